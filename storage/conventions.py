@@ -153,7 +153,8 @@ def latlong_uv(directions: ArrayLike) -> NDArray[np.float64]:
         u and v [..., 2] in [0, 1], float64; v is up, as everywhere: 1 at +Z, in the top row. At
         the poles u is 0.5, or what rounding makes of it.
     """
-    x, y, z = np.moveaxis(np.asarray(directions, np.float64), -1, 0)
+    # by a function of numpy's, which tensors in its place answer too (model.hits.device_arrays)
+    x, y, z = np.moveaxis(np.positive(directions, dtype=np.float64), -1, 0)
     u = 0.5 - np.arctan2(y, x) / (2 * np.pi)
     # of the two arcs, not of z alone: near the poles the arc cosine loses half of its digits
     v = 1 - np.arctan2(np.hypot(x, y), z) / np.pi

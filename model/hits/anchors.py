@@ -45,6 +45,9 @@ BLOCK = 2**13
 DEVICE_BLOCK = 2**18
 """Points that a GPU computes at a time: as many as fit its memory."""
 
+DEVICE_PAIRS = 2**26
+"""Pairs of points and lamps in such a block: each array of chances takes 256 MB."""
+
 
 def outgoing_radiance(
     scene: LitScene,
@@ -111,7 +114,7 @@ def _mirrored_radiance(
         scene, light, beyond, u_lamp, on_lamp[::-1], is_sharp, mirrors=mirrors - 1
     )
     lit = np.flatnonzero(is_sharp & is_hit & scene.emits[beyond.triangle])
-    if len(lit):
+    if len(lit) and len(scene.lamps):  # on a GPU, `lit` are all rows
         some = mirror_points.only(lit)
         lamp_points = beyond.only(lit)
         along = onward[:, lit]
@@ -131,7 +134,9 @@ def _mirrored_radiance(
 
 def blocks(scene: LitScene, count: int) -> Iterator[slice]:
     """Yield the parts of `count` points that are computed at a time."""
-    step = BLOCK if scene.place is None else DEVICE_BLOCK
+    step = BLOCK
+    if scene.place is not None:
+        step = min(DEVICE_BLOCK, DEVICE_PAIRS // max(len(scene.lamps), 1))
     for first in range(0, count, step):
         yield slice(first, min(first + step, count))
 

@@ -16,6 +16,8 @@ from numpy.lib.mixins import NDArrayOperatorsMixin
 from numpy.typing import NDArray
 from torch import Tensor
 
+from storage.digests import sha256_hex
+
 _TYPES = {
     np.dtype(np.float32): torch.float32,
     np.dtype(np.float64): torch.float64,
@@ -33,8 +35,8 @@ class DevicePlace:
         self._held: dict[tuple[object, ...], Tensor] = {}
 
     def tensor(self, array: NDArray) -> Tensor:
-        """Return a small array of the host; equal ones share a tensor, which lives as this does."""
-        key = (array.dtype.str, array.shape, array.tobytes())
+        """Return an array of the host; equal ones share a tensor, which lives as this does."""
+        key = (array.dtype.str, array.shape, sha256_hex(array.tobytes()))
         if key not in self._held:
             copy = np.array(array, dtype=None if array.dtype in _TYPES else np.int64)
             self._held[key] = torch.from_numpy(copy).to(self.device)
@@ -206,22 +208,24 @@ _UFUNCS: dict[str, Callable] = {
     "remainder": operator.mod,
     "power": operator.pow,
     "negative": operator.neg,
+    "positive": operator.pos,
     "matmul": operator.matmul,
     "less": operator.lt,
     "less_equal": operator.le,
     "greater": operator.gt,
     "greater_equal": operator.ge,
     "equal": operator.eq,
-    "not_equal": operator.ne,
     "bitwise_and": operator.and_,
     "bitwise_or": operator.or_,
     "invert": operator.invert,
     "maximum": _clamp_or(torch.maximum, "min"),
     "minimum": _clamp_or(torch.minimum, "max"),
     "absolute": torch.abs,
+    "arctan2": torch.atan2,
     "copysign": torch.copysign,
     "cos": torch.cos,
     "floor": torch.floor,
+    "hypot": torch.hypot,
     "radians": torch.deg2rad,
     "sin": torch.sin,
     "sqrt": torch.sqrt,
@@ -258,13 +262,18 @@ def _nonzero(place: DevicePlace, mask: DeviceArray) -> tuple[NDArray, ...]:
 
 _FUNCTIONS: dict[Any, Callable] = {
     np.broadcast_to: lambda place, a, shape: a.tensor.expand(shape),
+    np.clip: lambda place, a, least, most: a.tensor.clamp(least, most),
     np.concatenate: lambda place, a, axis=0: torch.cat(_all(a, place), dim=axis),
     np.cumsum: lambda place, a, axis: a.tensor.cumsum(dim=axis),
     np.flatnonzero: lambda place, mask: MaskedRows(mask.tensor.flatten() != 0),
+    np.full_like: lambda place, a, value: torch.full_like(a.tensor, float(value)),
     np.interp: _interp,
+    np.moveaxis: lambda place, a, source, target: a.tensor.movedim(source, target),
     np.nonzero: _nonzero,
     np.ones_like: lambda place, a: torch.ones_like(a.tensor),
-    np.searchsorted: lambda place, a, v: torch.searchsorted(*_all((a, v), place)),
+    np.searchsorted: lambda place, a, v, side="left": torch.searchsorted(
+        *_all((a, v), place), side=side
+    ),
     np.stack: lambda place, a, axis=0: torch.stack(_all(a, place), dim=axis),
     np.take: _take,
     np.take_along_axis: lambda place, a, index, axis: a.tensor.gather(axis, index.tensor),

@@ -4,7 +4,7 @@ Unbiased: the mean over points and shifts is the integral, but for the specular 
 part is left to rays that the lobe draws (`lobe_ray_weight`).
 """
 
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 
 import numpy as np
@@ -53,7 +53,7 @@ def direct_light(
     scene: LitScene,
     points: Points,
     gloss: Gloss | None,
-    on_lamps: Floats,
+    on_lamps: Callable[[slice], Floats],
     *,
     lobe_rays: int,
 ) -> DirectLight:
@@ -61,13 +61,13 @@ def direct_light(
 
     Args:
         gloss: the lobes there; None where the specular part is not wanted, which is then 0.
-        on_lamps: [2, lamps, P] in the unit square: where on each lamp's triangle.
+        on_lamps: returns where on the triangles of some lamps, [2, l, P] in the unit square.
         lobe_rays: 1 where a ray is drawn by the lobe at each of these points too: what such rays
             are better at finding is left to them (the power heuristic, Veach and Guibas 1995).
     """
     light = no_light(points)
     for some in _some_lamps(scene, points):
-        _add(light, scene, points, gloss, some, on_lamps[:, some], lobe_rays)
+        _add(light, scene, points, gloss, some, on_lamps(some), lobe_rays)
     return light
 
 
@@ -97,8 +97,10 @@ def _add(
     square = np.maximum(dot(to_lamp, to_lamp), np.float32(1e-12))
     to_lamp = to_lamp / np.sqrt(square)
     cosine = dot(lit_points.normal, to_lamp)
-    planes = [scene.plane[:, int(lamp)] for lamp in lamps]
-    facing = np.abs(np.stack([plane @ to_lamp[:, row] for row, plane in enumerate(planes)]))
+    if scene.place is None:  # one lamp; `dot` rounds otherwise, and pictures keep their bits
+        facing = np.abs(scene.plane[:, int(lamps[0])] @ to_lamp[:, 0])[None]
+    else:
+        facing = np.abs(dot(scene.plane[:, lamps][:, :, None], to_lamp))
     solid = facing * scene.area[lamps][:, None] / square
     diffuse = np.maximum(cosine, 0) * solid * _INV_PI
     specular = None

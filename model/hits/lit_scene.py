@@ -162,7 +162,7 @@ class LitScene:
         return None if self.place is None else self.place.device
 
     def on(self, place: DevicePlace, caster: Callable[..., RayCaster]) -> "LitScene":
-        """Return the scene, which has no sky, on a device, where `caster` prepares its rays."""
+        """Return the scene on a device, where `caster` prepares its rays."""
         moved = copy.copy(self)
         for name, table in vars(self).items():
             if isinstance(table, np.ndarray) and name not in ("lamps", "_corner_rows"):
@@ -170,6 +170,8 @@ class LitScene:
         moved.place = place
         if self.textures is not None:
             moved.textures = DeviceTextures(self.textures, place)
+        if self.sky is not None:
+            moved.drawn_sky = self.drawn_sky.on(place)
         moved.seen = caster(self._corner_rows, np.flatnonzero(~self.emits), place)
         moved.everything = caster(self._corner_rows, np.arange(self.num_triangles), place)
         return moved

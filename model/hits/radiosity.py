@@ -93,7 +93,9 @@ def _direct(scene: LitScene, rng: np.random.Generator) -> Floats:
     on_lamps = rng.random((2, len(scene.lamps), num_sides), np.float32)
 
     def from_lamps(points: Points, some: slice, trial: int) -> Floats:
-        on_some = spread(on_lamps[:, :, some], trial)
+        def on_some(lamps: slice) -> Floats:
+            return spread(on_lamps[:, lamps, some], trial)
+
         return direct_light(scene, points, None, on_some, lobe_rays=0).diffuse
 
     return _mean_of_sides(scene, on_triangle, from_lamps)

@@ -118,5 +118,5 @@ def escaped_light(
 def sees_sky(scene: LitScene, points: Points, direction: Floats) -> NDArray[np.bool_]:
     """Return True [P] for rays from points that meet nothing, lamps included."""
     start = off_surface(points.position, points.geometric_normal, direction)
-    far = np.full(direction.shape[1], _FAR_M, np.float32)
+    far = np.full_like(direction[0], _FAR_M)
     return scene.everything.is_free(as_rows(start), as_rows(direction), far)

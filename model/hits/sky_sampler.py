@@ -5,11 +5,15 @@ that most samples hit a sun of one texel. Samples are drawn in the axes of the m
 rotated together with its map has the same noise.
 """
 
+import copy
+import dataclasses
 from functools import cached_property
+from typing import Self
 
 import numpy as np
 from numpy.typing import NDArray
 
+from model.hits.device_arrays import DevicePlace
 from model.hits.vectors import Floats, as_rows
 from storage.conventions import latlong_uv
 from storage.records.environment import Environment, row_solid_angles, texel_means
@@ -34,15 +38,29 @@ class SkySampler:
         self._height = height
         self._width = width
 
+    def on(self, place: DevicePlace) -> Self:
+        """Return the sampler with its tables on a device."""
+        moved = copy.copy(self)
+        for name, table in {**vars(self), "_coarse": self._coarse}.items():
+            if isinstance(table, np.ndarray):
+                setattr(moved, name, place.array(table))
+            elif isinstance(table, Environment):
+                radiance_rgb = place.array(table.radiance_rgb)
+                rotation = place.array(table.rotation.astype(np.float64))
+                sky = dataclasses.replace(table, radiance_rgb=radiance_rgb, rotation=rotation)
+                setattr(moved, name, sky)
+        return moved
+
     def sample_directions(self, u: Floats) -> Floats:
         """Return unit world directions [3, P] for numbers u [2, P] in the unit square."""
         first = u[0].astype(np.float64)
         texel = np.searchsorted(self._cumulative, first, side="right").clip(
-            0, self._probability.size - 1
+            0, len(self._probability) - 1
         )
         share = self._probability[texel]
         along = (first - (self._cumulative[texel] - share)) / np.maximum(share, 1e-300)
-        row, column = np.divmod(texel, self._width)
+        row = texel // self._width
+        column = texel % self._width
         z = self._edges[row] + (self._edges[row + 1] - self._edges[row]) * u[1]
         azimuth = (0.5 - (column + along.clip(0, 1)) / self._width) * 2 * np.pi
         flat = np.sqrt(np.maximum(1 - z * z, 0))

@@ -121,7 +121,9 @@ def view_inputs(
         chance=scene.here(rng.random((6, resolution**2), np.float32)),
         to_sky=None  # a generator of its own: scenes without a sky keep their noise
         if scene.sky is None
-        else rng_for(seed, "hits of a sky", resolution).random((2, resolution**2), np.float32),
+        else scene.here(
+            rng_for(seed, "hits of a sky", resolution).random((2, resolution**2), np.float32)
+        ),
     )
     sums = np.zeros_like(noise.chance, shape=(NUM_CHANNELS, resolution**2))
     for part in blocks(scene, resolution**2):
@@ -168,7 +170,10 @@ def _add_pixels(
     gloss = block.gloss
     with aside(scene.device) as join_direct:
         _add_surface(block, scene, rays.origin)
-        on_lamps = spread(noise.on_lamps[:, :, pixel], block.ray_index)
+
+        def on_lamps(some: slice) -> Floats:
+            return spread(noise.on_lamps[:, some][:, :, pixel], block.ray_index)
+
         lit = direct_light(scene, points, gloss, on_lamps, lobe_rays=lobe_rays)
         _add_light(block, scene, lit)
         if noise.to_sky is not None:

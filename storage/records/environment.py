@@ -39,7 +39,7 @@ class Environment:
 
     def to_map(self, directions: ArrayLike) -> NDArray[np.float64]:
         """Return directions [..., 3] of the world in the axes of the map."""
-        turned: NDArray[np.float64] = np.asarray(directions, np.float64) @ self.rotation
+        turned: NDArray[np.float64] = np.positive(directions, dtype=np.float64) @ self.rotation
         return turned
 
     def check(self) -> None:

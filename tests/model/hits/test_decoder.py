@@ -16,6 +16,7 @@ import pytest
 import torch
 from numpy.typing import NDArray
 from torch import Tensor, nn
+from torch.utils._python_dispatch import TorchDispatchMode
 
 from model.config import ModelConfig, hit_stage
 from model.hits import decoder
@@ -29,6 +30,7 @@ from model.inference import NeuralRenderer
 from model.renderformer import RenderFormer, radiance
 from model.scene_tensors import SceneBatch, SceneTensors, batch_scenes, map_tensors, scene_tensors
 from model.weights import decode_weights, encode_weights
+from scene_templates.rotations import uniform_rotation
 from storage.errors import TrilightError
 from storage.raycast.caster import RayHits, Triangles
 from storage.records.material import EMISSION
@@ -36,8 +38,8 @@ from storage.records.scene import Scene
 from tests.for_each import for_each
 from tests.model.hits.kit import FLOOR, WALL, corner, lit_scene, textured, traced
 from tests.model.kit import awake, hits_config
-from tests.pipeline.renders.scene_kit import join, material, quad
-from tests.sky_maps import constant
+from tests.pipeline.renders.scene_kit import join, material, quad, sphere
+from tests.sky_maps import constant, one_sun, smooth
 
 PX = 32
 
@@ -259,6 +261,7 @@ def test_it_takes_bfloat16_for_what_is_rounded() -> None:
 
 
 HOST = torch.device("cpu")
+TURN = uniform_rotation(np.random.default_rng(3)).astype(np.float32)
 needs_card = pytest.mark.skipif(not torch.cuda.is_available(), reason="no CUDA device")
 
 
@@ -277,14 +280,44 @@ class _OnHost:
         return self._place.array(self._embree.is_free(*(each.tensor.numpy() for each in rays)))
 
 
-@for_each("scene", [corner(), textured()])
+class _NothingRead(TorchDispatchMode):
+    """Refuse what no graph of CUDA can hold: numbers for the host, shapes that they decide."""
+
+    def __torch_dispatch__(self, func: Any, types: Any, args: Any = (), kwargs: Any = None) -> Any:
+        name = func.overloadpacket.__name__
+        indices = args[1] if name in ("index", "index_put", "index_put_") else ()
+        by_mask = any(each is not None and each.dtype == torch.bool for each in indices)
+        assert not by_mask and name not in ("_local_scalar_dense", "nonzero", "masked_select")
+        return func(*args, **(kwargs or {}))
+
+
+def _below_a_lit_ball() -> Scene:
+    """Return a corner with 264 lamps."""
+    lamp = material(diffuse=0.0, emission=[9.0, 8.0, 7.0])
+    ball = dataclasses.replace(sphere([0.4, 0.2, 2.0], 0.2, lamp, rings=9), kind="emitter")
+    parts = [quad(FLOOR, material(diffuse=0.5, specular=0.3, roughness=0.2)), ball]
+    return join(parts, eye=(1.0, -3.0, 1.4), target=(0, 0, 0.4), fov_deg=38.0)
+
+
+BELOW_SKIES = [
+    corner(roughness=0.05, sky=smooth(rotation=TURN)),
+    corner(roughness=0.05, radiance=0.0, sky=one_sun(1e4, rotation=TURN)),
+]
+
+
+@for_each("scene", [corner(), textured(), _below_a_lit_ball(), *BELOW_SKIES])
 def test_a_view_of_tensors_is_numpys(scene: Scene) -> None:
     numpy_form = traced_scene(lit_scene(scene))
-    tensor_form = numpy_form.on_place(DevicePlace(HOST), _OnHost)
+    place = DevicePlace(HOST)
+    tensor_form = numpy_form.on_place(place, _OnHost)
     camera = torch.tensor(scene.c2w[0]), torch.tensor(float(scene.fov_deg[0]))
-    stage = hit_stage(hits_config(hit_rays=2, gather_rays=4))
+    stage = hit_stage(hits_config(hit_rays=2, gather_rays=4, sky_rays=3))
     given = (*camera, 32, stage, 0)
     expected, got = numpy_form.view(*given), tensor_form.view(*given)
+    held = len(place._held)
+    with _NothingRead():  # or it could not be recorded
+        tensor_form.view(*given)
+    assert len(place._held) == held
     for name, array in vars(expected).items():
         tensor = getattr(got, name).tensor
         np.testing.assert_allclose(tensor.numpy(), array, rtol=1e-3, atol=2e-5, err_msg=name)
