@@ -215,7 +215,6 @@ _UFUNCS: dict[str, Callable] = {
     "greater": operator.gt,
     "greater_equal": operator.ge,
     "equal": operator.eq,
-    "not_equal": operator.ne,
     "bitwise_and": operator.and_,
     "bitwise_or": operator.or_,
     "invert": operator.invert,

@@ -45,10 +45,10 @@ class SkySampler:
             if isinstance(table, np.ndarray):
                 setattr(moved, name, place.array(table))
             elif isinstance(table, Environment):
-                radiance = place.array(table.radiance_rgb)
+                radiance_rgb = place.array(table.radiance_rgb)
                 rotation = place.array(table.rotation.astype(np.float64))
-                there = dataclasses.replace(table, radiance_rgb=radiance, rotation=rotation)
-                setattr(moved, name, there)
+                sky = dataclasses.replace(table, radiance_rgb=radiance_rgb, rotation=rotation)
+                setattr(moved, name, sky)
         return moved
 
     def sample_directions(self, u: Floats) -> Floats:
