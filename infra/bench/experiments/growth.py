@@ -164,7 +164,8 @@ def _read(num_shards: int, folder: Path) -> None:
     shards = open_training_data([str(folder / "set")]).split("train")
     for number in range(len(shards.names)):
         with closing(shards.open(number)) as shard:
-            shard.members(0)
+            for key in shard.samples:
+                shard.members(key)
 
 
 WORK: Mapping[str, SizedWork] = {
