@@ -53,8 +53,8 @@ def reading(dataset: str, shard: str) -> Iterator[None]:
             else f"not as expected ({type(error).__name__})"
         )
         raise TrilightError(
-            f"{shard}: {why.rstrip('.')}. The shard is damaged; `trilight verify "
-            f"{shlex.quote(dataset)}` says how to repair it."
+            f"{shard}: {why.removeprefix(f'{shard}: ').rstrip('.')}. The shard is damaged; "
+            f"`trilight verify {shlex.quote(dataset)}` says how to repair it."
         ) from error
 
 
