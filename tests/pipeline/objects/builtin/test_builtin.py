@@ -1,12 +1,13 @@
 """Laws of all built-in families, the digests of their first objects, and volumes known on paper."""
 
+import itertools
 from functools import cache, partial
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
-from scipy.sparse import coo_array
-from scipy.sparse.csgraph import connected_components
 
+from pipeline.objects.builtin import lattice, shell
 from pipeline.objects.builtin.solids import Mesh
 from pipeline.objects.builtin.superquadric import superquadric
 from pipeline.objects.builtin.torus_knot import torus_knot
@@ -34,12 +35,17 @@ def made(family: str, number: int) -> Mesh:
 def parts_of(mesh: Mesh) -> list[Mesh]:
     """The pieces that share no vertex, each with vertices of its own."""
     positions, faces = mesh
-    links = coo_array((np.ones(2 * len(faces)), (faces[:, [0, 0]].ravel(), faces[:, 1:].ravel())),
-                      shape=(len(positions),) * 2)  # fmt: skip
-    label = connected_components(links)[1][faces[:, 0]]
+    label = np.arange(len(positions))
+    while True:
+        lowest = label.copy()
+        np.minimum.at(lowest, faces.ravel(), np.repeat(label[faces].min(axis=1), 3))
+        lowest = lowest[lowest]
+        if np.array_equal(lowest, label):
+            break
+        label = lowest
     parts = []
     for name in np.unique(label):
-        used, flat = np.unique(faces[label == name], return_inverse=True)
+        used, flat = np.unique(faces[label[faces[:, 0]] == name], return_inverse=True)
         parts.append((positions[used], flat.reshape(-1, 3)))
     return parts
 
@@ -165,3 +171,77 @@ def test_strands_of_a_knot_do_not_meet(windings: tuple[int, int]) -> None:
     step = np.linalg.norm(centre - np.roll(centre, 1, axis=0), axis=1).min()
     far_along = apart * step > np.pi * tube
     assert distance[far_along].min() > 2 * tube * 0.99
+
+
+def test_a_shell_is_a_larger_copy_of_itself_some_rings_before(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    shape = SimpleNamespace(
+        turns=3.0, growth=2.0, drop=1.0, tube=0.6, stretch=1.2, ribs=0, rib_height=0.1, cords=4,
+        cord_height=0.1, spines=1.0, wall=0.1, lean_rad=0.0, rings_per_turn=20, columns=16,
+    )  # fmt: skip
+    monkeypatch.setattr(shell, "_Shell", lambda _: shape)
+    outer = shell.sample_shell(rng_for(0, "any"))[0][:-2].reshape(-1, 16, 3)[:60]
+    # 60 rings from the tip to the mouth are 59 steps of three turns.
+    turns = 20 * 3.0 / 59
+    cosine, sine = np.cos(2 * np.pi * turns), np.sin(2 * np.pi * turns)
+    turned = outer[:-20] @ np.array([[cosine, sine, 0], [-sine, cosine, 0], [0, 0, 1]])
+    np.testing.assert_allclose(turned * 2.0**turns, outer[20:], atol=1e-12)
+
+
+def _lattice(cells: tuple[int, int, int], **changes: object) -> Mesh:
+    shape: dict[str, object] = {
+        "half_sizes": (1.0, 0.8, 0.6), "bar": 0.25, "hollow": False, "crate": False, "splits": 1,
+        "roundness": 0.0, "taper": 0.0, "twist_rad": 0.0, "bend_rad": 0.0,
+    }  # fmt: skip
+    stated = SimpleNamespace(cells=cells, **(shape | changes))
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(lattice, "_Lattice", lambda _: stated)
+        return lattice.sample_lattice(rng_for(0, "any"))
+
+
+def _graph(x: int, y: int, z: int) -> tuple[int, int]:
+    """Crossings and bars of a lattice."""
+    bars = x * (y + 1) * (z + 1) + y * (x + 1) * (z + 1) + z * (x + 1) * (y + 1)
+    return (x + 1) * (y + 1) * (z + 1), bars
+
+
+@for_each(
+    "cells, splits",
+    itertools.product([(1, 1, 1), (2, 1, 3), (3, 3, 2), (4, 0, 3), (1, 0, 1)], [1, 3]),
+)
+def test_a_lattice_has_the_genus_of_its_graph(cells: tuple[int, int, int], splits: int) -> None:
+    mesh = _lattice(cells, splits=splits)
+    crossings, bars = _graph(*cells)
+    assert is_closed(mesh) and len(parts_of(mesh)) == 1
+    assert len(mesh[0]) - len(mesh[1]) // 2 == 2 * (crossings - bars)
+    # Every side of every piece of a bar is a quad, and so is every side of a crossing without bar.
+    assert len(mesh[1]) == 2 * (4 * bars * splits + 6 * crossings - 2 * bars)
+
+
+def test_a_lattice_has_the_volume_of_its_bars() -> None:
+    mesh = _lattice((2, 1, 3))
+    crossings, _ = _graph(2, 1, 3)
+    count = np.array([2, 1, 3])
+    step = 2 * np.array([1.0, 0.8, 0.6]) / (count + 0.25)
+    cube = np.prod(0.25 * step)
+    # A bar is three times as long as a crossing, along its axis.
+    expected = cube * (crossings + 3 * _graph(2, 1, 3)[1])
+    assert volume(mesh) == pytest.approx(expected, rel=1e-12)
+    np.testing.assert_allclose(np.ptp(mesh[0], axis=0), [2.0, 1.6, 1.2])
+
+
+def test_a_hollow_lattice_and_a_crate_have_nothing_inside() -> None:
+    full, hollow = _lattice((3, 3, 3)), _lattice((3, 3, 3), hollow=True)
+    # Inside are 8 crossings, 4 bars along each axis between them, and 24 that lead to them.
+    lost = (8 + 3 * (12 + 24)) * np.prod(0.25 * 2 * np.array([1.0, 0.8, 0.6]) / 3.25)
+    assert volume(full) - volume(hollow) == pytest.approx(lost, rel=1e-9)
+    crate = _lattice((3, 3, 3), hollow=True, crate=True)
+    assert is_closed(crate)
+    inside = (np.abs(crate[0][:, :2] / [1.0, 0.8]) < 0.7).all(axis=1)
+    assert inside.any() and crate[0][inside, 2].max() < -0.4
+    assert np.isclose(crate[0].max(axis=0), [1.0, 0.8, 0.6]).all()
+    # Its rim has no bars across, but all its crossings: two triangles for each cell looking up.
+    a, b, c = crate[0][crate[1]].transpose(1, 0, 2)
+    up = (np.cross(b - a, c - a)[:, 2] > 0) & (a[:, 2] > 0.59)
+    assert up.sum() == 2 * 4 * (3 + 3)
