@@ -1,6 +1,6 @@
 """Laws of every layout: objects, emitters, surfaces and cameras lie in their stated ranges.
 
-Shells are flat and closed at their seams; the numbers of published families stand by digests.
+Shells are flat, closed at their seams, and in the published families as published.
 """
 
 import dataclasses
@@ -11,13 +11,14 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from scene_templates.families import DEFAULT_FAMILIES
+from scene_templates.families import DEFAULT_FAMILIES, Family
 from scene_templates.layout import Pose, ShellPart
 from scene_templates.renderformer_v1 import Policy, stage_1_families, stage_2_families
 from scene_templates.rooms import (
     PATCH_FACES,
     SIDES,
     TOUCHING,
+    SeparateSides,
     SharedRoom,
     patch,
     plane_of,
@@ -40,6 +41,7 @@ from tests.scene_templates.balls import (
     one_drawn,
     template_settings,
 )
+from tests.scene_templates.published import DEFAULT, STAGE_1, STAGE_2, Row, side_row
 
 ROUNDING = 1e-9
 """Far above the 1e-15 of float64 sums of numbers about 1, far below anything that matters."""
@@ -291,15 +293,39 @@ def _meets(
 
 POLICIES: tuple[Policy, ...] = ("original", "de-biased")
 
+STAGES = {1: (stage_1_families, STAGE_1), 2: (stage_2_families, STAGE_2)}
 
-def test_ours_have_each_layout_and_each_number_of_objects_equally_often() -> None:
-    odds = {
-        (family.template, count): family.weight / (1 + high - low)
-        for family in DEFAULT_FAMILIES
-        for low, high in [family.num_objects]
-        for count in range(low, high + 1)
-    }
-    assert odds == dict.fromkeys(itertools.product(ROOMS, (1, 2, 3)), 1.0)
+
+def _as_rows(families: tuple[Family, ...]) -> tuple[Row, ...]:
+    for family in families:
+        assert family.template == family.name.split("-")[0]
+    return tuple(
+        (one.name, one.weight, one.num_objects, one.object_scale, one.smooth_share)
+        for one in families
+    )
+
+
+@pytest.mark.parametrize("policy", POLICIES)
+def test_families_are_the_published_ones_and_ours_the_stated_ones(policy: Policy) -> None:
+    first, second = stage_1_families(policy), stage_2_families(policy)
+    assert (_as_rows(first), _as_rows(second)) == (STAGE_1, STAGE_2)
+    assert (len(first), sum(family.weight for family in first)) == (21, 46)
+    assert (len(second), sum(family.weight for family in second)) == (14, 42)
+    assert _as_rows(DEFAULT_FAMILIES) == DEFAULT
+
+
+@for_each(("policy", "stage"), itertools.product(POLICIES, STAGES))
+def test_every_side_has_its_published_ranges(policy: Policy, stage: int) -> None:
+    for family in STAGES[stage][0](policy):
+        assert isinstance(family.shell, SeparateSides)
+        for part in TEMPLATES[family.template].parts:
+            side = getattr(family.shell, part)
+            moves = (side.shift_x, side.shift_y, side.shift_z)
+            found = (side.spin_deg, side.tilt_deg, side.scale, *moves)
+            assert found == side_row(family.name, part, policy, stage), (family.name, part)
+        assert family.shell.wall2_faces_out == (
+            policy == "original" and ("open_box" in family.name or "patch" in family.name)
+        )
 
 
 @pytest.mark.parametrize("policy", POLICIES)

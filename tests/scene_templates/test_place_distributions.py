@@ -19,6 +19,7 @@ from scene_templates.sample_emitters import LightSettings, sample_emitters
 from scene_templates.templates import TEMPLATES
 from tests.for_each import for_each
 from tests.scene_templates.balls import DEFAULTS, MANY, Drawn, drawn, drawn_once, template_settings
+from tests.scene_templates.published import side_row
 from tests.scene_templates.statistics import (
     Table,
     alike,
@@ -83,21 +84,20 @@ def _sides_table(stage: int, drawn_policy: Policy, stated_policy: Policy) -> Tab
     found: dict[tuple[str, ...], list[float]] = {}
     stated: dict[tuple[str, ...], tuple[float, float]] = {}
     rng = np.random.default_rng(stage)
-    families = stage_1_families if stage == 1 else stage_2_families
-    for family, other in zip(families(drawn_policy), families(stated_policy), strict=True):
+    for family in (stage_1_families if stage == 1 else stage_2_families)(drawn_policy):
         parts = TEMPLATES[family.template].parts
         for _ in range(100):
             patches = family.shell.sample_room(rng, parts).patches
             for part, at in zip(parts, patches, strict=True):
                 assert at.reach == 1
                 axis = SIDES[part].axis
-                side = getattr(other.shell, part)
-                rows = [("spin", at.rotation_deg[axis], (-side.spin_deg, side.spin_deg))]
-                tilts = (-side.tilt_deg, side.tilt_deg)
-                rows += [(f"tilt {k}", at.rotation_deg[k], tilts) for k in {0, 1, 2} - {axis}]
-                for k, name in enumerate("xyz"):
-                    rows.append((f"scale {k}", at.scale[k], side.scale))
-                    rows.append((f"move {k}", at.translation[k], getattr(side, f"shift_{name}")))
+                spin, tilt, scale, *moves = side_row(family.name, part, stated_policy, stage)
+                rows = [("spin", at.rotation_deg[axis], (-spin, spin))]
+                others = sorted({0, 1, 2} - {axis})
+                rows += [(f"tilt {k}", at.rotation_deg[k], (-tilt, tilt)) for k in others]
+                for k in range(3):
+                    rows.append((f"scale {k}", at.scale[k], scale))
+                    rows.append((f"move {k}", at.translation[k], moves[k]))
                 for quantity, value, bounds in rows:
                     key = (family.template, part, quantity, str(bounds))
                     found.setdefault(key, []).append(value)

@@ -5,7 +5,7 @@ The line between chance and a defect is that of tests.scene_templates.statistics
 
 import dataclasses
 import math
-from collections import defaultdict
+from collections import Counter
 from collections.abc import Callable, Iterable, Sequence
 from typing import Any
 
@@ -20,7 +20,6 @@ from pipeline.presets.settings import differences
 from pipeline.scenes.compose import MeshShape
 from pipeline.scenes.pieces import object_piece, shell_piece
 from pipeline.scenes.triangle_budget import PooledAsset
-from scene_templates.families import DEFAULT_FAMILIES, Family
 from scene_templates.layout import ShellPart, SurfaceLook
 from scene_templates.out_of_range import median_settings
 from scene_templates.rooms import PATCH_FACES, SIDES, patch
@@ -31,6 +30,7 @@ from storage.seeds import rng_for
 from tests.pipeline.scenes.scene_facts import planes_of, points_of, rows_of, triangles_of
 from tests.pipeline.scenes.small_pool import LOOK, first_scene
 from tests.scene_templates.balls import STILL
+from tests.scene_templates.published import DEFAULT, STAGE_1
 from tests.scene_templates.statistics import (
     choices,
     implausible,
@@ -41,12 +41,12 @@ from tests.scene_templates.statistics import (
 
 
 def _composed_table(
-    scenes: list[Scene], pool: list[PooledAsset], families: Iterable[Family]
+    scenes: list[Scene], pool: list[PooledAsset], published: Iterable[Any]
 ) -> dict[str, Any]:
     """Rejected attempts are replaced by scenes of the same kind, and bend no share."""
-    odds = defaultdict[str, float](float)
-    for family in families:
-        odds[family.template] += family.weight
+    odds = Counter[str]()
+    for name, weight, *_ in published:
+        odds[name.split("-")[0]] += weight
     uids = [[scene.objects[row].uid for row in rows_of(scene, "object")] for scene in scenes]
     even = dict.fromkeys((entry.locked.uid for entry in pool), 1.0)
     counts = [len(rows_of(scene, "emitter")) for scene in scenes]
@@ -60,17 +60,17 @@ def _composed_table(
 
 def test_composed_scenes_are_as_planned(scenes: list[Scene], pool: list[PooledAsset]) -> None:
     """Views of the published recipe are hardly judged: even its cameras keep their distribution."""
-    require_plausible(_composed_table(scenes, pool, DEFAULT_FAMILIES))
+    require_plausible(_composed_table(scenes, pool, DEFAULT))
     settings = preset_settings("renderformer-v1-256", changes={"scenes.num_views": 2}).scenes
     published = [first_scene(settings, pool, seed=0, scene_index=index) for index in range(200)]
-    table = _composed_table(published, pool, settings.families)
+    table = _composed_table(published, pool, STAGE_1)
     table["fov"] = uniform([fov for scene in published for fov in scene.fov_deg.tolist()], 30, 60)
     first = [attempt == 0 for s in published for attempt in s.provenance["camera_attempts"]]
     require_plausible(table)
     assert np.mean(first) > 0.98  # the rest stood against geometry
     # A pool that is not drawn evenly is noticed: here the first object is never drawn.
     fewer = [scene for scene in published if "made/ball" not in {o.uid for o in scene.objects}]
-    assert "objects" in implausible(_composed_table(fewer, pool, settings.families))
+    assert "objects" in implausible(_composed_table(fewer, pool, STAGE_1))
 
 
 def test_how_far_meshes_shift_sizes(pool: list[PooledAsset]) -> None:
