@@ -1,26 +1,24 @@
 """Costs of a network from its configuration: parameters, FLOPs, bytes.
 
-FLOPs are counted by torch's FlopCounterMode on the meta device, where tensors have shapes and no
-numbers: matrix products, attention and convolutions, with two for a multiplication and an addition.
-Norms, rotations and activations are left out (1 % of the time at 205 M parameters).
+A multiplication and an addition count as two. Matrix products, attention and convolutions are
+counted as by torch's FlopCounterMode, against which this is tested; norms, rotations and
+activations are left out (1 % of the time at 205 M parameters).
+
+    d width   f hidden width   n registers + triangles   q ray bundles of a view
 """
 
 import functools
-import math
-import re
-from collections import Counter
-from collections.abc import Callable
 from dataclasses import dataclass
 
 import torch
-from torch.utils.flop_counter import FlopCounterMode
 
-from model.config import BundleStage, ModelConfig
-from model.hits.traced import INPUTS, Traced
-from model.hits.view_inputs import NUM_CHANNELS
+from model.attention import cut_windows
+from model.config import HitStage, ModelConfig
+from model.hits.decoder import view_flops
+from model.positions import encoded_normal_width
 from model.precision import PRECISIONS, rounded_parts
 from model.renderformer import SIDE_LIGHTS, RenderFormer, count_parameters
-from model.scene_tensors import SceneBatch
+from model.view_decoder import LAST_CHANNELS, picture_channels
 from storage.records.material import material_width
 
 TRAINING_BYTES = 16
@@ -29,11 +27,6 @@ TRAINING_BYTES = 16
 
 TRAINING_PASSES = 3
 """Forward passes of equal cost in a training step: backward has a product for each operand."""
-
-OTHER_WORK = "keys, values and what reads them"
-"""Part of the work that is done outside of the modules that are parts themselves."""
-
-_PART = re.compile(r"RenderFormer\.(\w+)\.(?:(layers)\.\d+\.)?(\w+)")
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -89,59 +82,73 @@ def costs(config: ModelConfig, workload: Workload) -> Costs:
 
 def flops(config: ModelConfig, workload: Workload) -> dict[str, int]:
     """Return the FLOPs of each part of a forward pass."""
-    with torch.device("meta"), torch.no_grad(), FlopCounterMode(display=False) as counter:
-        RenderFormer(config)(_meta_batch(config, workload), workload.resolution)
-    parts = Counter[str]()
-    for name, counts in counter.get_flop_counts().items():
-        if match := _PART.fullmatch(name):
-            parts[f"{match[1]} {match[3]}"] += sum(counts.values())
-    parts[OTHER_WORK] = counter.get_total_flops() - parts.total()
-    return {name: count for name, count in parts.items() if count}
-
-
-def _meta_batch(config: ModelConfig, workload: Workload) -> SceneBatch:
-    """Return a scene on the meta device, with its traced inputs, as the network reads it."""
-    t = workload.triangles
-    v = workload.views
-    r = workload.resolution
-    stage = config.stage
-    traced = albedo = None
-    if isinstance(stage, BundleStage):
-        albedo = torch.zeros(1, v, r, r, 6) if config.demodulated else None
-    else:
-        anchors = math.gcd(stage.hit_anchors, r) ** 2
-        traced = Traced(
-            sides_T12=torch.zeros(1, t, SIDE_LIGHTS),
-            unit_3=torch.zeros(1, 3),
-            pixels_VRRC=torch.zeros(1, v, r, r, NUM_CHANNELS),
-            anchor_VA=torch.zeros(1, v, anchors, dtype=torch.long),
-            gathered_VA3=torch.zeros(1, v, anchors, 3),
-            given_VI=torch.zeros(1, v, len(INPUTS)),
-        )
-    return SceneBatch(
-        triangles_BT33=torch.zeros(1, t, 3, 3),
-        normals_BT33=torch.zeros(1, t, 3, 3),
-        material_BTM=torch.zeros(1, t, material_width(config.material_columns)),
-        c2w_BV44=torch.zeros(1, v, 4, 4),
-        fov_deg_BV=torch.zeros(1, v),
-        is_triangle_BT=None,
-        columns=config.material_columns,
-        traced=traced,
-        albedo_BVRR6=albedo,
+    d = config.width
+    f = config.hidden_width
+    n = config.num_registers + workload.triangles
+    per_side = workload.resolution // config.patch_px
+    q = per_side**2
+    views = workload.views
+    token_inputs = material_width(config.material_columns) + encoded_normal_width(
+        config.normal_octaves
     )
+    if isinstance(config.stage, HitStage):
+        token_inputs += SIDE_LIGHTS
+    stage = {
+        "triangle tokens": 2 * workload.triangles * token_inputs * d,
+        "triangle self-attention": config.encoder_layers * (8 * n * d * d + 4 * n * n * d),
+        "triangle feed-forward": config.encoder_layers * 6 * n * d * f,
+        "keys and values": config.decoder_layers * 4 * n * d * d,
+    }
+    if isinstance(config.stage, HitStage):
+        view = view_flops(config, n, workload.resolution)
+        scene_stage = stage if config.scene_tokens else {}
+        return scene_stage | {name: views * count for name, count in view.items()}
+    layers = {
+        "cross-attention": 4 * q * d * d + 4 * q * n * d,
+        "bundle self-attention": 8 * q * d * d + 4 * d * _pairs(config, per_side),
+        "view feed-forward": 6 * q * d * f,
+    }
+    return {
+        **stage,
+        "bundle tokens": views * 2 * q * 3 * config.patch_px**2 * d,
+        **{name: views * config.decoder_layers * count for name, count in layers.items()},
+        "head": views * _head(config, per_side),
+    }
+
+
+@functools.lru_cache(maxsize=4096)
+def training_flops(config: ModelConfig, workload: Workload) -> int:
+    """Return the FLOPs of a forward and backward pass: each product has two more backward."""
+    return TRAINING_PASSES * sum(flops(config, workload).values())
 
 
 @functools.lru_cache
-def training_flops(config: ModelConfig, views: int, resolution: int) -> Callable[[int], int]:
-    """Return the FLOPs of a forward and backward pass as a function of a scene's triangles.
+def _pairs(config: ModelConfig, per_side: int) -> int:
+    """Return the number of (query, key) pairs of bundles, as a mean over the layers."""
+    if not config.window_bundles:
+        return per_side**4
+    pairs = []
+    for layer in range(config.decoder_layers):
+        cut = cut_windows(
+            per_side, config.window_bundles, shifted=layer % 2 == 1, device=torch.device("cpu")
+        )
+        pairs.append(sum(count * size**2 for count, size in cut.groups))
+    return sum(pairs) // len(pairs)
 
-    Attention is quadratic in them, so that three counts tell all. Torch counts by hooks of all
-    modules: no other thread may run any until this returns.
-    """
-    at_0, at_1, at_2 = (
-        sum(flops(config, Workload(triangles=n, views=views, resolution=resolution)).values())
-        for n in range(3)
-    )
-    quadratic = (at_0 - 2 * at_1 + at_2) // 2
-    linear = at_1 - at_0 - quadratic
-    return lambda n: TRAINING_PASSES * (at_0 + n * (linear + n * quadratic))
+
+def _head(config: ModelConfig, per_side: int) -> int:
+    if config.head == "linear":
+        return 2 * per_side**2 * config.width * picture_channels(config) * config.patch_px**2
+    features = config.dpt_features
+    half = (per_side + 1) // 2
+    grids = (4 * per_side, 2 * per_side, per_side, half)
+    total = 0
+    for level, (wide, side) in enumerate(zip(config.dpt_channels, grids, strict=True)):
+        resize = (16, 4, 0, 9)[level] * wide * wide * (half if level == 3 else per_side) ** 2
+        blocks = 1 if level == 3 else 2
+        refine = (9 * wide * features + blocks * 2 * 9 * features**2) * side**2
+        total += config.width * wide * per_side**2 + resize + refine + features**2 * side**2
+    full = (8 * per_side) ** 2
+    halve = 9 * features * (features // 2) * full
+    last = (9 * (features // 2) * LAST_CHANNELS + picture_channels(config) * LAST_CHANNELS) * full
+    return 2 * (total + halve + last)

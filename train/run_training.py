@@ -29,7 +29,7 @@ from train.initial_state import init_or_resume_state, plan_start
 from train.loop.distributed import DistributedContext
 from train.loop.recorder import Recorder, require_wandb
 from train.loop.train_state import TrainState
-from train.loop.trainer import Trainer
+from train.loop.trainer import Trainer, scene_flops
 from train.loss.lpips import load_lpips
 from train.loss.training_loss import TrainingLoss
 from train.progress import TrainProgress
@@ -221,8 +221,9 @@ def _train(
         watched=watched,
     )
     with closing(_batches(dataset, settings, state, dist_context, workers)) as batches:
+        cost = partial(scene_flops, settings)
         most = settings.scenes_per_pass
-        with closing(step_scenes(batches, trainer.scene_flops, most, dist_context.device)) as steps:
+        with closing(step_scenes(batches, cost, most, dist_context.device)) as steps:
             trainer.train(steps)
     if recorder is None:
         return None

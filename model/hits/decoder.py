@@ -22,7 +22,7 @@ from torch.nn.functional import normalize, silu, softplus
 from model.attention import Keys, Packing, attend
 from model.config import HitStage, ModelConfig, hit_stage
 from model.hits.anchors import DEVICE_BLOCK
-from model.hits.light_filter import LightFilter
+from model.hits.light_filter import LightFilter, filter_flops
 from model.hits.traced import INPUTS, Traced
 from model.hits.view_inputs import Channel
 from model.layers import (
@@ -83,6 +83,25 @@ _GAINED = 3
 
 BLOCK_PIXELS = 2**12
 """Pixels that are computed at a time while rendering."""
+
+
+def view_flops(config: ModelConfig, tokens: int, resolution: int) -> dict[str, int]:
+    """Return the FLOPs of the parts of this stage for one view of a scene of so many tokens."""
+    d = config.width
+    stage = hit_stage(config)
+    p = stage.pixel_width
+    a = math.gcd(stage.hit_anchors, resolution) ** 2
+    asks = 4 * a * d * d + 4 * a * tokens * d if config.scene_tokens else 0
+    pixel = PIXEL_DIM * p + p * p + NEIGHBOURS * (2 * p + 3) + OFFSET_DIM * p + NEIGHBOURS * 4 * 3
+    pixel += (2 * p + 3) * 2 * p + 2 * p * p + p * 3 * (_GAINED + 2)
+    width = stage.filter_width
+    return {
+        "filter": filter_flops(PIXEL_DIM, width, resolution**2) if width else 0,
+        "anchors": 2 * a * ((PIXEL_DIM + 3) * d + d * d),
+        "cross-attention": config.decoder_layers * asks,
+        "view feed-forward": config.decoder_layers * 6 * a * d * config.hidden_width,
+        "head": 4 * a * d * p + 2 * resolution**2 * pixel,
+    }
 
 
 class AnchorLayer(nn.Module):

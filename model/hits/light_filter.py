@@ -36,6 +36,13 @@ _MOST_DOUBT = 30.0
 """A ray that is not trusted at all counts e^-30: its pixel, all alone, still shows it."""
 
 
+def filter_flops(num_features: int, width: int, pixels: int) -> int:
+    """Return the FLOPs of filtering a picture of so many pixels."""
+    first = (num_features + 3 * len(_AROUND_PX)) * width + width * width
+    level = 3 * width + width * (_ALIKE + 1) + TAPS * (_ALIKE + 6)
+    return 2 * pixels * (first + len(STEPS_PX) * level)
+
+
 class LightFilter(nn.Module):
     """Features of pixels and their mirrored light -> mirrored light with less noise."""
 

@@ -13,7 +13,7 @@ from typing import Any
 
 import torch
 
-from model.costs import training_flops
+from model.costs import Workload, training_flops
 from storage.errors import TrilightError
 from train.data.buckets import CopyStream, StepScenes
 from train.folder import RunFolder
@@ -162,6 +162,16 @@ _PendingStep = tuple[int, Sequence[str], PendingStats]
 scenes, and statistics, still on the device."""
 
 
+def scene_flops(settings: TrainSettings, num_triangles: int) -> int:
+    """Return the FLOPs of a scene with so many triangles in a training step."""
+    workload = Workload(
+        triangles=num_triangles,
+        views=settings.views_per_scene,
+        resolution=settings.resolution,
+    )
+    return training_flops(settings.model, workload)
+
+
 class Trainer:
     """Training loop: runs all remaining steps, in lockstep with the other processes.
 
@@ -170,7 +180,6 @@ class Trainer:
         asked_to_stop: True once a synced step says that a process received a signal.
         saved_step: step of the last checkpoint of this call; None before the first.
         num_reported_bad: messages about damaged data that were already reported.
-        scene_flops: returns the FLOPs of a scene with so many triangles in a step.
         dead_start: checks once, after the warm-up, that pictures are not black.
     """
 
@@ -193,9 +202,6 @@ class Trainer:
         self.folder = folder
         self.data_digest = data_digest
         self.recorder = recorder
-        self.scene_flops = training_flops(
-            settings.model, settings.views_per_scene, settings.resolution
-        )
         self.stepper = Stepper(state, settings, objective, dist_context)
         self.copies = CopyStream(dist_context.device)
         self.dead_start = DeadStartDetector(settings)
@@ -291,7 +297,7 @@ class Trainer:
             self._note(self.stepper.remarks.pop(0))
         self.window.views += settings.scenes_per_step * settings.views_per_scene
         self.window.waited_s += waited_s
-        self.window.flops += sum(map(self.scene_flops, scenes.num_triangles))
+        self.window.flops += sum(scene_flops(settings, count) for count in scenes.num_triangles)
         self.state.step += 1
         self.watch.end_step()
         self.pending.append((self.state.step, scenes.keys, stats))

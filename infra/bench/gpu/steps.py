@@ -224,12 +224,13 @@ def _measure_steps(
     if device.type == "cuda":
         torch.cuda.reset_peak_memory_stats(device)
     step_s = statistics.median(time_calls(step, device, steps, warm_up=_WARM_STEPS))
-    cost = training_flops(settings.model, settings.views_per_scene, settings.resolution)
     figures = {
         "ms": 1e3 * step_s,
         "scenes": float(scenes),
         "views_per_s": scenes * settings.views_per_scene / step_s,
-        "teraflop_per_s": sum(cost(each.triangles) for each in workloads(settings, scenes))
+        "teraflop_per_s": sum(
+            training_flops(settings.model, each) for each in workloads(settings, scenes)
+        )
         / step_s
         / 1e12,
     }

@@ -4,11 +4,11 @@ import time
 from collections.abc import Mapping, Sequence
 from contextlib import closing
 from dataclasses import dataclass
+from functools import partial
 
 import numpy as np
 import torch
 
-from model.costs import training_flops
 from model.renderformer import RenderFormer
 from storage.dataset.shard_set import ShardSet
 from storage.dataset.training_data import open_training_data
@@ -21,6 +21,7 @@ from train.loop.distributed import DistributedContext
 from train.loop.optimizer import choose_muon_precision
 from train.loop.step import Stepper
 from train.loop.train_state import new_state
+from train.loop.trainer import scene_flops
 from train.loss.training_loss import TrainingLoss
 from train.run_training import loader_settings
 from train.settings import TrainSettings, learning_rate
@@ -87,7 +88,7 @@ def _trained_network(
     crew = DistributedContext(device=device)
     state = new_state(settings, device, muon_precision=choose_muon_precision(crew))
     stepper = Stepper(state, settings, TrainingLoss(settings.loss, None), crew)
-    cost = training_flops(settings.model, settings.views_per_scene, settings.resolution)
+    cost = partial(scene_flops, settings)
     stream = load_batches(
         shards,
         loader_settings(settings),

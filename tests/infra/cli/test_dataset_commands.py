@@ -510,7 +510,7 @@ def test_passes_are_of_the_views_that_are_named(dataset: Path, tmp_path: Path) -
 
 def test_a_size_is_described() -> None:
     text = trilight(["model", "base"]).stdout
-    for word in ("194.96 M", "692.7 GFLOP", "memory, bfloat16", "decoder cross"):
+    for word in ("194.96 M", "692.7 GFLOP", "memory, bfloat16", "cross-attention"):
         assert word in text
     found = said("model", "large", "--views", "4", "--resolution", "512")
     assert sum(found["parameters"].values()) == 483_266_819

@@ -1,8 +1,8 @@
 """Laws of what moves the weights, of its rate, and of the work that a step is.
 
 AdamW is torch's own, and Muon's steps are near orthogonal: the iteration by singular values, also
-in float32. A rate rises once and falls once; its constant part knows nothing of the end. The work
-of any length agrees with torch's counter.
+in float32. A rate rises once and falls once; its constant part knows nothing of the end. The
+formula of the work agrees with torch's counter.
 """
 
 import copy
@@ -20,7 +20,7 @@ from torch.nn.attention import SDPBackend, sdpa_kernel
 from torch.utils.flop_counter import FlopCounterMode
 
 from model.config import BaseWidths, ModelConfig
-from model.costs import training_flops
+from model.costs import Workload, training_flops
 from model.renderformer import RenderFormer
 from model.width_scales import width_scales
 from storage.seeds import rng_for
@@ -192,6 +192,11 @@ def counted(config: ModelConfig, batch: TrainingBatch) -> int:
     return int(counter.get_total_flops())
 
 
+def flops(num_triangles: int) -> int:
+    workload = Workload(triangles=num_triangles, views=2, resolution=RESOLUTION)
+    return training_flops(DEEPER, workload)
+
+
 def with_triangles(count: int) -> TrainingScene:
     scene = training_scene(toy_sample(0), RESOLUTION)
     old = scene.tensors
@@ -206,9 +211,8 @@ def with_triangles(count: int) -> TrainingScene:
 
 
 @for_each("boxes", [1, 5])
-def test_three_counts_say_what_any_scene_needs(boxes: int) -> None:
+def test_the_formula_says_what_any_scene_needs(boxes: int) -> None:
     found = counted(DEEPER, collate_batch([with_triangles(12 * boxes)]))
-    flops = training_flops(DEEPER, 2, RESOLUTION)
     # a first layer needs no gradient of its inputs, which our factor of 3 counts: below 10 %
     assert flops(12 * boxes) == pytest.approx(found, rel=0.1)
 
@@ -217,7 +221,7 @@ def test_batching_wastes_less_than_it_may() -> None:
     """Counted by torch, against the sum of single scenes, over lengths as they are drawn."""
     lengths = rng_for(0, "lengths").integers(10, 300, 7)
     scenes = [with_triangles(int(length)) for length in lengths]
-    batches = bucket_scenes(scenes, training_flops(DEEPER, 2, RESOLUTION), 16)
+    batches = bucket_scenes(scenes, flops, 16)
     together = sum(counted(DEEPER, batch) for batch in batches)
     alone = sum(counted(DEEPER, collate_batch([scene])) for scene in scenes)
     assert 1 < together / alone < 1 + MOST_WASTE
