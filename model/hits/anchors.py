@@ -26,7 +26,7 @@ from model.hits.vectors import Floats, brightest, cosine_direction, dot, spread,
 from storage.conventions import focal_px
 from storage.seeds import rng_for
 
-WIDENED_ALPHA = np.float32(0.4)
+WIDENED_ALPHA = np.float32(0.2)
 """GGX width that surfaces have at least, where a ray has met them."""
 
 SMOOTH_ALPHA = np.float32(0.1)

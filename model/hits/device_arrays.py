@@ -48,30 +48,21 @@ class DevicePlace:
 
 
 class MaskedRows:
-    """Rows that a mask chooses: all of them, of which those that it leaves out do not count.
+    """Rows that a mask chooses: all of them, of which those that it leaves out do not count."""
 
-    `within` are other rows [A] to ask, where it is known that the mask chooses only some of them.
-    """
-
-    def __init__(self, mask: Tensor, within: Tensor | None = None) -> None:
+    def __init__(self, mask: Tensor) -> None:
         self.mask = mask
-        self.within = within
 
     def __len__(self) -> int:
         return len(self.mask)
 
     def __getitem__(self, among: "MaskedRows") -> "MaskedRows":
-        return MaskedRows(self.mask & among.mask, among.within)
-
-    @property
-    def counts(self) -> Tensor:
-        """[A] True for the requested rows that count."""
-        return self.mask if self.within is None else self.mask[self.within]
+        return MaskedRows(self.mask & among.mask)
 
     def zero_others(self, values: "DeviceArray") -> "DeviceArray":
-        """Return the values [..., A] of the requested rows, 0 for those that do not count."""
+        """Return the values [..., A] of all rows, 0 for those that do not count."""
         zero = values.tensor.new_zeros(())
-        return DeviceArray(torch.where(self.counts, values.tensor, zero), values.place)
+        return DeviceArray(torch.where(self.mask, values.tensor, zero), values.place)
 
 
 def _method(operation: Callable[..., Tensor]) -> Any:
@@ -137,11 +128,8 @@ class DeviceArray(NDArrayOperatorsMixin):
         gathers = any(isinstance(each, DeviceArray | np.ndarray) for each in parts)
         for each in parts:
             if isinstance(each, MaskedRows):
-                mask = each.counts
-                rows = each.within
-                if rows is None and gathers:
-                    rows = self.place.tensor(np.arange(len(each)))
-                keys.append(slice(None) if rows is None else rows)
+                mask = each.mask
+                keys.append(self.place.tensor(np.arange(len(each))) if gathers else slice(None))
             elif isinstance(each, DeviceArray | np.ndarray):
                 keys.append(_operand(each, self.place))
             else:

@@ -85,6 +85,7 @@ class TracedScene:
             anchors_a_side=math.gcd(stage.hit_anchors, resolution),  # it divides the width
             gather_rays=stage.gather_rays,
             sky_rays=stage.sky_rays,
+            shades_each_ray=not stage.denoises(resolution),
             seed=seed,
         )
 

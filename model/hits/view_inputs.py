@@ -2,7 +2,8 @@
 
 A pixel has rays_a_side^2 rays, whose findings are averaged after shading, as the film does. Light
 from other surfaces is smooth but where it is mirrored. So it is gathered by many rays at few
-anchors, a grid over the picture, and mirrored by one ray for each pixel.
+anchors, a grid over the picture. Mirrors reflect every ray of a pixel, since what they show has
+edges too; of a rougher surface one ray stands for all, unless nothing denoises the picture.
 """
 
 from dataclasses import dataclass, replace
@@ -22,7 +23,7 @@ from model.hits.anchors import (
     gathered_at,
     outgoing_radiance,
 )
-from model.hits.device_arrays import DeviceArray, MaskedRows
+from model.hits.device_arrays import DeviceArray
 from model.hits.direct_light import DirectLight, direct_light, lobe_ray_weight, no_light
 from model.hits.lit_scene import LitScene, PerPoint, Points
 from model.hits.radiosity import SceneLight
@@ -63,11 +64,11 @@ class Channel:
     SHOWN_DIFFUSE = slice(30, 33)
     """Diffuse radiance from them, shadowed: albedo times irradiance, over all rays."""
     MIRRORED = slice(33, 36)
-    """Specular radiance from other surfaces, by one ray; over all rays of the pixel."""
+    """Specular radiance from other surfaces, by mirrored rays; over all rays of the pixel."""
     SEEN_ALBEDO = slice(36, 39)
-    """Diffuse and specular albedo of what that ray met; 0 where it met nothing."""
+    """Diffuse and specular albedo of what those rays met; 0 where they met nothing."""
     SEEN_NEARNESS = slice(39, 40)
-    """1 / (1 + d) for a way of d meters to it; 0 where it met nothing."""
+    """1 / (1 + d) for a way of d meters to it; 0 where they met nothing."""
 
 
 NUM_CHANNELS = 40
@@ -96,6 +97,7 @@ def view_inputs(
     anchors_a_side: int,
     gather_rays: int,
     sky_rays: int = 0,
+    shades_each_ray: bool = False,
     seed: int = 0,
 ) -> ViewInputs:
     """Trace the inputs of a view; equal arguments give equal numbers.
@@ -108,6 +110,7 @@ def view_inputs(
         anchors_a_side: anchors along a side of the picture, a divisor of the resolution.
         gather_rays: of each anchor; 0: nothing is gathered, and nothing mirrored.
         sky_rays: towards the sky from each point that is shaded, where the scene has a sky.
+        shades_each_ray: instead of one of a pixel that meets a single triangle.
         seed: of the noise, which stays where it is on the picture from view to view.
     """
     rays = Rays(c2w, fov_deg, resolution, rays_a_side)
@@ -126,9 +129,10 @@ def view_inputs(
         ),
     )
     sums = np.zeros_like(noise.chance, shape=(NUM_CHANNELS, resolution**2))
+    counts = _RayCounts(sky=sky_rays, lobe=int(gather_rays > 0), shades_each_ray=shades_each_ray)
     for part in blocks(scene, resolution**2):
         of_part = hits.only(part), noise.only(part)
-        _add_pixels(sums[:, part], scene, light, rays, *of_part, sky_rays, int(gather_rays > 0))
+        _add_pixels(sums[:, part], scene, light, rays, *of_part, counts)
     join_gathered()
     return ViewInputs(
         pixels=_average_rays(sums, rays.rays_per_pixel)
@@ -151,6 +155,15 @@ class _Noise(PerPoint):
     """[2, P] for rays to the sky; None without a sky."""
 
 
+@dataclass(frozen=True, kw_only=True)
+class _RayCounts:
+    """Rays of each point that is shaded, and whether each ray of a pixel has a point."""
+
+    sky: int
+    lobe: int
+    shades_each_ray: bool
+
+
 def _add_pixels(
     sums: Floats,
     scene: LitScene,
@@ -158,50 +171,41 @@ def _add_pixels(
     rays: Rays,
     hits: CameraHits,
     noise: _Noise,
-    sky_rays: int,
-    lobe_rays: int,
+    counts: _RayCounts,
 ) -> None:
     """Add what rays find of a block of pixels to its sums [40, P]; on a GPU, in two branches."""
-    block = _shading_points(scene, hits, noise.chance[5], sums)
-    pixel = block.pixel
-    if not len(pixel):
+    block, by_lobe, shading = _shading_points(scene, hits, noise.chance[5], sums, counts)
+    if not len(block.pixel):
         return
-    points = block.points
-    gloss = block.gloss
     with aside(scene.device) as join_direct:
         _add_surface(block, scene, rays.origin)
 
         def on_lamps(some: slice) -> Floats:
-            return spread(noise.on_lamps[:, some][:, :, pixel], block.ray_index)
+            return spread(noise.on_lamps[:, some][:, :, block.pixel], block.ray_index)
 
-        lit = direct_light(scene, points, gloss, on_lamps, lobe_rays=lobe_rays)
+        lit = direct_light(scene, block.points, block.gloss, on_lamps, lobe_rays=counts.lobe)
         _add_light(block, scene, lit)
         if noise.to_sky is not None:
-            lit = no_light(points)
-            shift = noise.to_sky[:, pixel]
-            index = block.ray_index
+            lit = no_light(block.points)
+            shift = noise.to_sky[:, block.pixel]
             add_sky_light(
-                lit, scene, points, gloss, shift, index, rays=sky_rays, lobe_rays=lobe_rays
-            )
+                lit, scene, block.points, block.gloss, shift, block.ray_index,
+                rays=counts.sky, lobe_rays=counts.lobe,
+            )  # fmt: skip
             _add_light(block, scene, lit)
-    by_lobe = block if scene.place is None else replace(block, sums=np.zeros_like(sums))
-    if lobe_rays:
-        u = noise.chance[:5, pixel]
-        u[:2] = spread(u[:2], block.ray_index)
-        shading = block.chosen * np.float32(rays.rays_per_pixel)
-        _add_lobe_rays(by_lobe, scene, light, u, shading, sky_rays)
+    if counts.lobe:
+        u = noise.chance[:5, by_lobe.pixel]
+        u[:2] = spread(u[:2], by_lobe.ray_index)
+        u[3:] = spread(u[3:], by_lobe.ray_index)
+        _add_lobe_rays(by_lobe, scene, light, u, shading, counts.sky)
     join_direct()
-    if by_lobe is not block:
+    if by_lobe.sums is not sums:
         sums[:] += by_lobe.sums
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class _Block:
-    """Points that are shaded together, and where their light is added up.
-
-    One of a pixel whose rays all meet one triangle without textures stands for all of them; else
-    each ray has its own.
-    """
+    """Points that are shaded together, and where their light is added up."""
 
     points: Points
     gloss: Gloss
@@ -213,10 +217,17 @@ class _Block:
     """[P] number of its ray among those of the pixel."""
     weight: NDArray[np.float32]
     """[P] number of the pixel's rays that it stands for."""
-    of_pixels: Floats
-    """[pixels] of all rays of the block, counted ray by ray: the one drawn of each pixel."""
-    chosen: NDArray[np.float32]
-    """[P] 1 for one point of each pixel, drawn evenly from its rays; 0 for others."""
+
+    def only(self, rows: NDArray[np.intp]) -> "_Block":
+        """Return some of the points."""
+        return replace(
+            self,
+            points=self.points.only(rows),
+            gloss=self.gloss.only(rows),
+            pixel=self.pixel[rows],
+            ray_index=self.ray_index[rows],
+            weight=self.weight[rows],
+        )
 
     def add(
         self, channel: slice, values: NDArray[np.float32], rows: NDArray[np.intp] | None = None
@@ -240,9 +251,20 @@ class _Block:
 
 
 def _shading_points(
-    scene: LitScene, hits: CameraHits, chance: NDArray[np.float32], sums: Floats
-) -> _Block:
-    """Return the points of a block of pixels, whose light is added to `sums`."""
+    scene: LitScene,
+    hits: CameraHits,
+    chance: NDArray[np.float32],
+    sums: Floats,
+    counts: _RayCounts,
+) -> tuple[_Block, _Block, Floats]:
+    """Return the points of a block of pixels that are lit, and those whose lobes send a ray.
+
+    One of a pixel whose rays all meet one triangle without textures stands for all of them, where
+    not each ray is shaded; else each ray has its own. Mirrors reflect each ray.
+
+    Returns:
+        both, and the rays [P] of the pixel that each lobe's ray counts for as to surfaces.
+    """
     triangle = hits.triangle
     rays_per_pixel, count = triangle.shape
     drawn_ray = np.minimum((chance * rays_per_pixel).astype(np.intp), rays_per_pixel - 1)
@@ -250,7 +272,13 @@ def _shading_points(
     is_one = (triangle == triangle[0]).all(axis=0)
     if scene.textures is not None:
         is_one &= ~scene.textures.is_textured[triangle[0]]
-    stands = (triangle >= 0) & (alone | ~is_one)
+    if counts.shades_each_ray:
+        is_one &= False
+    sends_one = is_one
+    if counts.lobe:
+        is_mirror = (scene.alpha < SMOOTH_ALPHA) & (brightest(scene.specular) > DIMMEST)
+        sends_one = is_one & ~is_mirror[triangle[0]]
+    stands = (triangle >= 0) & (alone | ~sends_one)
     ray_index, pixel = np.nonzero(stands)
     ray = ray_index * count + pixel
     points = scene.points(
@@ -258,17 +286,23 @@ def _shading_points(
         hits.uv.reshape(2, -1)[:, ray],
         hits.along[ray_index, :, pixel].T.copy(),
     )
-    return _Block(
+    is_there = stands[ray_index, pixel].astype(np.float32)
+    chosen = alone[ray_index, pixel] * is_there * np.float32(rays_per_pixel)
+    weight = np.where(is_one[pixel], chosen, is_there)
+    lit = _Block(
         points=points,
         gloss=gloss_at(scene, points),
         sums=sums,
         pixel=pixel,
         ray_index=ray_index,
-        weight=np.where(is_one[pixel], np.float32(rays_per_pixel), np.float32(1))
-        * stands[ray_index, pixel],
-        chosen=alone[ray_index, pixel].astype(np.float32),
-        of_pixels=drawn_ray * count + np.arange(count),
+        weight=weight,
     )
+    by_lobe = replace(lit, weight=np.where(sends_one[pixel], chosen, is_there))
+    each_alpha = np.float32(np.inf) if counts.shades_each_ray else SMOOTH_ALPHA
+    shading = np.where(by_lobe.gloss.alpha < each_alpha, by_lobe.weight, chosen)
+    if scene.place is None:
+        return lit.only(np.flatnonzero(weight)), by_lobe, shading
+    return lit, replace(by_lobe, sums=np.zeros_like(sums)), shading
 
 
 def _add_surface(block: _Block, scene: LitScene, origin: NDArray[np.float32]) -> None:
@@ -303,8 +337,7 @@ def _add_lobe_rays(
 ) -> None:
     """Add what rays drawn by the lobe meet: lamps, weighed by multiple importance, and surfaces.
 
-    Those that meet nothing bring their share of the sky. What surfaces send back takes a shadow ray
-    each, so one ray of a pixel stands for all.
+    Those that meet nothing bring their share of the sky.
 
     Args:
         u: [5, P] uniform numbers.
@@ -338,15 +371,13 @@ def _add_lobe_rays(
         block.add(Channel.OPEN_SPECULAR, escaped, some)
         block.add(Channel.DIRECT_SPECULAR, np.where(is_hit, np.float32(0), escaped), some)
     shaded = np.flatnonzero(is_hit & (shading[some] > 0))
-    if isinstance(shaded, MaskedRows):
-        shaded = MaskedRows(shaded.mask, block.of_pixels.tensor)
     if len(shaded):
         rows = some[shaded]
         is_sharp = gloss.alpha[shaded] < SMOOTH_ALPHA
         seen = beyond.only(shaded)
         radiance = outgoing_radiance(scene, light, seen, u[2, rows], u[3:5, rows], is_sharp)
-        # `add` counts the rays that a point stands for; here one stands for all of its pixel
-        counts = shading[rows] / block.weight[rows]
+        # `add` multiplies by the rays whose lamps a point stands for
+        counts = shading[rows] / np.maximum(block.weight[rows], np.float32(1))
         block.add(Channel.MIRRORED, radiance * arrives[:, shaded] * counts, rows)
         path = seen.position - points.position[:, shaded]
         albedo = scene.material_at(seen, "diffuse") + scene.material_at(seen, "specular")

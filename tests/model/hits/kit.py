@@ -1,5 +1,7 @@
 """Scenes for the tests of what is traced, as `LitScene` has them."""
 
+from typing import Any
+
 import numpy as np
 
 from model.hits.lit_scene import LitScene
@@ -43,7 +45,13 @@ def corner(
 
 
 def traced(scene: Scene, resolution: int = 32, **changes: int) -> ViewInputs:
-    numbers = {"rays_a_side": 2, "anchors_a_side": 8, "gather_rays": 16, "sky_rays": 4, "seed": 0}
+    numbers: dict[str, Any] = {
+        "rays_a_side": 2,
+        "anchors_a_side": 8,
+        "gather_rays": 16,
+        "sky_rays": 4,
+        "seed": 0,
+    }
     lit, fov_deg = lit_scene(scene), float(scene.fov_deg[0])
     numbers |= changes
     return view_inputs(lit, scene_light(lit), scene.c2w[0], fov_deg, resolution, **numbers)

@@ -152,7 +152,7 @@ def test_before_any_training_what_was_traced_is_passed_on() -> None:
     model = RenderFormer(hits_config(filter_width=0))
     model.initialize(torch.Generator().manual_seed(0))
     scene = corner()
-    inputs = traced(scene, PX)
+    inputs = traced(scene, PX, shades_each_ray=True)
     shown = radiance(picture(model, tensors(scene))[0, 0]).numpy()
     known = inputs.pixels[..., Channel.SHOWN_DIFFUSE] + inputs.pixels[..., Channel.DIRECT_SPECULAR]
     known = known + inputs.pixels[..., Channel.MIRRORED]

@@ -11,7 +11,7 @@ from torch import Tensor
 
 from model.config import hit_stage
 from model.hits.traced import Traced, denoise_traced
-from model.hits.tracing import with_traced
+from model.hits.tracing import lit_scene_of, traced_scene, traced_views, with_traced
 from model.hits.view_inputs import NUM_CHANNELS, Channel
 from model.inference import NeuralRenderer
 from model.renderformer import radiance
@@ -120,6 +120,27 @@ def test_any_width_shows_the_same_scene(resolution: int) -> None:
     many = traced(corner(), 64, rays_a_side=4)
     assert few.pixels.shape == (resolution, resolution, NUM_CHANNELS)
     assert direct(few).mean() == pytest.approx(direct(many).mean(), rel=tolerance)
+
+
+def test_mirrors_show_edges_as_smoothly_as_the_camera() -> None:
+    """2 x 2 rays of a pixel meet what one ray of each of 2 x 2 pixels meets, also in a mirror."""
+    scene = corner(roughness=0.01)
+    half, whole = traced(scene, 32), traced(scene, 64, rays_a_side=1)
+    seen = slice(Channel.SEEN_ALBEDO.start, Channel.SEEN_NEARNESS.stop)
+    wanted = whole.pixels[..., seen].reshape(32, 2, 32, 2, -1).mean(axis=(1, 3))
+    is_mirror = half.pixels[..., Channel.ROUGHNESS][..., 0] == np.float32(0.01)
+    assert is_mirror.sum() > 50
+    # lobes are narrow, and not points: a ray in hundreds meets the other side of an edge
+    apart = np.abs(half.pixels[..., seen] - wanted).max(axis=-1)[is_mirror]
+    assert np.mean(apart > 0.01) < 0.1
+
+
+def test_one_point_of_a_pixel_and_each_ray_bring_the_same_light() -> None:
+    for roughness in (0.01, 0.4):
+        forms = [traced(corner(roughness=roughness), 64, shades_each_ray=each) for each in (0, 1)]
+        for channel in (Channel.SHOWN_DIFFUSE, Channel.DIRECT_SPECULAR, Channel.MIRRORED):
+            one, each = (form.pixels[..., channel].mean() for form in forms)
+            assert one == pytest.approx(each, rel=0.05), (roughness, channel)
 
 
 def test_edges_near_those_of_256_rays_as_rays_grow() -> None:
@@ -269,19 +290,14 @@ def test_it_scales_with_the_lamps_and_is_the_same_in_every_thread() -> None:
 def test_wide_pictures_are_denoised_wherever_their_light_is_traced() -> None:
     scene, config = corner(), hits_config(denoise_from_px=WIDE_PX)
     tensors = scene_tensors(scene)
-    inputs = {
-        (px, which.denoise_from_px): with_traced(tensors, px, which).traced
-        for px in (WIDE_PX, WIDE_PX // 2)
-        for which in (hits_config(), config)
-    }
-    small, plain, wide = (
-        inputs[key] for key in ((WIDE_PX // 2, WIDE_PX), (WIDE_PX, 0), (WIDE_PX, WIDE_PX))
-    )
-    assert small is not None and plain is not None and wide is not None
-    below = inputs[WIDE_PX // 2, 0]
-    assert below is not None and torch.equal(small.pixels_VRRC, below.pixels_VRRC)
-    expected = _denoise(plain.pixels_VRRC, plain.unit_3)
-    assert torch.equal(wide.pixels_VRRC, expected)
+    below = [with_traced(tensors, WIDE_PX // 2, which).traced for which in (hits_config(), config)]
+    assert below[0] is not None and below[1] is not None
+    assert torch.equal(below[0].pixels_VRRC, below[1].pixels_VRRC)
+    cameras = tensors.c2w_V44[:1], tensors.fov_deg_V[:1]
+    noisy = traced_views(traced_scene(lit_scene_of(tensors)), *cameras, WIDE_PX, hit_stage(config))
+    wide = with_traced(tensors, WIDE_PX, config).traced
+    assert wide is not None
+    assert torch.equal(wide.pixels_VRRC, _denoise(noisy.pixels_VRRC, noisy.unit_3))
     model = awake(config, torch.float32)
     with torch.no_grad():
         trained = radiance(
