@@ -184,7 +184,7 @@ def _write_settings(
         "versions": {"torch": torch.__version__, "python": platform.python_version()},
         "threads": torch.get_num_threads(),
         "processes": dist_context.world_size,
-        "muon_precision": state.updater.muon_precision,
+        "muon_precision": state.optimizer.muon_precision,
         **(more or {}),
     }
     now = {
@@ -218,7 +218,7 @@ def _record_execution_changes(
         # the only one that there was
         "muon_precision": (
             header.get("muon_precision", "bfloat16"),
-            state.updater.muon_precision,
+            state.optimizer.muon_precision,
         ),
     }
     for name, (before, after) in now.items():

@@ -40,7 +40,7 @@ class LevelBase:
 
 
 def make_watertight(source: MeasuredSource, settings: AssetSettings) -> LevelBase:
-    """Return the first watertight form of a source that passes the quality checks.
+    """Repair a mesh: return its first watertight form that passes the quality checks.
 
     The checks of a new surface admit twice the area: a plate has two sides.
 

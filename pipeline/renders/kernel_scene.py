@@ -101,6 +101,8 @@ def build_mitsuba_mesh(
 def build_mitsuba_scene(scene: Scene, triangles: NDArray[np.intp], child: Any = None) -> Any:
     """Return a Mitsuba scene of one mesh, whose triangle numbers are positions in `triangles`.
 
+    It has no integrator: `path_kernel.trace` samples its paths, as Mitsuba's `path` would.
+
     One kernel may trace rays into this scene and into `child`. On a GPU all rays of a
     kernel use one OptiX shader binding table, and miss whatever is in another table. A scene that
     has another scene as a child shares its table.

@@ -1,4 +1,4 @@
-"""DataLoader of training datasets, as an IterableDataset: endless batches, decoded by threads.
+"""Endless batches of training datasets, decoded by threads, in place of torch's DataLoader.
 
 Batch i holds the same scenes with the same augmentation wherever the stream starts, for any number
 of ranks and threads: a run resumes by the number of its step, and every start chooses the number of

@@ -80,7 +80,7 @@ def _encode_checkpoint(
     state: TrainState, settings: TrainSettings, data_digest: str, world_size: int
 ) -> bytes:
     """Return the bytes of a checkpoint without its sha256; later steps do not change them."""
-    tensors = state.updater.optimizer_state()
+    tensors = state.optimizer.optimizer_state()
     for name, weight in state.model.named_parameters():
         tensors[f"model/{name}"] = weight.detach()
     if state.ema_model is not None:
@@ -99,7 +99,7 @@ def _encode_checkpoint(
         "history": event_records(state.history),
         "world_size": world_size,
         "threads": torch.get_num_threads(),
-        "muon_precision": state.updater.muon_precision,
+        "muon_precision": state.optimizer.muon_precision,
         **({"extensions": extensions} if (extensions := extension_digests("weights")) else {}),
         "sha256": UNSEALED,
     }
@@ -161,7 +161,7 @@ def restore_state(
         load_tensors(state.ema_model, checkpoint.tensors_under("mean") or weights)
     if updates := state.step - state.skipped_steps:
         tensors = {name: torch.from_numpy(array) for name, array in checkpoint.arrays.items()}
-        state.updater.load_optimizer_state(tensors, updates)
+        state.optimizer.load_optimizer_state(tensors, updates)
     return state
 
 

@@ -287,7 +287,7 @@ _Scaled = tuple[Tensor, float]
 """A weight, and the factor of its learning rate."""
 
 
-class Updater:
+class Optimizer:
     """Updates the weights of a network with AdamW, and the matrices with Muon if configured.
 
     Muon (Jordan et al. 2024) makes the step of a matrix nearly orthogonal, so that its rare

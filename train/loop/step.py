@@ -125,7 +125,7 @@ class Stepper:
     ) -> PendingStats:
         state = self._state
         activity = self.activity
-        state.updater.zero_grad()
+        state.optimizer.zero_grad()
         num_views = sum(batch.noise_BV.numel() for batch in batches)
         sums = torch.zeros(4, dtype=torch.float64, device=self._dist_context.device)
         for index, batch in enumerate(batches):
@@ -154,7 +154,7 @@ class Stepper:
         updates = self._updates if self.defer_sync else state.updates
         applied = torch.isfinite(loss) & torch.isfinite(norm)
         decision = Decision(applied=applied, updates=updates, defer_sync=self.defer_sync)
-        state.updater.step(learning_rate, decision)
+        state.optimizer.step(learning_rate, decision)
         state.update_ema(self._settings.ema_decay, decision)
         self._updates += applied
         self.layers.record_update()

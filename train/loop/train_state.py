@@ -17,7 +17,7 @@ from model.width_scales import scale_start, width_scales
 from storage.seeds import seed_for
 from train.data.bad_samples import BadSampleCounter
 from train.data.order import Mixture
-from train.loop.optimizer import Decision, Updater, Updates, move_towards
+from train.loop.optimizer import Decision, Optimizer, Updates, move_towards
 from train.resume import Event
 from train.settings import Precision, TrainSettings
 
@@ -36,7 +36,7 @@ class TrainState:
 
     model: RenderFormer
     """Network that is trained."""
-    updater: Updater
+    optimizer: Optimizer
     """Optimizers of the weights of `model`."""
     bad_samples: BadSampleCounter
     """Counter of damaged samples so far, with its limit."""
@@ -119,7 +119,7 @@ def new_state(
         ema_model = copy.deepcopy(model).requires_grad_(False)
     return TrainState(
         model=model,
-        updater=Updater(model, settings, muon_precision),
+        optimizer=Optimizer(model, settings, muon_precision),
         bad_samples=BadSampleCounter(settings.most_unusable, bad_counts, advice=_SKIP_ADVICE),
         ema_model=ema_model,
     )

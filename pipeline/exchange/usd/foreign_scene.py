@@ -42,9 +42,10 @@ def build_stage_scene(
     licence: str,
     written: Mapping[str, NDArray[np.float32]],
 ) -> Scene:
-    """Build the scene of a stage at a time; `opened.lost` receives notes on losses.
+    """Read meshes, materials, lights and cameras of a Usd.Stage at a time, as a scene.
 
-    `written` has material rows as Trilight wrote them, by the paths of their prims, where known.
+    `opened.lost` receives notes on losses. `written` has material rows as Trilight wrote them, by
+    the paths of their prims, where known.
 
     Raises:
         TrilightError: a count exceeds its maximum, arrays contradict each other, or the stage lacks

@@ -32,8 +32,8 @@ from train.data.scenes import TrainingScene, training_scene
 from train.loop import optimizer as muon_file
 from train.loop.distributed import DistributedContext
 from train.loop.optimizer import (
+    Optimizer,
     StackedMuon,
-    Updater,
     choose_muon_precision,
     orthogonal,
     split_over_ranks,
@@ -64,10 +64,10 @@ def with_gradients(seed: int = 0) -> RenderFormer:
     return model
 
 
-def moved(model: RenderFormer, updater: Updater) -> dict[str, torch.Tensor]:
+def moved(model: RenderFormer, optimizer: Optimizer) -> dict[str, torch.Tensor]:
     """Return how far every weight moved in one step."""
     before = {name: weight.detach().clone() for name, weight in model.named_parameters()}
-    updater.step(RATE)
+    optimizer.step(RATE)
     return {name: weight.detach() - before[name] for name, weight in model.named_parameters()}
 
 
@@ -77,11 +77,11 @@ def test_without_muon_it_is_torchs_adamw() -> None:
     for ours, theirs in zip(model.parameters(), twin.parameters(), strict=True):
         theirs.grad = None if ours.grad is None else ours.grad.clone()
     settings = tiny_run(weight_decay=0.1)
-    updater = Updater(model, settings, "float32")
-    assert updater.muon_precision is None
+    optimizer = Optimizer(model, settings, "float32")
+    assert optimizer.muon_precision is None
     adamw = torch.optim.AdamW(twin.parameters(), betas=settings.betas, weight_decay=0.1)
     for rate in (RATE, 3 * RATE):
-        updater.step(rate)
+        optimizer.step(rate)
         adamw.param_groups[0]["lr"] = rate
         adamw.step()
     for ours, theirs in zip(model.parameters(), twin.parameters(), strict=True):
@@ -95,7 +95,7 @@ def test_steps_and_not_decay_follow_the_width(muon_rate: float, precision: Preci
     def steps(base: BaseWidths, decay: float) -> dict[str, torch.Tensor]:
         model = with_gradients()
         run = tiny_run(muon_rate=muon_rate, weight_decay=decay, base_widths=base)
-        return moved(model, Updater(model, run, precision))
+        return moved(model, Optimizer(model, run, precision))
 
     plain, scaled = steps(BaseWidths(), 0.0), steps(BASE, 0.0)
     decayed = {name: step - scaled[name] for name, step in steps(BASE, 0.5).items()}
@@ -117,7 +117,9 @@ def test_what_is_said_not_to_decay_does_not() -> None:
     model = with_gradients()
     for weight in model.parameters():
         weight.grad = torch.zeros_like(weight)
-    steps = moved(model, Updater(model, tiny_run(weight_decay=0.5, decayed="matrices"), "float32"))
+    steps = moved(
+        model, Optimizer(model, tiny_run(weight_decay=0.5, decayed="matrices"), "float32")
+    )
     still = {name for name, step in steps.items() if not step.any()}
     weights = dict(model.named_parameters())
     vectors = {name for name, weight in weights.items() if weight.ndim == 1 and weight.any()}
@@ -133,8 +135,8 @@ def test_muon_leaves_inputs_tokens_and_the_head_and_takes_queries_keys_and_value
     for ours, theirs in zip(twin.parameters(), model.parameters(), strict=True):
         assert theirs.grad is not None
         ours.grad = theirs.grad.clone()
-    without = moved(twin, Updater(twin, tiny_run(weight_decay=0), "float32"))
-    steps = moved(model, Updater(model, settings, "float32"))
+    without = moved(twin, Optimizer(twin, tiny_run(weight_decay=0), "float32"))
+    steps = moved(model, Optimizer(model, settings, "float32"))
     for name, step in steps.items():
         by_adamw = torch.equal(step, without[name])
         assert by_adamw == (".layers." not in name or step.ndim != 2), name

@@ -36,7 +36,7 @@ from train.loop import compiled, optimizer
 from train.loop import step as step_module
 from train.loop.checkpoints import read_checkpoint
 from train.loop.compiled import compile_parts, compiled_parts
-from train.loop.optimizer import Decision, Updater, move_along, move_towards
+from train.loop.optimizer import Decision, Optimizer, move_along, move_towards
 from train.loop.step import Stepper, StepReport, predict_log10
 from train.loop.train_state import TrainState, ema_step, new_state
 from train.loss.training_loss import TrainingLoss
@@ -221,7 +221,7 @@ def tensors(state: TrainState) -> dict[str, Tensor]:
     return {
         **state.model.state_dict(),
         **{f"mean/{name}": each for name, each in state.ema_model.state_dict().items()},
-        **state.updater.optimizer_state(),
+        **state.optimizer.optimizer_state(),
     }
 
 
@@ -242,10 +242,10 @@ def test_kernels_update_as_the_host_does_but_for_rounding(
     request: pytest.FixtureRequest,
 ) -> None:
     host, late = with_gradients(), with_gradients()
-    Updater(host, LATE, "float32").step(3e-3)
+    Optimizer(host, LATE, "float32").step(3e-3)
     request.getfixturevalue("late")
     decision = Decision(applied=torch.tensor(True), updates=0, defer_sync=True)
-    Updater(late, LATE, "float32").step(3e-3, decision)
+    Optimizer(late, LATE, "float32").step(3e-3, decision)
     for found, wanted in zip(late.parameters(), host.parameters(), strict=True):
         # units of the last place: the fused kernels add up in another order
         torch.testing.assert_close(found, wanted, rtol=2e-6, atol=1e-8)
