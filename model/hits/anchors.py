@@ -22,7 +22,7 @@ from model.hits.direct_light import chosen_lamp_light, lamp_chances, lobe_ray_we
 from model.hits.lit_scene import LitScene, PerPoint, Points
 from model.hits.radiosity import SceneLight
 from model.hits.reflectance import gloss_at, lobe, sample_lobe
-from model.hits.vectors import Floats, brightest, cosine_direction, dot, spread, unit
+from model.hits.vectors import Floats, at_rows, brightest, cosine_direction, dot, spread, unit
 from storage.conventions import focal_px
 from storage.seeds import rng_for
 
@@ -105,7 +105,7 @@ def _mirrored_radiance(
 ) -> Floats:
     """Return the radiance [3, rows] that some points, which are mirrors, reflect."""
     u_lamp = u[0][rows]
-    on_lamp = u[1][:, rows]
+    on_lamp = at_rows(u[1], rows)
     mirror_points = points.only(rows)
     gloss = gloss_at(scene, mirror_points)
     onward, weight = sample_lobe(gloss, mirror_points, on_lamp)
@@ -117,7 +117,7 @@ def _mirrored_radiance(
     if len(lit) and len(scene.lamps):  # on a GPU, `lit` are all rows
         some = mirror_points.only(lit)
         lamp_points = beyond.only(lit)
-        along = onward[:, lit]
+        along = at_rows(onward, lit)
         _, density = lobe(gloss.only(lit), some, along, dot(some.normal, along))
         number = np.searchsorted(scene.lamps, lamp_points.triangle).clip(0, len(scene.lamps) - 1)
         chance = chances[number, rows[lit]]

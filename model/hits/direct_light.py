@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from model.hits.lit_scene import LitScene, Points, off_surface
 from model.hits.reflectance import Gloss, lobe
-from model.hits.vectors import Floats, as_rows, brightest, dot
+from model.hits.vectors import Floats, as_rows, at_rows, brightest, dot
 
 _INV_PI = np.float32(1 / np.pi)
 
@@ -143,7 +143,7 @@ def lobe_ray_weight(
         chance: [P] with which the lamp would have been chosen there; of `direct_light`, 1.
     """
     to_hit = hit_points.position - start
-    facing = np.abs(dot(scene.plane[:, hit_points.triangle], hit_points.to_viewer))
+    facing = np.abs(dot(at_rows(scene.plane, hit_points.triangle), hit_points.to_viewer))
     square = np.maximum(dot(to_hit, to_hit), np.float32(1e-12))
     solid = (
         facing * scene.area[hit_points.triangle] / square / np.maximum(chance, np.float32(1e-12))
@@ -209,7 +209,7 @@ def chosen_lamp_light(
     square = np.maximum(dot(to_lamp, to_lamp), np.float32(1e-12))
     to_lamp = to_lamp / np.sqrt(square)
     cosine = dot(points.normal, to_lamp)
-    solid = np.abs(dot(scene.plane[:, lamp], to_lamp)) * scene.area[lamp] / square / chance
+    solid = np.abs(dot(at_rows(scene.plane, lamp), to_lamp)) * scene.area[lamp] / square / chance
     value, density = lobe(gloss, points, to_lamp, cosine)
     value = value / (1 + np.where(has_lobe_ray, np.square(density * solid), np.float32(0)))
     albedo = scene.material_at(points, "diffuse")
@@ -227,7 +227,7 @@ def _is_free(
     if not len(rows):
         return np.zeros(0, np.bool_)
     position, plane, place, to_lamp = (
-        np.broadcast_to(each, place.shape).reshape(3, -1)[:, rows]
+        at_rows(np.broadcast_to(each, place.shape).reshape(3, -1), rows)
         for each in (points.position, points.geometric_normal, place, to_lamp)
     )
     start = off_surface(position, plane, to_lamp)
@@ -239,7 +239,7 @@ def _is_free(
 def _on_triangle(scene: LitScene, rows: NDArray[np.intp], u: Floats) -> Floats:
     """Return points [3, ...], evenly spread over triangles [...] for u [2, ...] from 0 to 1."""
     root = np.sqrt(u[0])
-    corners = scene.corners[:, :, rows]
+    corners = at_rows(scene.corners, rows)
     place: Floats = corners[0] * (1 - root)
     place += corners[1] * (root * (1 - u[1]))
     place += corners[2] * (root * u[1])

@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from model.hits.device_arrays import DeviceArray, DevicePlace
 from model.hits.sky_sampler import SkySampler
 from model.hits.textures import DeviceTextures, SurfaceTextures
-from model.hits.vectors import Floats, as_rows, brightest, dot, unit
+from model.hits.vectors import Floats, as_rows, at_rows, brightest, dot, unit
 from storage.optics.bsdf import bsdf_lobes
 from storage.optics.multiscatter import scattered_again
 from storage.raycast.caster import RayCaster, RayHits, Triangles
@@ -34,9 +34,12 @@ class PerPoint:
 
     def only(self, rows: Any) -> Self:
         """Return some of them; of None, all with an axis before that of points."""
-        index = (..., None, slice(None)) if rows is None else (..., rows)
         some = {
-            name: each.only(rows) if isinstance(each, PerPoint) else each[index]
+            name: each.only(rows)
+            if isinstance(each, PerPoint)
+            else each[..., None, :]
+            if rows is None
+            else at_rows(each, rows)
             for name, each in vars(self).items()
             if each is not None
         }
@@ -216,7 +219,7 @@ class LitScene:
         weights = np.stack([1 - uv[0] - uv[1], uv[0], uv[1]])
         position = _between(self.corners, triangle, weights)
         normal = unit(_between(self.normals, triangle, weights))
-        plane = self.plane[:, triangle]
+        plane = at_rows(self.plane, triangle)
         back = dot(plane, direction) > 0
         # as the renderer: the triangle's own normal goes with the shading normal, then both turn
         plane = plane * np.where(dot(plane, normal) < 0, np.float32(-1), np.float32(1))

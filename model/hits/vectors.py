@@ -1,5 +1,7 @@
 """Vectors [3, P] of many points, component by component; float32."""
 
+from typing import Any
+
 import numpy as np
 from numpy.typing import NDArray
 
@@ -26,6 +28,11 @@ def dot(a: Floats, b: Floats) -> Floats:
 def brightest(a: Floats) -> Floats:
     """Return [P] the largest of the three components."""
     return np.maximum(np.maximum(a[0], a[1]), a[2])
+
+
+def at_rows(array: Floats, rows: Any) -> Floats:
+    """Return some rows of the last axis; numpy's `take` is five times as fast as an index."""
+    return np.take(array, rows, axis=-1) if isinstance(rows, np.ndarray) else array[..., rows]
 
 
 def unit(a: Floats) -> Floats:

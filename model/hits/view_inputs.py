@@ -29,7 +29,7 @@ from model.hits.lit_scene import LitScene, PerPoint, Points
 from model.hits.radiosity import SceneLight
 from model.hits.reflectance import Gloss, gloss_at, lobe, sample_lobe
 from model.hits.sky_light import add_sky_light, escaped_light
-from model.hits.vectors import Floats, brightest, dot, spread
+from model.hits.vectors import Floats, at_rows, brightest, dot, spread
 from model.replayed import aside
 from storage.seeds import rng_for
 
@@ -181,7 +181,7 @@ def _add_pixels(
         _add_surface(block, scene, rays.origin)
 
         def on_lamps(some: slice) -> Floats:
-            return spread(noise.on_lamps[:, some][:, :, block.pixel], block.ray_index)
+            return spread(at_rows(noise.on_lamps[:, some], block.pixel), block.ray_index)
 
         lit = direct_light(scene, block.points, block.gloss, on_lamps, lobe_rays=counts.lobe)
         _add_light(block, scene, lit)
@@ -194,7 +194,7 @@ def _add_pixels(
             )  # fmt: skip
             _add_light(block, scene, lit)
     if counts.lobe:
-        u = noise.chance[:5, by_lobe.pixel]
+        u = at_rows(noise.chance[:5], by_lobe.pixel)
         u[:2] = spread(u[:2], by_lobe.ray_index)
         u[3:] = spread(u[3:], by_lobe.ray_index)
         _add_lobe_rays(by_lobe, scene, light, u, shading, counts.sky)
@@ -283,8 +283,8 @@ def _shading_points(
     ray = ray_index * count + pixel
     points = scene.points(
         np.maximum(triangle.reshape(-1)[ray], 0),
-        hits.uv.reshape(2, -1)[:, ray],
-        hits.along[ray_index, :, pixel].T.copy(),
+        at_rows(hits.uv.reshape(2, -1), ray),
+        at_rows(hits.along.swapaxes(0, 1).reshape(3, -1), ray),
     )
     is_there = stands[ray_index, pixel].astype(np.float32)
     chosen = alone[ray_index, pixel] * is_there * np.float32(rays_per_pixel)
@@ -344,10 +344,12 @@ def _add_lobe_rays(
         shading: [P] rays of the pixel that a ray counts for as to surfaces; 0: it counts for none.
     """
     some = np.flatnonzero(brightest(block.gloss.color) > DIMMEST)
-    direction, weight = sample_lobe(block.gloss.only(some), block.points.only(some), u[:2, some])
+    direction, weight = sample_lobe(
+        block.gloss.only(some), block.points.only(some), at_rows(u[:2], some)
+    )
     goes = np.flatnonzero(weight > 0)
     some = some[goes]
-    direction = direction[:, goes]
+    direction = at_rows(direction, goes)
     weight = weight[goes]
     if not len(some):
         return
@@ -359,11 +361,11 @@ def _add_lobe_rays(
     if len(lamps):
         glossy_points = points.only(lamps)
         lamp_points = beyond.only(lamps)
-        along = direction[:, lamps]
+        along = at_rows(direction, lamps)
         _, density = lobe(gloss.only(lamps), glossy_points, along, dot(glossy_points.normal, along))
         mis_weight = lobe_ray_weight(scene, lamp_points, glossy_points.position, density)
         emission = np.take(scene.emission, lamp_points.triangle, axis=1)
-        emitted = arrives[:, lamps] * emission * mis_weight
+        emitted = at_rows(arrives, lamps) * emission * mis_weight
         block.add(Channel.DIRECT_SPECULAR, emitted, some[lamps])
         block.add(Channel.OPEN_SPECULAR, emitted, some[lamps])
     if scene.sky is not None:
@@ -378,8 +380,8 @@ def _add_lobe_rays(
         radiance = outgoing_radiance(scene, light, seen, u[2, rows], u[3:5, rows], is_sharp)
         # `add` multiplies by the rays whose lamps a point stands for
         counts = shading[rows] / np.maximum(block.weight[rows], np.float32(1))
-        block.add(Channel.MIRRORED, radiance * arrives[:, shaded] * counts, rows)
-        path = seen.position - points.position[:, shaded]
+        block.add(Channel.MIRRORED, radiance * at_rows(arrives, shaded) * counts, rows)
+        path = seen.position - at_rows(points.position, shaded)
         albedo = scene.material_at(seen, "diffuse") + scene.material_at(seen, "specular")
         block.add(Channel.SEEN_ALBEDO, albedo * counts, rows)
         block.add(Channel.SEEN_NEARNESS, (counts / (1 + np.sqrt(dot(path, path))))[None], rows)
