@@ -29,10 +29,6 @@ from tests.pipeline.generation.test_dataset_writer import ENVIRONMENT, _build
 from tests.s3_server import Line, control
 from tests.storage.remote.conftest import SHARD, expected, read, with_changed_byte
 
-pytest.importorskip("s3fs", reason="needs the package s3fs (setup-all)")
-pytest.importorskip("moto", reason="needs the package moto with its server (setup-all)")
-
-
 pytest.importorskip("gcsfs", reason="gs:// needs the package gcsfs")
 emulator: Any = pytest.importorskip(
     "gcp_storage_emulator.server", reason="needs the package gcp-storage-emulator"
