@@ -15,6 +15,7 @@ import pytest
 
 from tests.command_line import run_program
 from tests.command_line import trilight as run_here
+from tests.s3_server import moto as moto
 
 Trilight = Callable[..., "subprocess.CompletedProcess[str]"]
 
