@@ -1,6 +1,7 @@
-"""The web server of the tests: files of memory or of a folder, ranges, counts, all breakages."""
+"""Web servers of tests: any handler, and files of memory or a folder with all breakages."""
 
 import hashlib
+import json
 import threading
 import time
 from collections import Counter
@@ -132,18 +133,50 @@ class Site:
             return always or (self.faults[path].pop(0) if self.faults.get(path) else Fault())
 
 
-class _Handler(BaseHTTPRequestHandler):
-    site: Site
+class Handler(BaseHTTPRequestHandler):
+    """Answers without a word on standard error."""
+
     protocol_version = "HTTP/1.1"
+
+    def log_message(self, format: str, *args: object) -> None:
+        """Say nothing."""
+
+    def reply(self, status: int, body: bytes, **headers: str) -> None:
+        """Answer as a whole; underscores in the names of headers stand for hyphens."""
+        self.send_response(status)
+        for name, value in {**headers, "Content_Length": str(len(body))}.items():
+            self.send_header(name.replace("_", "-"), value)
+        self.end_headers()
+        self.wfile.write(body)
+
+    def reply_json(self, value: object, status: int = 200) -> None:
+        """Answer with a document."""
+        self.reply(status, json.dumps(value).encode(), Content_Type="application/json")
+
+
+@contextmanager
+def running(handler: type[Handler], **given: object) -> Iterator[str]:
+    """Run a server, whose handlers have these attributes; give its URL on the loopback."""
+    server = ThreadingHTTPServer(("127.0.0.1", 0), type("Given", (handler,), given))
+    server.daemon_threads = True
+    thread = threading.Thread(target=server.serve_forever, kwargs={"poll_interval": 0.02})
+    thread.start()
+    try:
+        yield f"http://127.0.0.1:{server.server_address[1]}"
+    finally:
+        server.shutdown()
+        thread.join()
+        server.server_close()
+
+
+class _SiteHandler(Handler):
+    site: Site
 
     def do_HEAD(self) -> None:
         self._answer()
 
     def do_GET(self) -> None:
         self._answer()
-
-    def log_message(self, format: str, *args: object) -> None:
-        """Say nothing."""
 
     def _answer(self) -> None:
         site = self.site
@@ -212,16 +245,8 @@ class _Handler(BaseHTTPRequestHandler):
 def serve(root: Path | None = None) -> Iterator[Site]:
     """Run a server on a free port of the loopback; `Site.url` has no final slash."""
     site = Site(root)
-    handler = type("Handler", (_Handler,), {"site": site})
-    server = ThreadingHTTPServer(("127.0.0.1", 0), handler)
-    server.daemon_threads = True
-    thread = threading.Thread(target=server.serve_forever, kwargs={"poll_interval": 0.02})
-    thread.start()
-    site.url = f"http://127.0.0.1:{server.server_address[1]}"
-    try:
-        yield site
-    finally:
-        site.closing.set()
-        server.shutdown()
-        thread.join()
-        server.server_close()
+    with running(_SiteHandler, site=site) as site.url:
+        try:
+            yield site
+        finally:
+            site.closing.set()

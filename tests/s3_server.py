@@ -9,6 +9,8 @@ import urllib.request
 from collections.abc import Iterator
 from contextlib import contextmanager, suppress
 
+import pytest
+
 CREDENTIALS = {
     "AWS_ACCESS_KEY_ID": "ada",
     "AWS_SECRET_ACCESS_KEY": "s3cret",
@@ -68,6 +70,15 @@ def s3_server() -> Iterator[int]:
     finally:
         server.kill()
         server.wait()
+
+
+@pytest.fixture(scope="session")
+def moto() -> Iterator[int]:
+    """Run the server for all tests of a folder; returns its port."""
+    pytest.importorskip("s3fs", reason="needs the package s3fs (setup-all)")
+    pytest.importorskip("moto", reason="needs the package moto with its server (setup-all)")
+    with s3_server() as port:
+        yield port
 
 
 def control(port: int, what: str, data: bytes = b"") -> None:

@@ -194,3 +194,13 @@ def test_no_file_names_this_machine() -> None:
         if (match := pattern.search(path.read_text()))
     ]
     assert not found
+
+
+def test_next_steps_are_printed_in_one_place() -> None:
+    """So that one test can run them all; `make serve` prints the documents' own lines."""
+    found = {
+        path.relative_to(ROOT).as_posix()
+        for path in _sources("infra", "pipeline", "storage", "train", "model")
+        if re.search(r"Next(?: step)?:", path.read_text())
+    }
+    assert found == {"infra/cli/console.py", "infra/serving/local.py"}

@@ -17,11 +17,7 @@ from pipeline.documents.scene_page import Neighbours, encode_scene_page
 from storage.digests import sha256_hex
 from storage.errors import TrilightError
 from storage.records.exr import decode_exr, encode_channels, encode_exr
-from storage.records.lights import (
-    decode_parts_exr,
-    encode_parts_exr,
-    num_lights,
-)
+from storage.records.lights import decode_parts_exr, encode_parts_exr
 from storage.records.packed_maps import MAP_NAME
 from storage.records.passes.pictures import passes_exr
 from storage.records.sample import PartFloor, Sample, decode_sample, decode_scene, encode_sample
@@ -40,36 +36,31 @@ _PARTS = ("direct", "indirect")
 
 
 def _sample() -> Sample:
-    """Return a sample with its only light, parts and a pass apart: every kind of member exists."""
+    """Return a sample in which every kind of member exists, and every name and right is stated.
+
+    It is textured, below a sky, with its lights, their parts and a pass apart.
+    """
+    rights = MapSource(name="n", licence="CC-BY-4.0", attribution="a", source_url="https://x.org")
+    scene = bumpy_scene(environment=sky(source=rights))
+    textures = tuple(dataclasses.replace(texture, source=rights) for texture in scene.textures)
+    scene = dataclasses.replace(scene, textures=textures)
     sample = tiny_sample(resolution=_PIXELS)
-    packed = [passes_exr(sample.scene, ["object"], view=v, resolution=_PIXELS) for v in range(2)]
-    lights = sample.radiance_rgb[:, None]
+    packed = [passes_exr(scene, ["object"], view=view, resolution=_PIXELS) for view in range(2)]
+    black = np.zeros_like(sample.radiance_rgb)
+    lights = np.stack([sample.radiance_rgb, black], axis=1)  # the sky is one more
     floor = PartFloor(noise_floor_db=40.0, noise_floor_linear_db=30.0, object_noise_floor_db=39.0)
     views = [dataclasses.replace(view, parts=dict.fromkeys(_PARTS, floor)) for view in sample.views]
-    parts = dict(zip(_PARTS, (lights, np.zeros_like(lights)), strict=True))
     return dataclasses.replace(
         sample,
+        scene=scene,
         lights_rgb=lights,
-        parts_rgb=parts,
+        parts_rgb=dict(zip(_PARTS, (lights, np.zeros_like(lights)), strict=True)),
         passes_exr=tuple(packed),
         views=tuple(views),
     )
 
 
-def _textured() -> Sample:
-    """Return a textured sample below a sky, of which every name and right is filled in."""
-    scene = bumpy_scene()
-    rights = MapSource(name="n", licence="CC-BY-4.0", attribution="a", source_url="https://x.org")
-    textures = tuple(dataclasses.replace(texture, source=rights) for texture in scene.textures)
-    scene = dataclasses.replace(scene, textures=textures, environment=sky(source=rights))
-    plain = _sample()
-    assert plain.lights_rgb is not None and plain.parts_rgb is not None
-    lights, *parts = (  # the sky is one more light
-        np.concatenate([pictures, np.zeros_like(pictures)], axis=1)
-        for pictures in (plain.lights_rgb, *plain.parts_rgb.values())
-    )
-    by_name = dict(zip(_PARTS, parts, strict=True))
-    return dataclasses.replace(plain, scene=scene, lights_rgb=lights, parts_rgb=by_name)
+MEMBERS = encode_sample(_sample())
 
 
 def _consumed(members: Members) -> str:
@@ -87,7 +78,7 @@ def _consumed(members: Members) -> str:
     except TrilightError as error:
         return str(error)
     page = encode_scene_page(sample, "train", [], Neighbours(report="", before=None, after=None))
-    names = ["object", *(["uv", "material_diffuse"] if sample.scene.textures else [])]
+    names = ["object", "uv", "material_diffuse"]
     seen = [sample.view_passes(names, view=view) for view in range(2)]
     passes = [each[name].tobytes() for each in seen for name in names]
     return sha256_hex(b"".join([*_tensors(scene), *passes, json.dumps(values).encode(), page]))
@@ -165,8 +156,7 @@ def _brighter_picture(members: Members) -> None:
 
 def _brighter_parts(what: str, names: Sequence[str]) -> Change:
     def change(members: Members) -> None:
-        num = num_lights(_sample().scene)
-        parts = decode_parts_exr(members[f"1.{what}.exr"], names, (_PIXELS, _PIXELS), num)
+        parts = decode_parts_exr(members[f"1.{what}.exr"], names, (_PIXELS, _PIXELS), 2)
         brighter = {name: 2 * part for name, part in parts.items()}
         members[f"1.{what}.exr"] = encode_parts_exr(brighter)
 
@@ -180,12 +170,12 @@ def _other_objects(members: Members) -> None:
 
 
 def _changes() -> dict[str, Change]:
-    members = encode_sample(_sample())
     changes: dict[str, Change] = {
         f"{RECORD} {'.'.join(map(str, path))}": _change_record(path)
-        for path in _leaves(json.loads(members[RECORD]))
+        for path in _leaves(json.loads(MEMBERS[RECORD]))
     }
-    changes |= {f"{ARRAYS} {name}": _change_array(name) for name in sorted(load(members[ARRAYS]))}
+    changes |= {f"{ARRAYS} {name}": _change_array(name) for name in sorted(load(MEMBERS[ARRAYS]))}
+    changes |= {name: _other_map(name) for name in filter(MAP_NAME.fullmatch, MEMBERS)}
     return changes | {
         "1.exr": _brighter_picture,
         "1.lights.exr": _brighter_parts("lights", ("",)),
@@ -198,53 +188,23 @@ CHANGES = _changes()
 
 
 def test_a_consumer_reads_every_member() -> None:
-    members = encode_sample(_sample())
-    before = _consumed(dict(members))
-    for stored, change in CHANGES.items():
-        changed = dict(members)
-        change(changed)
-        assert _consumed(changed) != before, stored
-
-
-def _changes_of_maps() -> dict[str, Change]:
-    """Return changes of all that a textured sample has, and others have not."""
-    members = encode_sample(_textured())
-    paths = _leaves(json.loads(members[RECORD])["maps"], ("maps",))
-    changes = {f"{RECORD} {'.'.join(map(str, path))}": _change_record(path) for path in paths}
-    more = set(load(members[ARRAYS])) - set(load(encode_sample(_sample())[ARRAYS]))
-    changes |= {f"{ARRAYS} {name}": _change_array(name) for name in sorted(more)}
-    return changes | {name: _other_map(name) for name in filter(MAP_NAME.fullmatch, members)}
-
-
-CHANGES_OF_MAPS = _changes_of_maps()
-
-
-def test_a_consumer_reads_every_member_of_a_textured_sample() -> None:
-    members = encode_sample(_textured())
-    before = _consumed(dict(members))
+    before = _consumed(dict(MEMBERS))
     assert len(before) == 64, "a digest, and no refusal"
-    for stored, change in CHANGES_OF_MAPS.items():
-        changed = dict(members)
+    for stored, change in CHANGES.items():
+        changed = dict(MEMBERS)
         change(changed)
         assert _consumed(changed) != before, stored
-
-
-def test_every_member_of_a_textured_sample_is_changed_above() -> None:
-    parts = {"maps_sha256", "uv", "material_textures", "normal_textures"}
-    assert {stored.partition(" ")[2] for stored in CHANGES_OF_MAPS if ARRAYS in stored} == parts
-    maps = {name for name in CHANGES_OF_MAPS if MAP_NAME.fullmatch(name)}
-    assert maps == {name for name in encode_sample(_textured()) if MAP_NAME.fullmatch(name)}
-    assert len(maps) == 4
 
 
 def test_every_member_is_changed_above() -> None:
     """Members that come with more views are of the same kinds."""
-    of_the_second_view = {suffix.replace("0.", "1.", 1) for suffix in encode_sample(_sample())}
+    of_the_second_view = {suffix.replace("0.", "1.", 1) for suffix in MEMBERS}
     assert of_the_second_view == {stored.partition(" ")[0] for stored in CHANGES}
+    assert len(list(filter(MAP_NAME.fullmatch, CHANGES))) == 4
 
 
 def test_what_nobody_reads_would_be_found() -> None:
-    members = encode_sample(_sample())
+    members = dict(MEMBERS)
     before = _consumed(members)
     record = json.loads(members[RECORD])
     record["extra"] = 1

@@ -13,8 +13,9 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from infra.cli.app import main
 from tests.command_line import run_program
+from tests.command_line import trilight as run_here
+from tests.s3_server import moto as moto
 
 Trilight = Callable[..., "subprocess.CompletedProcess[str]"]
 
@@ -30,30 +31,10 @@ def trilight(tmp_path: Path) -> Trilight:
 
 
 @pytest.fixture
-def refused(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> Callable[..., str]:
+def refused(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Callable[..., str]:
     """Run `trilight` with a mistake in this process, which spares its imports; return its line."""
-
-    def leave(message: str, status: int) -> None:
-        sys.stderr.write(f"{message}\n")
-        raise SystemExit(status)
-
-    def run(*arguments: str) -> str:
-        monkeypatch.chdir(tmp_path)
-        monkeypatch.setattr(sys, "argv", ["trilight", *arguments])
-        monkeypatch.setenv("OMP_WAIT_POLICY", "PASSIVE")  # as main would, for good
-        monkeypatch.setattr("infra.cli.app.leave", leave)
-        monkeypatch.setattr(signal, "signal", lambda number, handler: None)
-        with pytest.raises(SystemExit) as left:
-            main()
-        printed = capsys.readouterr()
-        assert left.value.code in (1, 2), printed.out  # 2: no command line at all
-        (line,) = [line for line in printed.err.splitlines() if line.strip()]
-        assert line.startswith("trilight: ")
-        return line
-
-    return run
+    monkeypatch.chdir(tmp_path)
+    return lambda *arguments: run_here(arguments).mistake
 
 
 def command(*arguments: str) -> list[str]:

@@ -15,10 +15,7 @@ from tests.end_to_end.production_kit import FEW_SAMPLES, FEW_SAMPLES_CHANGES, ca
 from tests.http_server import serve
 from tests.pipeline.assets.meshes_by_hand import knot, write_obj
 from tests.pipeline.generation.bucket_kit import empty_bucket
-from tests.s3_server import control, s3_server
-
-pytest.importorskip("s3fs", reason="needs the package s3fs (setup-all)")
-pytest.importorskip("moto", reason="needs the package moto with its server (setup-all)")
+from tests.s3_server import control
 
 CANARY = "CANARY-93ce"
 """Part of every secret; nothing that is written or said may contain it."""
@@ -44,9 +41,9 @@ with private.prefect_server():
 
 
 @pytest.fixture
-def driver(monkeypatch: pytest.MonkeyPatch) -> Iterator[Any]:
-    with s3_server() as port, empty_bucket(port, monkeypatch) as bucket:
-        bucket.port = port
+def driver(moto: int, monkeypatch: pytest.MonkeyPatch) -> Iterator[Any]:
+    with empty_bucket(moto, monkeypatch) as bucket:
+        bucket.port = moto
         yield bucket
 
 

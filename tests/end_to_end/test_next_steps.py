@@ -12,7 +12,6 @@ from pathlib import Path
 
 import pytest
 
-from infra.cli.process_exit import temporary_folder
 from storage.dataset.manifest import read_manifest
 from tests.command_line import run_program
 from tests.conftest import ROOT
@@ -88,12 +87,6 @@ def test_ctrl_c_while_libraries_are_loaded_leaves_no_traceback(tmp_path: Path) -
     (tmp_path / "cyclopts.py").write_text("import signal\nsignal.raise_signal(signal.SIGINT)\n")
     path = os.pathsep.join([str(tmp_path), str(ROOT)])
     assert run_program(command("doctor"), status=130, PYTHONPATH=path).stderr == ""
-
-
-def test_a_temporary_folder_is_gone_after_its_block() -> None:
-    with temporary_folder("trilight-test-") as folder:
-        (folder / "file").touch()
-    assert not folder.exists()
 
 
 def test_an_error_is_one_line_without_a_bar_before_it(tmp_path: Path) -> None:

@@ -22,27 +22,8 @@ from storage.records.passes.pictures import view_passes
 from tests.command_line import run_program, trilight
 from tests.conftest import ROOT
 from tests.end_to_end.conftest import Trilight
-from tests.end_to_end.production_kit import SIXTEEN_SAMPLES, copy_objects
+from tests.end_to_end.production_kit import SIXTEEN_SAMPLES
 from tests.foreign_packages import foreign_packages, nerfstudio_pictures
-
-SMALL = ("--resolution", "32", "--noise-floor", "20", "--scenes", "4", *SIXTEEN_SAMPLES)
-
-
-@pytest.mark.slow("commands")
-def test_real_objects_with_their_licences(trilight: Trilight, shared: Path, tmp_path: Path) -> None:
-    rows = [json.loads(row) for row in (shared / "objects/objects.jsonl").open()]
-    refusable = [row for row in rows if row["licence"] != "CC0-1.0"]
-    chosen = [*refusable, *(row for row in rows[:24] if row not in refusable)]
-    objects = copy_objects(shared / "objects", tmp_path / "objects", chosen)
-    trilight("generate", "smoke", "--objects", str(objects), "--out", "set", *SMALL)
-    dataset = open_dataset(str(tmp_path / "set"))
-    refused = [f for f in read_failures(dataset.folder.failures) if f.stage == "objects"]
-    assert len(refused) == 5
-    assert {failure.reason for failure in refused} == {"licence_refused"}
-    used = {o.licence for s in dataset.manifest.shards for x in dataset.read_shard(s)
-            for o in x.scene.objects}  # fmt: skip
-    assert used == {"CC0-1.0"}
-
 
 BAD_INPUT = [
     (("generate", "nonsense"), "dataset preset 'nonsense' is unknown; expected one of tiny, smoke"),

@@ -22,7 +22,6 @@ import pytest
 
 from pipeline.generation.generation_run import Piece, ShardJob, TaskResult
 from pipeline.generation.pipeline import make_dataset
-from storage.dataset.dataset import open_dataset
 from storage.dataset.layout import DatasetFolder
 from storage.dataset.scene_logs import decode_scene_log
 from storage.dataset.verify import verify_dataset
@@ -36,25 +35,6 @@ from train.data.order import visits_from
 def scenes(monkeypatch: pytest.MonkeyPatch) -> list[tuple[str, int]]:
     """Split and number of each scene that is made, without objects and pictures."""
     return without_rendering(monkeypatch)
-
-
-def test_ranges_of_one_shard_in_any_order_are_the_whole(
-    tmp_path: Path, scenes: list[tuple[str, int]]
-) -> None:
-    make_dataset(tiny_order(out=str(tmp_path / "whole"), scenes=16), Undocumented())
-    scenes.clear()
-    finished = []
-    for first in (2, 0, 3, 1):
-        runner = Undocumented()
-        part = tiny_order(out=str(tmp_path / "set"), scenes=16, shards=f"{first}:{first + 1}")
-        outcome = make_dataset(part, runner)
-        finished.append(runner.finished)
-        assert [scene // 4 for _, scene in scenes[-4:]] == [first] * 4
-    assert (outcome.num_shards, outcome.num_shards_planned) == (4, 4)
-    assert finished == [0, 0, 0, 1]  # whoever makes the last one, and nobody else
-    assert len(scenes) == 16
-    whole = open_dataset(str(tmp_path / "whole"))
-    assert outcome.digest == whole.digest == open_dataset(str(tmp_path / "set")).digest
 
 
 class _Counting(Undocumented):

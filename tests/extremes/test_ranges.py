@@ -44,7 +44,6 @@ from storage.errors import TrilightError
 from storage.records.material import PUBLISHED_COLUMNS, laid_out
 from storage.records.scene import MAP_ARRAYS, MAX_TEXTURES, Scene
 from storage.records.texture import CONSTANT
-from storage.settings.described import checked
 from storage.settings.fields import FieldDescription, describe_fields
 from storage.settings.ranges import Within
 from tests.conftest import ROOT
@@ -281,20 +280,6 @@ def test_no_class_of_settings_is_forgotten() -> None:
     reached = {settings.__name__ for settings, _ in FIELDS}
     assert named - reached - set(INTERNAL) == {"GenerateOptions"}, "which DatasetInRuns is"
     assert set(EXAMPLES) == {settings for settings, _ in FIELDS}
-
-
-def test_what_is_checked_is_what_is_declared() -> None:
-    """A field is looked at by its range and by nothing before it: the first wrong one is named."""
-
-    @checked("group")
-    class Group:
-        share: Annotated[float, Within(0, 1, high_open=True, unit="parts")] = 0.5
-
-    Group(share=0.0)
-    with pytest.raises(TrilightError) as caught:
-        Group(share=1.0)
-    expected = "group: share is 1.0; expected a number from 0 to below 1 parts."
-    assert str(caught.value) == expected
 
 
 DESCRIBED = {field.name: field for field in describe_fields(Scene)}

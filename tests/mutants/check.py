@@ -2,28 +2,33 @@
 
 Each change is made in a copy of the tracked tree; its test must fail there, and pass without it.
 What the list holds with a reason in place of a test (`equivalent`, `removed`) is left out.
+Changes of single lines were drawn twice by a seed, so many of each kind and package; commit
+880f3fa6 has the program, `tests/mutants/draw.py`.
 """
 
 import argparse
+import ast
 import importlib
+import itertools
 import json
 import os
 import shutil
 import subprocess
 import sys
 import tempfile
+from collections.abc import Iterator
 from importlib.util import cache_from_source
 from pathlib import Path
 
 import pytest
 
+from infra.setup.wheel_tree import PACKAGES
 from tests.conftest import ROOT
-from tests.mutants.draw import PACKAGES, Source
 
 LIST = Path(__file__).parent / "mutants.jsonl"
 LIBRARIES = ("numpy", "scipy.sparse", "torch", "trimesh")
 """They are imported once, before processes are forked; no mutant changes them."""
-OURS = ("tests", *PACKAGES)
+OURS = ("tests", "trilight", *PACKAGES)
 OPTIONS = ("-x", "-m", "", "-p", "no:cacheprovider", "-o", "timeout=300")  # no end: it noticed
 
 
@@ -37,10 +42,25 @@ def copied_tree(folder: Path) -> Path:
     return folder
 
 
+def definitions(text: str) -> Iterator[tuple[str, int, int]]:
+    """Yield the dotted name and the offsets of each function and class, and of the module."""
+    yield "<module>", 0, len(text)
+    starts = [0, *itertools.accumulate(map(len, text.splitlines(keepends=True)))]
+    tree = ast.parse(text)
+    names: dict[ast.AST, str] = {tree: ""}
+    for parent in ast.walk(tree):
+        for node in ast.iter_child_nodes(parent):
+            names[node] = names[parent]
+            if isinstance(node, ast.FunctionDef | ast.AsyncFunctionDef | ast.ClassDef):
+                names[node] = f"{names[parent]}.{node.name}".lstrip(".")
+                top = min([node.lineno, *(each.lineno for each in node.decorator_list)])
+                yield names[node], starts[top - 1], starts[node.end_lineno or 0]
+
+
 def changed(mutant: dict[str, str]) -> str:
     """Return the text of a file with the change, at the one place of its function."""
     text = (ROOT / mutant["path"]).read_text() if (ROOT / mutant["path"]).is_file() else ""
-    for name, first, last in Source(mutant["path"], text).definitions():
+    for name, first, last in definitions(text):
         if name == mutant["function"] and text.count(mutant["source"], first, last) == 1:
             place = text.index(mutant["source"], first, last)
             return text[:place] + mutant["changed"] + text[place + len(mutant["source"]) :]

@@ -25,6 +25,7 @@ from infra.render.preview_table import (
     shipped_table,
 )
 from model.inference import NeuralRenderer
+from pipeline.exchange.convert import write_scene
 from pipeline.exchange.open_scene import load_source, scene_source
 from pipeline.exchange.reader import SceneReader
 from pipeline.exchange.renderformer_h5 import write_renderformer_h5
@@ -55,8 +56,6 @@ pytestmark = pytest.mark.usefixtures("children_here")
 
 FEW = ("--resolution", "16", "--max-spp", "8")
 SMALL = (*FEW, "--noise-floor", "90")
-FLOOR = "v -1 -1 0\nv 1 -1 0\nv 1 1 0\nv -1 1 0\nf 1 2 3 4\n"
-LAMP = "v -0.1 -0.1 2\nv 0 0.1 2\nv 0.1 -0.1 2\nf 1 2 3\n"
 
 
 def printed(*words: str | Path) -> str:
@@ -98,35 +97,16 @@ def network(tmp_path: Path) -> Path:
     return write_network(tmp_path / "model.safetensors", max_triangles=2)
 
 
-def _object(mesh: str, emissive: float, **more: Any) -> dict[str, Any]:
-    place = {"translation": [0, 0, 0], "rotation": [0, 0, 0], "scale": [1, 1, 1]}
-    material = {
-        "diffuse": [0.0 if emissive else 0.4] * 3,
-        "specular": [0.2] * 3,
-        "roughness": 0.5,
-        "emissive": [emissive] * 3,
-        "smooth_shading": False,
-    }
-    transform = {**place, "normalize": False}
-    return {"mesh_path": mesh, "transform": transform, "material": material, **more}
-
-
 @pytest.fixture
 def described(tmp_path: Path) -> Path:
-    """A RenderFormer scene of two meshes and two cameras."""
-    folder = tmp_path / "scenes"
-    folder.mkdir()
-    (folder / "floor.obj").write_text(FLOOR)
-    (folder / "lamp.obj").write_text(LAMP)
-    camera = {"look_at": [0, 0, 0], "up": [0, 0, 1], "fov": 40}
-    objects = {
-        "floor": _object("floor.obj", 0, colour="red"),
-        "lamp": _object("lamp.obj", 100),
-    }
-    cameras = [{**camera, "position": place} for place in ([2, 0, 1], [0, 2, 1])]
-    scene = {"scene_name": "two", "version": "1.0", "objects": objects, "cameras": cameras}
-    (folder / "two.json").write_text(json.dumps(scene))
-    return folder / "two.json"
+    """The tiny scene as a file of RenderFormer, with a field that is unknown."""
+    path = tmp_path / "scenes" / "two.json"
+    path.parent.mkdir()
+    write_scene(path, tiny_scene())
+    record = json.loads(path.read_text())
+    record["objects"]["floor"]["colour"] = "red"
+    path.write_text(json.dumps(record))
+    return path
 
 
 def _shard(path: Path, scene: Scene, profile: Profile = "lossless") -> Path:
@@ -517,7 +497,7 @@ def test_a_bad_source_is_one_line(
     shard = _shard(tmp_path / "train-000000.tar", tiny_scene())
     Path("cut.tar").write_bytes(shard.read_bytes()[:700])
     _shard(tmp_path / "train-000001.tar", tiny_scene(fov_deg=np.array([45, 181], np.float32)))
-    described.write_text(described.read_text().replace("floor.obj", "../floor.obj"))
+    described.write_text(described.read_text().replace("templates/", "../templates/"))
     for source, message in BAD_SOURCES.items():
         with case(source), pytest.raises(TrilightError, match=message) as caught:
             load_source(scene_source(source))

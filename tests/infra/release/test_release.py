@@ -5,10 +5,8 @@ import hashlib
 import json
 import os
 import sys
-import threading
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
-from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
 from pathlib import Path
 from typing import Any
 
@@ -27,6 +25,7 @@ from storage.digests import sha256_hex
 from storage.errors import TrilightError
 from tests.command_line import run_program, trilight
 from tests.conftest import ROOT
+from tests.http_server import Handler, running
 from tests.pipeline.documents.dataset_by_hand import (
     edit_manifest,
     five_scenes,
@@ -230,48 +229,46 @@ LARGE = (".tar", ".safetensors")
 """Files that go by themselves; all others go within the commit."""
 
 
-class _Handler(BaseHTTPRequestHandler):
+class _Hub(Handler):
     root: Path
     token: str
     made: list[dict[str, Any]]
-    protocol_version = "HTTP/1.1"
 
     def do_GET(self) -> None:
-        self._answer({"id": "ada/set", "sha": "0" * 40, "siblings": [], "private": False})
+        self.reply_json({"id": "ada/set", "sha": "0" * 40, "siblings": [], "private": False})
 
     def do_PUT(self) -> None:
         place = self.root / ".objects" / self.path.rpartition("/")[2]
         place.parent.mkdir(exist_ok=True)
         place.write_bytes(self._body())
-        self._answer({})
+        self.reply_json({})
 
     def do_POST(self) -> None:
         body = self._body()
         if self.headers["Authorization"] != f"Bearer {self.token}":
-            self._answer({"error": "Invalid username or password."}, status=401)
+            self.reply_json({"error": "Invalid username or password."}, status=401)
         elif self.path == "/api/repos/create":
             asked = json.loads(body)
             self.made.append(asked)
             kind = {"model": ""}.get(asked.get("type", "model"), f"{asked.get('type')}s/")
             name = f"{asked['organization']}/{asked['name']}"
-            self._answer({"url": f"{self._here}/{kind}{name}", "name": name, "id": "1"})
+            self.reply_json({"url": f"{self._here}/{kind}{name}", "name": name, "id": "1"})
         elif self.path == "/api/validate-yaml":
-            self._answer({"errors": [], "warnings": []})
+            self.reply_json({"errors": [], "warnings": []})
         elif "/preupload/" in self.path:
             names = [entry["path"] for entry in json.loads(body)["files"]]
-            self._answer({"files": [self._mode(name) for name in names]})
+            self.reply_json({"files": [self._mode(name) for name in names]})
         elif self.path.endswith("/objects/batch"):
             wanted = json.loads(body)["objects"]
-            self._answer({"transfer": "basic", "objects": [self._place(each) for each in wanted]})
+            self.reply_json(
+                {"transfer": "basic", "objects": [self._place(each) for each in wanted]}
+            )
         else:
             assert "/commit/" in self.path, self.path
             self._commit(body)
-            self._answer(
+            self.reply_json(
                 {"commitOid": "1" * 40, "commitUrl": f"{self._here}/datasets/ada/set/commit/1"}
             )
-
-    def log_message(self, format: str, *args: object) -> None:
-        """Say nothing."""
 
     @property
     def _here(self) -> str:
@@ -301,30 +298,13 @@ class _Handler(BaseHTTPRequestHandler):
             place.parent.mkdir(parents=True, exist_ok=True)
             place.write_bytes(data)
 
-    def _answer(self, value: object, *, status: int = 200) -> None:
-        body = json.dumps(value).encode()
-        self.send_response(status)
-        self.send_header("Content-Type", "application/json")
-        self.send_header("Content-Length", str(len(body)))
-        self.end_headers()
-        self.wfile.write(body)
-
 
 @contextmanager
 def hub_for_uploads(root: Path, token: str) -> Iterator[tuple[str, list[dict[str, Any]]]]:
-    """Run the server on a free port; returns its URL and what repositories it was asked to make."""
+    """Run the server; returns its URL and what repositories it was asked to make."""
     made: list[dict[str, Any]] = []
-    handler = type("Handler", (_Handler,), {"root": root, "token": token, "made": made})
-    server = ThreadingHTTPServer(("127.0.0.1", 0), handler)
-    server.daemon_threads = True
-    thread = threading.Thread(target=server.serve_forever, kwargs={"poll_interval": 0.02})
-    thread.start()
-    try:
-        yield f"http://127.0.0.1:{server.server_address[1]}", made
-    finally:
-        server.shutdown()
-        thread.join()
-        server.server_close()
+    with running(_Hub, root=root, token=token, made=made) as url:
+        yield url, made
 
 
 def settings_of(url: str, token: str, home: Path) -> dict[str, str]:

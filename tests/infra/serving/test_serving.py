@@ -2,7 +2,6 @@
 
 import contextlib
 import dataclasses
-import http.server
 import json
 import os
 import signal
@@ -10,7 +9,6 @@ import socket
 import stat
 import subprocess
 import sys
-import threading
 import time
 import tomllib
 from collections.abc import Iterator
@@ -42,6 +40,7 @@ from pipeline.flows.prefect_server import (
 )
 from storage.errors import TrilightError
 from storage.settings.fields import describe_fields
+from tests import http_server
 from tests.command_line import run_program, trilight
 from tests.conftest import ROOT
 from tests.for_each import case
@@ -139,18 +138,12 @@ def test_a_slow_server_is_waited_for_with_signs_of_life(
 
 @contextlib.contextmanager
 def healthy_server() -> Iterator[str]:
-    class Healthy(http.server.BaseHTTPRequestHandler):
+    class Healthy(http_server.Handler):
         def do_GET(self) -> None:
-            self.send_response(200)
-            self.end_headers()
+            self.reply(200, b"")
 
-        def log_message(self, format: str, *arguments: object) -> None:
-            pass
-
-    with http.server.HTTPServer(("127.0.0.1", 0), Healthy) as stranger:
-        threading.Thread(target=stranger.serve_forever, daemon=True).start()
-        yield f"http://127.0.0.1:{stranger.server_port}/api"
-        stranger.shutdown()
+    with http_server.running(Healthy) as url:
+        yield f"{url}/api"
 
 
 def test_wrong_variables_are_named(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -5,13 +5,9 @@ import re
 import shutil
 import subprocess
 import sys
-from collections.abc import Iterator
-from fnmatch import fnmatch
 from pathlib import Path
-from typing import Any
 
 import pytest
-import yaml
 
 from tests.conftest import ROOT
 
@@ -20,8 +16,6 @@ for needed in ("mkdocs", "material", "mkdocstrings"):
         needed, reason="the site needs requirements/docs.txt; `make docs` installs it"
     )
 
-NAMES = ("README.md", "index.md")
-"""Names of the page of a folder, which stands in the place of an index."""
 LOADED = re.compile(r'<(?:script|img|link|iframe|source)\b[^>]*?(?:src|href)="(?:https?:)?//')
 """What a browser would fetch from a server; links that a person may click are not among it."""
 
@@ -41,29 +35,6 @@ def site(tmp_path_factory: pytest.TempPathFactory) -> Path:
     done = build(ROOT, folder)
     assert done.returncode == 0, done.stdout + done.stderr
     return folder
-
-
-def test_the_navigation_takes_up_every_page_and_names_none_that_is_missing() -> None:
-    asked = list(_patterns(yaml.safe_load((ROOT / "docs" / ".nav.yml").read_text())["nav"]))
-    pages = {path.relative_to(ROOT / "docs").as_posix() for path in (ROOT / "docs").rglob("*.md")}
-    for page in pages:
-        names = {page.replace("README.md", name) for name in NAMES}
-        assert any(fnmatch(name, pattern) for name in names for pattern in asked), page
-    for pattern in asked:
-        names = {page.replace("README.md", name) for page in pages for name in NAMES}
-        assert any(fnmatch(name, pattern) for name in names), pattern
-
-
-def _patterns(nav: Any) -> Iterator[str]:
-    """Yield names and patterns of pages, whatever heading they are under."""
-    if isinstance(nav, str):
-        yield nav
-    elif isinstance(nav, dict):
-        for name, entry in nav.items():
-            yield from _patterns(entry) if name != "sort" else ()
-    else:
-        for entry in nav:
-            yield from _patterns(entry)
 
 
 @pytest.mark.slow("packaging")

@@ -3,7 +3,6 @@
 import asyncio
 import json
 import uuid
-from collections.abc import Iterator, Mapping
 from typing import Any
 
 import pytest
@@ -12,107 +11,66 @@ from prefect.client.schemas.objects import FlowRun
 from prefect.utilities.schema_tools import ValidationError, validate
 
 from tests.conftest import ROOT
+from tests.for_each import case
 from tests.infra.setup.manifests_kit import IMAGES, MANIFESTS, containers, documents, job_template
 
-_SERVES = {"Deployment"}
-
-
-def faults_of_manifests(documents: list[dict[str, Any]], job: Mapping[str, Any]) -> Iterator[str]:
-    """Say what is missing in manifests of Kubernetes, and in the template of the flows' job."""
-    for row in documents:
-        if row["kind"] in ("Deployment", "Job"):
-            pod = row["spec"]["template"]["spec"]
-            yield from _faults_of_pod(row["metadata"]["name"], pod, row["kind"] in _SERVES)
-    pod = job["job_configuration"]["job_manifest"]["spec"]["template"]["spec"]
-    yield from _faults_of_pod("job template", pod, serves=False)
-    yield from _faults_of_namespace(documents)
-
-
-def _faults_of_pod(name: str, pod: Mapping[str, Any], serves: bool) -> Iterator[str]:
-    mine = pod.get("securityContext", {})
-    if not mine.get("runAsNonRoot") or not mine.get("runAsUser"):
-        yield f"{name}: may be root"
-    if mine.get("seccompProfile") != {"type": "RuntimeDefault"}:
-        yield f"{name}: no seccomp profile"
-    if any(pod.get(key) for key in ("hostNetwork", "hostPID", "hostIPC")):
-        yield f"{name}: shares the host's namespaces"
-    if any("hostPath" in volume for volume in pod.get("volumes", ())):
-        yield f"{name}: mounts the host's files"
-    for container in pod["containers"]:
-        given = container.get("securityContext", {})
-        if given.get("capabilities") != {"drop": ["ALL"]} or given.get("privileged"):
-            yield f"{name}: keeps capabilities"
-        if given.get("allowPrivilegeEscalation") is not False:
-            yield f"{name}: may gain privileges"
-        if not given.get("readOnlyRootFilesystem"):
-            yield f"{name}: writes to its image"
-        for kind in ("requests", "limits"):
-            if set(container.get("resources", {}).get(kind, ())) < {"cpu", "memory"}:
-                yield f"{name}: no {kind}"
-        if serves and "livenessProbe" not in container:
-            yield f"{name}: nothing asks whether it lives"
-
-
-def _faults_of_namespace(documents: list[dict[str, Any]]) -> Iterator[str]:
-    hard = [row["spec"]["hard"] for row in documents if row["kind"] == "ResourceQuota"]
-    if not hard or not {"limits.cpu", "limits.memory", "pods"} <= set(hard[0]):
-        yield "namespace: no quota"
-    policies = [row["spec"] for row in documents if row["kind"] == "NetworkPolicy"]
-    closed = {"podSelector": {}, "policyTypes": ["Ingress", "Egress"]}
-    if closed not in policies:
-        yield "namespace: open to the network by default"
-    for policy in policies:
-        for rule in (*policy.get("ingress", ()), *policy.get("egress", ())):
-            if not rule.get("ports"):
-                yield "namespace: a rule of the network names no port"
-
-
-def faults_of_services(compose: Mapping[str, Any]) -> Iterator[str]:
-    """Say what is missing in services of a compose file."""
-    for name, service in compose["services"].items():
-        if service.get("cap_drop") != ["ALL"] or service.get("privileged"):
-            yield f"{name}: keeps capabilities"
-        if not service.get("read_only"):
-            yield f"{name}: writes to its image"
-        options = service.get("security_opt", ())
-        if "no-new-privileges:true" not in options:
-            yield f"{name}: may gain privileges"
-        if any("unconfined" in option for option in options):
-            yield f"{name}: no seccomp profile"
-        if any("docker.sock" in volume for volume in service.get("volumes", ())):
-            yield f"{name}: holds the socket of Docker"
-        if service.get("network_mode") == "host" or service.get("pid") == "host":
-            yield f"{name}: shares the host's namespaces"
-
-
-def unpinned_images(texts: Mapping[str, str], compose: Mapping[str, Any]) -> set[str]:
-    """Return the foreign images without a digest: of each FROM, and of services."""
-    named: set[str] = set()
-    for text in texts.values():
-        lines = [line.split() for line in text.splitlines() if line.startswith("FROM ")]
-        stages = {words[-1] for words in lines if "AS" in words}
-        named |= {words[1] for words in lines if words[1] not in stages}
-    named |= {
-        row["image"] for row in compose["services"].values() if "trilight" not in row["image"]
-    }
-    return {image for image in named if "@sha256:" not in image}
+USER = {"runAsNonRoot": True, "runAsUser": 10001, "seccompProfile": {"type": "RuntimeDefault"}}
+CONFINED = {
+    "allowPrivilegeEscalation": False,
+    "readOnlyRootFilesystem": True,
+    "capabilities": {"drop": ["ALL"]},
+}
+CLOSED = {"podSelector": {}, "policyTypes": ["Ingress", "Egress"]}
 
 
 @pytest.fixture(scope="module")
-def compose() -> Any:
-    return yaml.safe_load((IMAGES / "compose.yaml").read_text())
+def services() -> Any:
+    return yaml.safe_load((IMAGES / "compose.yaml").read_text())["services"]
 
 
-def test_manifests_and_services_keep_the_rules(compose: Any) -> None:
-    assert list(faults_of_manifests(documents(), job_template())) == []
-    assert list(faults_of_services(compose)) == []
+def of_kind(kind: str) -> list[dict[str, Any]]:
+    return [row for row in documents() if row["kind"] == kind]
 
 
-def test_images_of_others_have_a_digest(compose: Any) -> None:
-    texts = {path.name: path.read_text() for path in IMAGES.glob("*.Dockerfile")}
-    assert unpinned_images(texts, compose) == set()
-    mutated = {**texts, "x": "FROM debian:13 AS build\nFROM build\nFROM a@sha256:0 AS b"}
-    assert unpinned_images(mutated, compose) == {"debian:13"}
+def test_containers_of_manifests_are_confined() -> None:
+    serving = {row["metadata"]["name"] for row in of_kind("Deployment")}
+    for name, pod, container in containers():
+        with case(name):
+            assert pod["securityContext"].items() >= USER.items()
+            assert not {"hostNetwork", "hostPID", "hostIPC"} & set(pod)
+            assert not any("hostPath" in volume for volume in pod["volumes"])
+            assert container["securityContext"] == CONFINED
+            for kind in ("requests", "limits"):
+                assert set(container["resources"][kind]) >= {"cpu", "memory"}, kind
+            assert "livenessProbe" in container or name not in serving
+
+
+def test_the_namespace_is_bounded_and_closed() -> None:
+    (quota,) = (row["spec"]["hard"] for row in of_kind("ResourceQuota"))
+    assert {"limits.cpu", "limits.memory", "pods"} <= set(quota)
+    policies = [row["spec"] for row in of_kind("NetworkPolicy")]
+    assert CLOSED in policies
+    for policy in policies:
+        for rule in (*policy.get("ingress", ()), *policy.get("egress", ())):
+            assert rule.get("ports"), "a rule of the network names its ports"
+
+
+def test_services_are_confined(services: Any) -> None:
+    for name, service in services.items():
+        with case(name):
+            assert service["cap_drop"] == ["ALL"] and service["read_only"]
+            assert service["security_opt"] == ["no-new-privileges:true"]
+            assert not {"privileged", "network_mode", "pid"} & set(service)
+            assert not any("docker.sock" in volume for volume in service.get("volumes", ()))
+
+
+def test_images_of_others_have_a_digest(services: Any) -> None:
+    """Of each FROM that names no stage before it, and of services."""
+    named = {row["image"] for row in services.values() if "trilight" not in row["image"]}
+    for path in IMAGES.glob("*.Dockerfile"):
+        lines = [line.split() for line in path.read_text().splitlines() if line[:5] == "FROM "]
+        named |= {words[1] for words in lines} - {words[-1] for words in lines if "AS" in words}
+    assert len(named) > 2 and [image for image in named if "@sha256:" not in image] == []
 
 
 TEMPLATES = {

@@ -72,14 +72,6 @@ def _imported(module: ast.Module) -> set[str]:
     return {name.partition(".")[0] for name in names}
 
 
-@pytest.mark.slow("packaging")
-def test_every_module_of_the_tree_compiles(tree: Path) -> None:
-    for path in sorted((tree / FACE).rglob("*.py")):
-        source = path.read_text()
-        compile(source, path, "exec")
-        assert not _imported(ast.parse(source)) & {*PACKAGES, "tests"}, path
-
-
 def test_lines_keep_their_numbers(tree: Path) -> None:
     for package in (*PACKAGES, FACE):
         for path in (ROOT / package).rglob("*.py"):

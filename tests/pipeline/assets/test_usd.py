@@ -203,14 +203,6 @@ def test_a_quad_keeps_its_corner_colours(tmp_path: Path, suffix: str) -> None:
     assert geometry(prepare(path)) == geometry(asset)
 
 
-def test_coordinates_of_each_corner_are_read(tmp_path: Path) -> None:
-    def corners(stage: Usd.Stage) -> None:
-        mesh = UsdGeom.Mesh(stage.GetPrimAtPath(MESH))
-        coordinates(mesh, kit.UV_UP[kit.SQUARE.faces].reshape(-1, 2), "faceVarying")
-
-    kit.assert_corners(made(tmp_path, corners))
-
-
 def test_a_quad_of_four_corners_and_a_place_of_its_own(tmp_path: Path) -> None:
     """One polygon with coordinates of its corners, a quarter turn above it."""
 
@@ -301,13 +293,6 @@ def test_the_colour_space_of_the_shader_counts(
     change = _inputs({"sourceColorSpace": space}) if space else None
     asset = made(tmp_path, change, picture[:33] + claim + picture[33:])
     assert np.abs(kit.seen_at(asset, 0.25, -0.25) - linear * (1 - kit.F)).max() < kit.STORED
-
-
-def test_scale_and_bias_and_a_single_channel(tmp_path: Path) -> None:
-    change = _inputs({"scale": Gf.Vec4f(1, 0.5, 1, 1), "bias": Gf.Vec4f(0, 0.25, 0, 0)})
-    asset = made(tmp_path, change, connect={"diffuseColor": "g"})
-    assert np.abs(kit.seen_at(asset, 0.25, -0.25) - 0.75 * (1 - kit.F)).max() < kit.SLOPE  # green
-    assert np.abs(kit.seen_at(asset, -0.25, -0.25) - 0.25 * (1 - kit.F)).max() < kit.SLOPE  # red
 
 
 @for_each(

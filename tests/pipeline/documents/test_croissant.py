@@ -3,6 +3,7 @@
 import dataclasses
 import json
 from pathlib import Path
+from typing import Any
 
 import pytest
 
@@ -18,9 +19,10 @@ from storage.records.objects import read_objects_lock
 from tests.pipeline.documents.dataset_by_hand import five_scenes, locked, sample, write_dataset
 from tests.scenes_by_hand import tiny_scene
 
-mlcroissant = pytest.importorskip(
-    "mlcroissant", reason="mlcroissant is not installed; run make setup-all"
-)
+
+@pytest.fixture
+def mlcroissant() -> Any:
+    return pytest.importorskip("mlcroissant", reason="run make setup-all")
 
 
 def _write(root: Path) -> Path:
@@ -30,7 +32,9 @@ def _write(root: Path) -> Path:
     return dataset.folder.croissant
 
 
-def test_the_validator_has_no_error_and_every_shard_and_scene_is_found(tmp_path: Path) -> None:
+def test_the_validator_has_no_error_and_every_shard_and_scene_is_found(
+    mlcroissant: Any, tmp_path: Path
+) -> None:
     read = mlcroissant.Dataset(jsonld=str(_write(tmp_path)))
     issues = read.metadata.ctx.issues
     assert not issues.errors
@@ -58,7 +62,7 @@ def test_it_is_json_whatever_the_licences_are_called(tmp_path: Path, licence: st
     assert document["license"] == [licence]
 
 
-def test_a_dataset_without_shards_is_valid_too(tmp_path: Path) -> None:
+def test_a_dataset_without_shards_is_valid_too(mlcroissant: Any, tmp_path: Path) -> None:
     manifest = dataclasses.replace(five_scenes(tmp_path / "a").manifest, shards=())
     path = tmp_path / "croissant.json"
     path.write_bytes(encode_croissant(manifest, rights_of([])))
@@ -82,7 +86,7 @@ def test_shards_are_spread_over_each_split(dataset: Dataset) -> None:
 
 @pytest.mark.usefixtures("bare_reports")
 def test_documents_of_a_sample_say_so(
-    dataset: Dataset, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    mlcroissant: Any, dataset: Dataset, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     whole = dataset_statistics(dataset)
     assert whole.scene_digest and "what follows is" not in dict(whole.lines())

@@ -8,20 +8,12 @@ import pytest
 
 from storage.remote import url as remote_url
 from tests.pipeline.generation.bucket_kit import Machines, empty_bucket
-from tests.s3_server import s3_server
+from tests.s3_server import moto as moto
 
 
 @pytest.fixture(autouse=True)
 def _bare(bare_reports: None) -> None:
     """No test here looks at a figure."""
-
-
-@pytest.fixture(scope="session")
-def moto() -> Iterator[int]:
-    pytest.importorskip("s3fs", reason="needs the package s3fs (setup-all)")
-    pytest.importorskip("moto", reason="needs the package moto with its server (setup-all)")
-    with s3_server() as port:
-        yield port
 
 
 @pytest.fixture(scope="module")

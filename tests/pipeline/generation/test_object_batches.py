@@ -86,24 +86,6 @@ def test_an_object_more_or_less_changes_one_batch(mesher: Mesher, tmp_path: Path
         assert len([batch for batch in cut if batch not in whole]) <= 2  # it may have been a first
 
 
-def test_a_kill_loses_the_batches_in_hand(mesher: Mesher, tmp_path: Path) -> None:
-    records = object_records(tmp_path / "objects")
-
-    def die(uid: str) -> None:
-        if sum(mesher.made.values()) == 20:
-            raise KeyboardInterrupt
-
-    mesher.before_each = die
-    with pytest.raises(KeyboardInterrupt):
-        _prepare(records, tmp_path / "set")
-    mesher.before_each = lambda uid: None
-    (found, _), _ = _prepare(records, tmp_path / "set")
-    assert len(found) == 30
-    again = {uid for uid, count in mesher.made.items() if count > 1}
-    lost = [batch for batch in cut_objects(records) if again & {r.uid for r in batch}]
-    assert len(lost) <= 2
-
-
 def test_what_the_environment_prevented_is_tried_again(mesher: Mesher, tmp_path: Path) -> None:
     records = object_records(tmp_path / "objects")
     mesher.reasons["object 00007"] = "killed"

@@ -91,15 +91,6 @@ def cold(workshop: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Ite
     (workshop / poison.DEATHS).unlink()
 
 
-def test_a_mesh_child_that_is_killed_twice_changes_no_object(workshop: Path, cold: Path) -> None:
-    """The lock holds the digest of every mesh, and all pictures follow from it."""
-    (workshop / poison.DEATHS).write_text("2")
-    begun = prepare_dataset(order(workshop, cold / "set"))
-    assert (workshop / poison.DEATHS).read_text() == "0"
-    undisturbed = open_dataset(str(workshop / "plain")).manifest
-    assert begun.publication.manifest.objects_lock_sha256 == undisturbed.objects_lock_sha256
-
-
 def test_an_object_whose_children_are_all_killed_is_tried_again_by_the_next_run(
     workshop: Path, cold: Path, caplog: pytest.LogCaptureFixture
 ) -> None:

@@ -192,9 +192,6 @@ def test_a_build_with_the_setting_stores_what_verify_accepts() -> None:
         np.testing.assert_array_equal(back.radiance_rgb, sample.radiance_rgb)
 
 
-NEAR_LAMP = [[-0.3, -1.5, 2], [0.3, -1.5, 2], [0, -1, 2.2]]
-
-
 def _tracer(scene: Scene, *, bounces: bool, lobes: bool, max_depth: int = 10) -> Tracer:
     tracer = load_tracer(scene, max_depth=max_depth, rr_depth=2)
     return tracer.split_lights(bounces=bounces, lobes=lobes)

@@ -15,14 +15,7 @@ from storage.records.sample import encode_sample
 from storage.remote import retries, url
 from tests.http_server import Site, serve
 from tests.pipeline.documents.dataset_by_hand import edit_manifest, five_scenes
-from tests.s3_server import s3_server
-
-
-@pytest.fixture(scope="session")
-def moto() -> Iterator[int]:
-    """Run an S3 server; returns its port."""
-    with s3_server() as port:
-        yield port
+from tests.s3_server import moto as moto
 
 
 @pytest.fixture

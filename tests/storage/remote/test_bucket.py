@@ -29,15 +29,6 @@ from tests.pipeline.generation.test_dataset_writer import ENVIRONMENT, _build
 from tests.s3_server import Line, control
 from tests.storage.remote.conftest import SHARD, expected, read, with_changed_byte
 
-pytest.importorskip("s3fs", reason="needs the package s3fs (setup-all)")
-pytest.importorskip("moto", reason="needs the package moto with its server (setup-all)")
-
-
-pytest.importorskip("gcsfs", reason="gs:// needs the package gcsfs")
-emulator: Any = pytest.importorskip(
-    "gcp_storage_emulator.server", reason="needs the package gcp-storage-emulator"
-)
-
 
 def place(text: str) -> RemoteUrl:
     url = remote_url.parse_url(text, what="out")
@@ -64,7 +55,15 @@ def s3(moto: int, local: Dataset, cache: Path, monkeypatch: pytest.MonkeyPatch) 
 
 
 @pytest.fixture
-def gs(local: Dataset, cache: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Any]:
+def emulator() -> Any:
+    pytest.importorskip("gcsfs", reason="gs:// needs the package gcsfs")
+    return pytest.importorskip("gcp_storage_emulator.server", reason="needs gcp-storage-emulator")
+
+
+@pytest.fixture
+def gs(
+    emulator: Any, local: Dataset, cache: Path, monkeypatch: pytest.MonkeyPatch
+) -> Iterator[Any]:
     """Put the small dataset into a bucket of Google's emulator; returns the driver of it."""
     server = emulator.create_server("127.0.0.1", 0, in_memory=True, default_bucket="shards")
     server.start()
@@ -80,7 +79,7 @@ def gs(local: Dataset, cache: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator
 
 
 @pytest.fixture
-def conditional(gs: Any, monkeypatch: pytest.MonkeyPatch) -> None:
+def conditional(emulator: Any, gs: Any, monkeypatch: pytest.MonkeyPatch) -> None:
     """Teach the emulator, which ignores it, what Google's server does with ifGenerationMatch=0."""
     upload = emulator.objects.upload_partial
     handlers = next(row[-1] for row in emulator.HANDLERS if upload in row[-1].values())

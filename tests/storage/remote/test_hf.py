@@ -8,10 +8,7 @@ import json
 import os
 import subprocess
 import sys
-import threading
 from collections.abc import Iterator
-from contextlib import contextmanager
-from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
 from pathlib import Path
 from typing import Any
 from urllib.parse import parse_qs, unquote
@@ -22,34 +19,31 @@ from storage.dataset.dataset import Dataset
 from storage.digests import sha256_hex
 from storage.records.sample import encode_sample
 from tests.conftest import ROOT
+from tests.http_server import Handler, running
 from tests.storage.remote.conftest import SHARD, with_changed_byte
 
 REPOSITORY = "ada/set"
 
 
-class _Handler(BaseHTTPRequestHandler):
+class _Hub(Handler):
     root: Path
-    protocol_version = "HTTP/1.1"
 
     def do_GET(self) -> None:
         path = unquote(self.path.partition("?")[0])
         api, files = f"/api/datasets/{REPOSITORY}", f"/datasets/{REPOSITORY}/resolve/main/"
         if path in (api, f"{api}/revision/main"):
-            self._json({"id": REPOSITORY, "sha": "0" * 40, "siblings": [], "private": False})
+            self.reply_json({"id": REPOSITORY, "sha": "0" * 40, "siblings": [], "private": False})
         elif path.startswith(f"{api}/tree/main"):
-            self._json([self._entry(file) for file in sorted(self.root.iterdir())])
+            self.reply_json([self._entry(file) for file in sorted(self.root.iterdir())])
         elif path.startswith(files) and (self.root / path.removeprefix(files)).is_file():
             self._part((self.root / path.removeprefix(files)).read_bytes())
         else:
-            self._send(404, b"{}", {"X-Error-Code": "RepoNotFound"})
+            self.reply(404, b"{}", X_Error_Code="RepoNotFound")
 
     def do_POST(self) -> None:
         body = parse_qs(self.rfile.read(int(self.headers["Content-Length"])).decode())
         wanted = [self.root / name for name in body["paths"]]
-        self._json([self._entry(file) for file in wanted if file.is_file()])
-
-    def log_message(self, format: str, *args: object) -> None:
-        """Say nothing."""
+        self.reply_json([self._entry(file) for file in wanted if file.is_file()])
 
     def _entry(self, file: Path) -> dict[str, Any]:
         oid = hashlib.sha1(file.read_bytes(), usedforsecurity=False).hexdigest()
@@ -58,32 +52,7 @@ class _Handler(BaseHTTPRequestHandler):
     def _part(self, data: bytes) -> None:
         first, last = self.headers["Range"].removeprefix("bytes=").split("-")
         part = data[int(first) : int(last) + 1]
-        self._send(206, part, {"Content-Range": f"bytes {first}-{last}/{len(data)}"})
-
-    def _json(self, value: object) -> None:
-        self._send(200, json.dumps(value).encode(), {"Content-Type": "application/json"})
-
-    def _send(self, status: int, body: bytes, headers: dict[str, str]) -> None:
-        self.send_response(status)
-        for name, value in {**headers, "Content-Length": str(len(body))}.items():
-            self.send_header(name, value)
-        self.end_headers()
-        self.wfile.write(body)
-
-
-@contextmanager
-def serve_hub(root: Path) -> Iterator[str]:
-    """Run the server on a free port of the loopback; returns its URL."""
-    server = ThreadingHTTPServer(("127.0.0.1", 0), type("Handler", (_Handler,), {"root": root}))
-    server.daemon_threads = True
-    thread = threading.Thread(target=server.serve_forever, kwargs={"poll_interval": 0.02})
-    thread.start()
-    try:
-        yield f"http://127.0.0.1:{server.server_address[1]}"
-    finally:
-        server.shutdown()
-        thread.join()
-        server.server_close()
+        self.reply(206, part, Content_Range=f"bytes {first}-{last}/{len(data)}")
 
 
 pytest.importorskip("huggingface_hub", reason="hf:// needs the package huggingface_hub")
@@ -118,7 +87,7 @@ if len(sys.argv) > 2:
 
 @pytest.fixture
 def hub(local: Dataset) -> Iterator[str]:
-    with serve_hub(local.folder.root) as url:
+    with running(_Hub, root=local.folder.root) as url:
         yield url
 
 

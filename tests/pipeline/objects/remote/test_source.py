@@ -14,9 +14,7 @@ from pipeline.objects.licences import DEFAULT_ALLOWED, USER_PROVIDED
 from pipeline.objects.remote import source as remote_source
 from pipeline.objects.sources import list_objects
 from storage.errors import TrilightError
-from storage.remote import retries
 from storage.remote import url as remote_url
-from storage.remote.retries import Patience
 from storage.remote.url import PACKAGES, RemoteUrl, open_driver, parse_url
 from tests.for_each import for_each
 from tests.http_server import Fault, Site, serve
@@ -391,28 +389,6 @@ def test_one_dead_link_costs_one_object(
     assert "s3cret" not in text and "lovelace" not in text and "Traceback" not in text
     assert not list(Path(found.records[0].path).parent.glob("b.obj*"))
     assert breaks is not grow or not site.gets()["/b.obj"]
-
-
-def test_an_object_that_trickles_costs_itself(site: Site, monkeypatch: pytest.MonkeyPatch) -> None:
-    """Nothing is fast enough here, and what comes whole is taken: no clock decides the test."""
-    monkeypatch.setattr(retries, "PATIENCE", Patience(window_s=0.0, least_bytes_per_s=1e12))
-    site.put("a.obj", "content of a")
-    site.put("b.obj", "v 0 0 0\n" * 1000)
-    site.always["/b.obj"] = Fault(trickle=(1, 0.02))
-    found = find(site.url)
-    assert [record.uid for record in found.records] == ["a"]
-    assert "too slow" in found.failures[0].message
-    assert site.gets()["/b.obj"] == 1
-
-
-def test_what_may_pass_is_tried_again(site: Site) -> None:
-    site.put("a.obj", "A")
-    site.put("b.obj", "B")
-    site.faults = {"/a.obj": [Fault(status=503), Fault(status=500)]}
-    site.always = {"/b.obj": Fault(status=404)}
-    found = find(site.url)
-    assert [record.uid for record in found.records] == ["a"]
-    assert (site.gets()["/a.obj"], site.gets()["/b.obj"]) == (3, 1)
 
 
 def forbid(name: str) -> Callable[[Site], None]:
