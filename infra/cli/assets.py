@@ -17,7 +17,7 @@ from infra.cli.console import (
     progress_bars,
     suggest_look,
 )
-from infra.cli.options import OutputOptions, command
+from infra.cli.options import command
 from pipeline.assets.settings import AssetSettings, OwnMaterialSettings, Profile
 from pipeline.objects.licences import DEFAULT_ALLOWED
 from pipeline.presets.registry import DATASET_PRESETS, preset_settings
@@ -69,17 +69,17 @@ class AssetOptions:
 
 
 @command("source")
-def assets(options: AssetOptions, output: OutputOptions) -> None:
+def assets(options: AssetOptions) -> None:
     settings = _settings(options)
     source = options.source
     out = options.out
-    first_words(f"Meshes of {safe_url(source)} to {out}", silent=output.json)
+    first_words(f"Meshes of {safe_url(source)} to {out}")
     from pipeline.generation.make_assets import AssetFolder, make_assets
 
     folder = AssetFolder(out)
     with progress_bars() as bars:
-        fetched = bars.add_task("download", total=None, note="", visible=not output.json)
-        task = bars.add_task("objects", total=None, note="", visible=not output.json)
+        fetched = bars.add_task("download", total=None, note="")
+        task = bars.add_task("objects", total=None, note="")
         report = make_assets(
             source,
             folder,
@@ -91,10 +91,8 @@ def assets(options: AssetOptions, output: OutputOptions) -> None:
             on_plan=lambda total: bars.update(task, total=total),
             on_object=lambda: bars.advance(task),
         )
-    if output.json:
-        print_json(report.as_json())
-    else:
-        _print_report(report, options, settings, folder)
+    print_json(report.as_json())
+    _print_report(report, options, settings, folder)
     if not report.rows:
         sys.exit(1)
 

@@ -1,7 +1,7 @@
 """Commands whose options are the fields of settings classes, so that each is described once.
 
     @command("build")
-    def generate(order: GenerateOptions, shown: Shown) -> None: ...
+    def generate(order: GenerateOptions, base: BaseSettings) -> None: ...
 
 makes the argument BUILD, and an option of every other field. Each parameter of the function is a
 class of settings (storage.settings.described) and a section of the help, with the class's first
@@ -20,6 +20,7 @@ from typing import Annotated, Any, get_origin
 
 from cyclopts import Group, Parameter, Token
 
+from infra.cli.console import printing
 from infra.cli.extend_option import resolve_reference
 from infra.cli.overrides import parse_overrides
 from storage.errors import TrilightError
@@ -54,17 +55,24 @@ class FileName(Path):
     """Type of an option that takes any text; shells complete it as a file name."""
 
 
-def command(*arguments: str) -> Callable[[Callable[..., None]], Callable[..., None]]:
+_OUTPUT = "output"
+
+
+def command(
+    *arguments: str, has_json: bool = True
+) -> Callable[[Callable[..., None]], Callable[..., None]]:
     """Return a decorator that makes a command of a function of settings classes.
 
     Args:
         arguments: fields that are positional arguments, and required unless they are empty or None
             by default; all other fields are options.
+        has_json: add `--json`, by which the command prints only its JSON.
     """
 
     def decorate(function: Callable[..., None]) -> Callable[..., None]:
-        kinds = typing.get_type_hints(function)
-        kinds.pop("return")
+        parts = typing.get_type_hints(function)
+        parts.pop("return")
+        kinds = {**parts, **({_OUTPUT: OutputOptions} if has_json else {})}
         parameters = {
             field.name: _parameter(field, group, by_place=field.name in arguments)
             for kind in kinds.values()
@@ -80,7 +88,10 @@ def command(*arguments: str) -> Callable[[Callable[..., None]], Callable[..., No
 
         def run(*_words: Any, **_options: Any) -> None:
             arguments_by_name = signature.bind(*_words, **_options).arguments
-            function(**{name: _settings(kind, arguments_by_name) for name, kind in kinds.items()})
+            values = {name: _settings(kind, arguments_by_name) for name, kind in kinds.items()}
+            output = values.pop(_OUTPUT, OutputOptions())
+            with printing(as_json=output.json):
+                function(**values)
 
         run.__name__ = function.__name__
         run.__signature__ = signature  # type: ignore[attr-defined]

@@ -7,7 +7,7 @@ from typing import Any
 
 import numpy as np
 
-from infra.cli.console import console, note, print_json, print_rows
+from infra.cli.console import note, print_json, print_rows, suggest_look
 from infra.render.networks import NetworkRenderer
 from infra.render.path_tracer import PathTracer
 from infra.render.plan import RenderPlan
@@ -42,32 +42,28 @@ _MEANING = {
 }
 
 
-def print_outcome(outcome: RenderResult, seconds: float, *, as_json: bool) -> None:
+def print_outcome(outcome: RenderResult, seconds: float) -> None:
     """Print files and figures of the only picture, or a summary of many."""
     plan = outcome.plan
-    if as_json:
-        shots = [_shot_json(shot, timed=plan.choice is not None) for shot in outcome.shots]
-        common = {
-            "engine": plan.engine,
-            "notes": list(outcome.notes),
-            "resolution": plan.resolution,
-            "seconds": round(seconds, 2),
-            "source": plan.source,
-            "view": plan.view,
-        }
-        if plan.choice is not None:
-            common["choice"] = plan.choice.sentence
-        if not plan.output.is_sequence:
-            print_json({**common, **shots[0]})
-            return
-        video = plan.output.video
-        print_json({**common, "pictures": shots, "video": None if video is None else str(video)})
-        return
+    record = {
+        "engine": plan.engine,
+        "notes": list(outcome.notes),
+        "resolution": plan.resolution,
+        "seconds": round(seconds, 2),
+        "source": plan.source,
+        "view": plan.view,
+    }
+    if plan.choice is not None:
+        record["choice"] = plan.choice.sentence
+    shots = [_shot_json(shot, timed=plan.choice is not None) for shot in outcome.shots]
     for text in outcome.notes:
         note(text)
     if plan.output.is_sequence:
+        video = plan.output.video
+        print_json({**record, "pictures": shots, "video": None if video is None else str(video)})
         _print_sequence(plan, outcome.shots, seconds)
     else:
+        print_json({**record, **shots[0]})
         _print_one(plan, outcome.shots[0], seconds)
 
 
@@ -119,7 +115,7 @@ def _print_one(plan: RenderPlan, done: FinishedShot, seconds: float) -> None:
     print_rows("Rendered", rows)
     measure = " and ".join(str(picture.path) for picture in done.pictures.values())
     look = f"Look at {done.shot.png}; measure with {measure}"
-    console.print(f"\n{look}", style="bold")
+    suggest_look(look)
 
 
 def _describe(renderer: Renderer, facts: Facts) -> Rows:
@@ -207,7 +203,7 @@ def _print_sequence(plan: RenderPlan, shots: Sequence[FinishedShot], seconds: fl
     print_rows("Rendered", rows)
     folder = plan.output.folder
     look = f"Look at {plan.output.video or folder}; measure with the pictures in {folder}"
-    console.print(f"\n{look}", style="bold")
+    suggest_look(look)
 
 
 def _time_rows(plan: RenderPlan, shots: Sequence[FinishedShot]) -> Rows:
