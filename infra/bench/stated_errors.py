@@ -42,7 +42,6 @@ from storage.markdown import table
 
 Values = NDArray[np.float64]
 
-GROUPS = ("narrow", "medium", "wide")
 ALLOWED = {
     "log": {"narrow": 0.025, "medium": 0.015, "wide": 0.015},
     "linear": {"narrow": 0.04, "medium": 0.025, "wide": 0.025},
@@ -198,13 +197,13 @@ def largest_shift(metric: str, looks: Sequence[Look], stated_db: Values, allowed
 
 
 def shifts_of(metric: str, looks: Sequence[Look], stated_db: Values) -> dict[str, float]:
-    """Return the `largest_shift` of each of GROUPS that has looks."""
+    """Return the `largest_shift` of each group of widths that has looks."""
     shifts = {}
-    for group in GROUPS:
+    for group, allowed in ALLOWED[metric].items():
         at = [row for row, look in enumerate(looks) if group_of(look.px) == group]
         if at:
             some = [looks[row] for row in at]
-            shifts[group] = largest_shift(metric, some, stated_db[at], ALLOWED[metric][group])
+            shifts[group] = largest_shift(metric, some, stated_db[at], allowed)
     return shifts
 
 
@@ -235,7 +234,14 @@ def fit_metric(metric: str, looks: Sequence[Look]) -> MetricStatement:
         expected={group: round(float(np.median(misses[groups == group])), 3) for group in bound},
         judged={},
     )
-    return replace(statement, judged=_judge_widths(metric, statement, looks))
+    judging = [look for look in filter_known(metric, looks) if look.use == "judge"]
+    by_width = {px: [look for look in judging if look.px == px] for px in LOOKS}
+    judged = {
+        str(px): judge(metric, some, stated_by(metric, statement, some))
+        for px, some in by_width.items()
+        if some
+    }
+    return replace(statement, judged=judged)
 
 
 def stated_by(metric: str, statement: MetricStatement, looks: Sequence[Look]) -> Values:
@@ -243,18 +249,6 @@ def stated_by(metric: str, statement: MetricStatement, looks: Sequence[Look]) ->
     center = apply_weights(metric, (statement.intercept, statement.weights), looks)
     shifts: Values = np.array([statement.bound[group_of(look.px)] for look in looks])
     return center + shifts
-
-
-def _judge_widths(
-    metric: str, statement: MetricStatement, looks: Sequence[Look]
-) -> dict[str, JudgedShare]:
-    judging = [look for look in filter_known(metric, looks) if look.use == "judge"]
-    by_width = {px: [look for look in judging if look.px == px] for px in LOOKS}
-    return {
-        str(px): judge(metric, some, stated_by(metric, statement, some))
-        for px, some in by_width.items()
-        if some
-    }
 
 
 ROWS = ROOT / "docs" / "results" / "stated-errors.jsonl"

@@ -25,7 +25,6 @@ from infra.render.held_out_scenes import first_composed
 from infra.render.raw_references import RawReference, first_camera, true_error
 from pipeline.isolation import IsolatedChild
 from pipeline.objects.generated import BENCHMARK, PREFIX
-from pipeline.presets.settings import DatasetSettings
 from pipeline.presets.training import smoke
 from pipeline.renders.calibrated_error import MEASURES, METRICS, versions_of_pictures
 from pipeline.renders.host_pictures import HostPictures, measure_errors
@@ -222,8 +221,9 @@ def _record(context: BenchContext, trial: str) -> dict[tuple[int, int], Figures]
     index = int(trial.split(",")[0].split()[1])
     sources = _sources(context.options)
     source = sources[index % len(sources)]
+    settings = apply_overrides(smoke(), {"splits.one_split": True})
     child = context.get_or_make(
-        ("objects", source), lambda: context.render_child(_one_split(), source, threads=1)
+        ("objects", source), lambda: context.render_child(settings, source, threads=1)
     )
     scene = _scene(child, index, KINDS[index % len(KINDS)])
     widest = 256 if has_wide(index) else 128
@@ -231,14 +231,10 @@ def _record(context: BenchContext, trial: str) -> dict[tuple[int, int], Figures]
     reference = load_or_render_reference(child, scene, first_camera(scene, widest), reference_spp)
     figures = dict[tuple[int, int], Figures]()
     for px in (px for px in LOOKS if px <= widest):
-        settings = unreachable(smoke().renders, px, max(LOOKS[px]))
-        looks = child.call(record_looks, scene, settings, shrink_reference(reference, px), index)
+        renders = unreachable(smoke().renders, px, max(LOOKS[px]))
+        looks = child.call(record_looks, scene, renders, shrink_reference(reference, px), index)
         figures |= {(px, spp): look for spp, look in zip(LOOKS[px], looks, strict=True)}
     return figures
-
-
-def _one_split() -> DatasetSettings:
-    return apply_overrides(smoke(), {"splits.one_split": True})
 
 
 def _scene(child: IsolatedChild, index: int, kind: str) -> Scene:

@@ -225,7 +225,7 @@ def _resume(store: Store, wanted: dict) -> Run:
     for trial in current.missing_trials():
         for point, figures in wanted[trial].items():
             store.add(current, trial, point, figures)
-    store.end(current, 1.0, ["a note"])
+    store.write(current, seconds=1.0, notes=["a note"])
     found = store.newest()
     assert found is not None and found.notes == ["a note"] and not found.missing_trials()
     return found
