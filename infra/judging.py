@@ -5,7 +5,7 @@ import copy
 import dataclasses
 import itertools
 import os
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -126,17 +126,10 @@ def judge_network(
         judged = dataclasses.replace(contest, tracer=tracer)
         views = judge_views(judged, lambda: done(next(numbers), total))
     about = _about(Path(checkpoint).name, opened, contest, split, views)
-    figures = record(views, about, _beside_tracer(contest, views, times))
+    every, first = spread_views(tracer_views, total)
+    spread = spread_text(every, first, 1 + max(view.view for view in views))
+    figures = record(views, about, equal_time(views, times, spread))
     return Judgement(record=figures, views=tuple(views), contest=contest)
-
-
-def _beside_tracer(
-    contest: EvalConfig, views: Sequence[JudgedView], times: Mapping[str, Any]
-) -> dict[str, Any]:
-    """Return the comparison with the path tracer as JSON values."""
-    every, first = spread_views(contest.tracer_views, contest.num_scenes)
-    most_views = 1 + max(view.view for view in views)
-    return equal_time(views, times, spread_text(every, first, most_views))
 
 
 def _time_tracer(

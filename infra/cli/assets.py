@@ -101,6 +101,8 @@ def _print_report(
     report: "AssetReport", options: AssetOptions, settings: AssetSettings, folder: "AssetFolder"
 ) -> None:
     """Print the result for the objects, the page to look at, and the next command."""
+    from pipeline.generation.prepare_isolated import format_unread
+
     _print_table(report)
     decimated = [row for row in report.rows if row.method != "source"]
     rows = [
@@ -110,7 +112,7 @@ def _print_report(
         *_material_rows(report, settings, folder),
         ("rejected", f"{len(report.failures)}"),
         *(("", f"{count} x {reason}") for _, reason, count in count_by_reason(report.failures)),
-        *_unread_rows(report, folder),
+        *_lines("not read", format_unread(report.unread, folder.logs)),
         ("meshes, catalogue", f"{folder.meshes}, {folder.catalogue}"),
     ]
     print_rows("Assets finished" if report.rows else "No object can be used", rows)
@@ -126,11 +128,8 @@ def _print_report(
         )
 
 
-def _unread_rows(report: "AssetReport", folder: "AssetFolder") -> list[tuple[str, str]]:
-    from pipeline.generation.prepare_isolated import format_unread
-
-    lines = format_unread(report.unread, folder.logs)
-    return [("" if row else "not read", line) for row, line in enumerate(lines)]
+def _lines(name: str, lines: Sequence[str]) -> list[tuple[str, str]]:
+    return [("" if row else name, line) for row, line in enumerate(lines)]
 
 
 def _epsilon_rows(report: "AssetReport", settings: AssetSettings) -> list[tuple[str, str]]:
@@ -155,8 +154,7 @@ def _material_rows(
     num_kept = sum(row.colours is not None for row in report.rows)
     reasons = {row.uid: row.materials.reason for row in report.rows if row.materials}
     lost = format_unread({uid: (why,) for uid, why in reasons.items() if why}, folder.page)
-    lines = [f"{num_kept} of {len(report.rows)}", *lost]
-    return [("" if row else "in their own materials", line) for row, line in enumerate(lines)]
+    return _lines("in their own materials", [f"{num_kept} of {len(report.rows)}", *lost])
 
 
 def _settings(options: AssetOptions) -> AssetSettings:

@@ -15,6 +15,7 @@ import re
 import typing
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import MISSING
+from importlib import import_module
 from pathlib import Path
 from typing import Annotated, Any, get_origin
 
@@ -24,6 +25,7 @@ from infra.cli.console import printing
 from infra.cli.extend_option import resolve_reference
 from infra.cli.overrides import parse_overrides
 from storage.errors import TrilightError
+from storage.installation import module_name
 from storage.remote.url import parse_local_path
 from storage.settings.described import checked
 from storage.settings.fields import (
@@ -107,7 +109,7 @@ def _parameter(field: FieldDescription, group: Group, *, by_place: bool) -> insp
     several = is_repeated(field.hint) or takes_names(field.hint)
     choices = choices_of(field.hint)
     kind = kind_of(field.hint)
-    complete = (lambda _: NAMES[field.name]()) if field.name in NAMES else None
+    complete = (lambda _: _known_names(field.name)) if field.name in NAMES else None
     word: Any = bool if kind is bool else str  # numbers are read when the class is made
     if kind is str and not (choices or complete or takes_names(field.hint)):
         word = FileName
@@ -234,34 +236,16 @@ def takes_names(hint: Any) -> bool:
     return get_origin(unwrap(hint)[0]) in (Mapping, dict)
 
 
-def _dataset_presets() -> list[str]:
-    from pipeline.presets.registry import DATASET_PRESETS
-
-    return list(DATASET_PRESETS)
-
-
-def _training_presets() -> list[str]:
-    from train.presets import TRAINING_PRESETS
-
-    return list(TRAINING_PRESETS)
-
-
-def _sizes() -> list[str]:
-    from model.config import SIZES
-
-    return list(SIZES)
-
-
-def _runners() -> list[str]:
-    from pipeline.executors.registry import EXECUTORS
-
-    return list(EXECUTORS)
-
-
-NAMES: dict[str, Callable[[], list[str]]] = {
-    "build": _dataset_presets,
-    "run": _training_presets,
-    "network": _sizes,
-    "runner": _runners,
+NAMES = {
+    "build": ("pipeline.presets.registry", "DATASET_PRESETS"),
+    "run": ("train.presets", "TRAINING_PRESETS"),
+    "network": ("model.config", "SIZES"),
+    "runner": ("pipeline.executors.registry", "EXECUTORS"),
 }
-"""Known names by the field that takes one; a field may also take a name that is not listed."""
+"""Module and constant with the known names, by the field that takes one; a field may also take a
+name that is not listed."""
+
+
+def _known_names(field: str) -> list[str]:
+    module, constant = NAMES[field]
+    return list(getattr(import_module(module_name(module)), constant))

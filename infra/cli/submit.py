@@ -119,8 +119,7 @@ def submit_to_slurm(
     array: ArrayOptions,
     batch: SlurmOptions,
 ) -> None:
-    options = with_base_settings(options, base)
-    submit_to_array(options, array, batch)
+    submit_to_array(with_base_settings(options, base), array, batch)
 
 
 @app.command(name=KUBERNETES, help="Submit the missing shards to Kubernetes, as an indexed job.")
@@ -131,8 +130,7 @@ def submit_to_kubernetes(
     array: ArrayOptions,
     machines: KubernetesOptions,
 ) -> None:
-    options = with_base_settings(options, base)
-    submit_to_array(options, array, machines)
+    submit_to_array(with_base_settings(options, base), array, machines)
 
 
 @app.command(name=BY_ARRAY, help="Have a Prefect worker submit the missing shards as an array.")
