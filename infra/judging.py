@@ -105,31 +105,29 @@ def judge_network(
     shards = opened.split(split)
     stored = stored_resolution(shards)
     resolution = resolution or min(network_file.trained.resolution or stored, stored)
+    trained = rivals.split("train") if "train" in rivals.splits else None
     torch_device = choose_device(device)
     distance = load_lpips(lpips)
     contest = EvalConfig(
         network=network_file.open().to(torch_device),
         shards=shards,
         resolution=resolution,
-        baselines=make_baselines(rivals.split("train"), resolution)
-        if "train" in rivals.splits
-        else None,
+        baselines=None if trained is None else make_baselines(trained, resolution),
         lpips=None if distance is None else distance.to(torch_device),
         most_scenes=most_scenes,
         tracer_views=tracer_views,
     )
     total = contest.num_scenes
-    done(0, total)
-    numbers = itertools.count(1)
+    numbers = itertools.count()
+    done(next(numbers), total)
     with contextlib.ExitStack() as stack:
         times, tracer = _time_tracer(contest, stack)
-        judged = dataclasses.replace(contest, tracer=tracer)
-        views = judge_views(judged, lambda: done(next(numbers), total))
+        traced = dataclasses.replace(contest, tracer=tracer)
+        views = judge_views(traced, lambda: done(next(numbers), total))
     about = _about(Path(checkpoint).name, opened, contest, split, views)
-    every, first = spread_views(tracer_views, total)
-    spread = spread_text(every, first, 1 + max(view.view for view in views))
-    figures = record(views, about, equal_time(views, times, spread))
-    return Judgement(record=figures, views=tuple(views), contest=contest)
+    spread = spread_text(*spread_views(tracer_views, total), 1 + max(row.view for row in views))
+    beside = equal_time(views, times, spread)
+    return Judgement(record=record(views, about, beside), views=tuple(views), contest=contest)
 
 
 def _time_tracer(

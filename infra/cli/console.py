@@ -65,7 +65,7 @@ _LEAST_RATED_S = 1.0
 
 
 @contextlib.contextmanager
-def printing(*, as_json: bool) -> Iterator[None]:
+def use_output(*, as_json: bool) -> Iterator[None]:
     """Print the text of the block, or with `as_json` only what `print_json` receives."""
     before = console.quiet
     console.quiet = as_json

@@ -21,7 +21,7 @@ from typing import Annotated, Any, get_origin
 
 from cyclopts import Group, Parameter, Token
 
-from infra.cli.console import printing
+from infra.cli.console import use_output
 from infra.cli.extend_option import resolve_reference
 from infra.cli.overrides import parse_overrides
 from storage.errors import TrilightError
@@ -92,7 +92,7 @@ def command(
             arguments_by_name = signature.bind(*_words, **_options).arguments
             values = {name: _settings(kind, arguments_by_name) for name, kind in kinds.items()}
             output = values.pop(_OUTPUT, OutputOptions())
-            with printing(as_json=output.json):
+            with use_output(as_json=output.json):
                 function(**values)
 
         run.__name__ = function.__name__
