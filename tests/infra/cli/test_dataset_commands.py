@@ -342,7 +342,6 @@ def test_other_folders_and_damage_are_named(tmp_path: Path) -> None:
             run_facts(tmp_path / "run")
 
 
-FORMS = ("usda", "usdc", "usdz", "json", "h5", "safetensors")
 PROFILE: Profile = "lossless"
 
 
@@ -372,23 +371,6 @@ def shard(tmp_path: Path) -> Path:
     samples = {key: encode_sample(tiny_sample(key), PROFILE) for key in ("000000003", "000000005")}
     write_shard(path, samples.items())
     return path
-
-
-def test_a_scene_goes_round_through_every_form(tmp_path: Path) -> None:
-    """From exact to exact form the bytes stay; JSON and HDF5 keep every triangle and its light."""
-    source = tmp_path / "a.safetensors"
-    source.write_bytes(encode_scene(tiny_scene()))
-    for form in FORMS:
-        found = convert(source, tmp_path / f"b.{form}")
-        assert found["triangles"] == 3
-        back = loaded(tmp_path / f"b.{form}")
-        if form not in ("json", "h5"):
-            assert encode_scene(back) == source.read_bytes()
-        want = tiny_scene()
-        assert np.array_equal(back.vertex_positions[back.faces], want.vertex_positions[want.faces])
-        assert np.array_equal(
-            back.materials[back.material_index], want.materials[want.material_index]
-        )
 
 
 def test_a_sample_and_a_whole_shard(tmp_path: Path, shard: Path) -> None:
