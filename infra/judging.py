@@ -126,8 +126,8 @@ def judge_network(
         views = judge_views(traced, lambda: done(next(numbers), total))
     about = _about(Path(checkpoint).name, opened, contest, split, views)
     spread = spread_text(*spread_views(tracer_views, total), 1 + max(row.view for row in views))
-    beside = equal_time(views, times, spread)
-    return Judgement(record=record(views, about, beside), views=tuple(views), contest=contest)
+    comparison = equal_time(views, times, spread)
+    return Judgement(record=record(views, about, comparison), views=tuple(views), contest=contest)
 
 
 def _time_tracer(
