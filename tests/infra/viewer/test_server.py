@@ -243,20 +243,6 @@ def test_pages_load_what_is_there_and_nothing_from_elsewhere() -> None:
     assert named > 3 * 9
 
 
-def test_every_element_that_a_script_asks_for_is_in_its_page() -> None:
-    scripts = {
-        "scene.html": ("scene.js", "pictures.js", "edits.js", "ask.js"),
-        "dataset.html": ("dataset.js", "ask.js"),
-        "folder.html": ("folder.js", "ask.js"),
-    }
-    for page, names in scripts.items():
-        there = set(re.findall(r'id="([\w-]+)"', (STATIC / page).read_text()))
-        for name in names:
-            text = (STATIC / name).read_text()
-            asked = set(re.findall(r'(?:byId|getElementById)\("([\w-]+)"\)', text))
-            assert asked and asked <= there, (page, name, asked - there)
-
-
 def test_the_page_of_a_source(tmp_path: Path) -> None:
     write_run(tmp_path / "run")
     (tmp_path / "set").mkdir()
