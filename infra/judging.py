@@ -5,7 +5,7 @@ import copy
 import dataclasses
 import itertools
 import os
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -105,38 +105,29 @@ def judge_network(
     shards = opened.split(split)
     stored = stored_resolution(shards)
     resolution = resolution or min(network_file.trained.resolution or stored, stored)
+    trained = rivals.split("train") if "train" in rivals.splits else None
     torch_device = choose_device(device)
     distance = load_lpips(lpips)
     contest = EvalConfig(
         network=network_file.open().to(torch_device),
         shards=shards,
         resolution=resolution,
-        baselines=make_baselines(rivals.split("train"), resolution)
-        if "train" in rivals.splits
-        else None,
+        baselines=None if trained is None else make_baselines(trained, resolution),
         lpips=None if distance is None else distance.to(torch_device),
         most_scenes=most_scenes,
         tracer_views=tracer_views,
     )
     total = contest.num_scenes
-    done(0, total)
-    numbers = itertools.count(1)
+    numbers = itertools.count()
+    done(next(numbers), total)
     with contextlib.ExitStack() as stack:
         times, tracer = _time_tracer(contest, stack)
-        judged = dataclasses.replace(contest, tracer=tracer)
-        views = judge_views(judged, lambda: done(next(numbers), total))
+        traced = dataclasses.replace(contest, tracer=tracer)
+        views = judge_views(traced, lambda: done(next(numbers), total))
     about = _about(Path(checkpoint).name, opened, contest, split, views)
-    figures = record(views, about, _beside_tracer(contest, views, times))
-    return Judgement(record=figures, views=tuple(views), contest=contest)
-
-
-def _beside_tracer(
-    contest: EvalConfig, views: Sequence[JudgedView], times: Mapping[str, Any]
-) -> dict[str, Any]:
-    """Return the comparison with the path tracer as JSON values."""
-    every, first = spread_views(contest.tracer_views, contest.num_scenes)
-    most_views = 1 + max(view.view for view in views)
-    return equal_time(views, times, spread_text(every, first, most_views))
+    spread = spread_text(*spread_views(tracer_views, total), 1 + max(row.view for row in views))
+    comparison = equal_time(views, times, spread)
+    return Judgement(record=record(views, about, comparison), views=tuple(views), contest=contest)
 
 
 def _time_tracer(

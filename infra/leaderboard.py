@@ -142,11 +142,18 @@ def widths_of(requested: Sequence[int], stored: int) -> list[int]:
 
 def _add_folders(board: Board, folders: Sequence[Path]) -> None:
     views = [(key, view) for key in board.keys for view in range(board.num_views)]
-    for folder in picture_folders(folders, views, board.widths):
-        board.add(folder, ELSEWHERE)
+    names: list[str] = []
+    for folder in folders:
+        pictures = picture_folder(folder, views, board.widths)
+        if pictures.name in names:
+            raise TrilightError(
+                f"--pictures {folder}: another folder has the same name; expected different ones."
+            )
+        names.append(pictures.name)
+        board.add(pictures, ELSEWHERE)
         board.notes.append(
-            f"{folder.name} were made elsewhere: what they cost is not known, and they are judged "
-            f"at {folder.resolution} pixels alone"
+            f"{pictures.name} were made elsewhere: what they cost is not known, and they are "
+            f"judged at {pictures.resolution} pixels alone"
         )
 
 
@@ -373,18 +380,3 @@ def _picture(data: bytes, path: Path, widths: Sequence[int]) -> NDArray[np.float
             f"least 0 (channel {'RGB'[channel]}). Make the picture again."
         )
     return radiance_rgb
-
-
-def picture_folders(
-    folders: Sequence[Path], views: Views, widths: Sequence[int]
-) -> list[PictureSource]:
-    """Return the checked folders; raises TrilightError for equal names."""
-    all_folders: list[PictureSource] = []
-    for folder in folders:
-        one = picture_folder(folder, views, widths)
-        if one.name in [other.name for other in all_folders]:
-            raise TrilightError(
-                f"--pictures {folder}: another folder has the same name; expected different ones."
-            )
-        all_folders.append(one)
-    return all_folders

@@ -131,20 +131,21 @@ class Pictures:
         """One scene in five steps: given mesh, clean mesh, traced, by the network, its error."""
         scene = self._room()
         traced = _trace(scene, self._view, 320, STATED_DB[-1])
-        learned = NeuralRenderer.load("builtin:").render(
-            _seen_by(scene, self._view), resolution=320
-        )[0]
+        rows = [self._view]
+        seen = scene.with_cameras(scene.c2w[rows], scene.fov_deg[rows])
+        learned = NeuralRenderer.load("builtin:").render(seen, resolution=320)[0]
         source, level = self._meshes(scene)
         target = traced.radiance_rgb
         gain = preview_gain(target)
         agreement = f"{psnr_log_db(learned, target):.0f} dB, included"
         stated = f"stated error {traced.noise_floor_db:.0f} dB"
+        error = heat_colors(AMPLIFIED * mean_error(learned, target) / ERROR_WHITE)
         panels = [
             _panel(_draw_mesh(source, 320), "Your mesh", _triangles(source), GIVEN),
             _panel(_draw_mesh(level, 320), "Clean mesh", _triangles(level), TRACED),
             _panel(preview_srgb8(gain * target), "Path traced", stated, TRACED),
             _panel(preview_srgb8(gain * learned), "Network", agreement, LEARNED),
-            _panel(_error(learned, target), "Its error", f"{AMPLIFIED} times brighter", LEARNED),
+            _panel(error, "Its error", f"{AMPLIFIED} times brighter", LEARNED),
         ]
         self._write("hero", _beside(panels))
 
@@ -292,14 +293,6 @@ def _trace(scene: Scene, view: int, resolution: int, target_db: float) -> Render
         camera = own_camera(scene, view, named="view")
         # no preview, whose error is not measured
         return cast(RenderedView, tracer.load(scene, "scene").render_view(camera))
-
-
-def _seen_by(scene: Scene, view: int) -> Scene:
-    return scene.with_cameras(scene.c2w[[view]], scene.fov_deg[[view]])
-
-
-def _error(image: NDArray[np.float32], target: NDArray[np.float32]) -> Pixels:
-    return heat_colors(AMPLIFIED * mean_error(image, target) / ERROR_WHITE)
 
 
 def _triangles(mesh: TriangleMesh) -> str:

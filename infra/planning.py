@@ -7,7 +7,7 @@ measured scenes are the first ones of the dataset, in its shards and splits.
 
 import dataclasses
 import math
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -148,7 +148,15 @@ def predict_cost(
     core_hours = _total(measured.core_s[1:] or measured.core_s, num_scenes / 3600)
     scene_s = core_hours.value * 3600 / num_scenes / available_cores()
     num_tasks = min(MAX_TASKS, max(1, math.ceil(num_scenes * scene_s / TASK_S)))
-    prediction = Prediction(
+    task_minutes = num_scenes * scene_s / num_tasks / 60
+    notes = []
+    if task_minutes > _LONG_TASK_MINUTES:
+        parts = math.ceil(task_minutes / _LONG_TASK_MINUTES)
+        notes.append(
+            f"one flow run would have tasks of {task_minutes:.0f} minutes: let build-dataset make "
+            f"it in at least {parts} flow runs, on as many workers"
+        )
+    return Prediction(
         num_scenes=num_scenes,
         num_shards=num_shards,
         scenes_per_shard=splits.scenes_per_shard,
@@ -158,12 +166,11 @@ def predict_cost(
         gigabytes=_total(measured.num_bytes, num_scenes / 1e9),
         shard_hours=_scale(core_hours, 1 / num_shards),
         num_tasks=num_tasks,
-        task_minutes=num_scenes * scene_s / num_tasks / 60,
+        task_minutes=task_minutes,
         database_mb=num_tasks * _BYTES_PER_TASK_RUN / 1e6,
         manifest_mb=num_shards * _BYTES_PER_SHARD / 1e6,
-        notes=(),
+        notes=tuple(notes),
     )
-    return dataclasses.replace(prediction, notes=tuple(_notes(prediction)))
 
 
 def describe_run(options: GenerateOptions, folder: DatasetFolder) -> str:
@@ -222,15 +229,6 @@ def _expected_time(settings: DatasetSettings, remaining: int, core_s: Sequence[f
 
 def _count_text(count: int, noun: str) -> str:
     return f"{count:,} {noun}{'' if count == 1 else 's'}"
-
-
-def _notes(prediction: Prediction) -> Iterator[str]:
-    if prediction.task_minutes > _LONG_TASK_MINUTES:
-        parts = math.ceil(prediction.task_minutes / _LONG_TASK_MINUTES)
-        yield (
-            f"one flow run would have tasks of {prediction.task_minutes:.0f} minutes: let "
-            f"build-dataset make it in at least {parts} flow runs, on as many workers"
-        )
 
 
 def _num_scenes(options: GenerateOptions) -> int:

@@ -254,6 +254,19 @@ class Run:
         done = {*self.whole_trials(), *self.left_out}
         return [trial for trial in self.plan["trials"] if trial not in done]
 
+    def take(self, record: Mapping[str, Any]) -> None:
+        """Receive a record of the file after the plan."""
+        if "figures" in record:
+            figures = record["figures"]
+            if isinstance(figures, list):
+                figures = dict(zip(self.plan["figures"], figures, strict=bool(figures)))
+            self.trials.setdefault(record["trial"], {})[record["point"]] = figures
+        elif "left_out" in record:
+            self.left_out[record["trial"]] = record["left_out"]
+        else:
+            self.seconds = record["seconds"]
+            self.notes = record["notes"]
+
 
 class Store:
     """File with the runs of one experiment."""
@@ -274,7 +287,7 @@ class Store:
                 if "plan" in record:
                     runs.append(Run(plan=record["plan"], date=record["date"]))
                 else:
-                    _take(runs[-1], record)
+                    runs[-1].take(record)
         except (ValueError, LookupError, TypeError) as error:
             raise TrilightError(
                 f"{self.path}: no rows of `trilight bench` ({error}); expected a file that it "
@@ -300,32 +313,12 @@ class Store:
         """Write the figures of one point in one trial; values alone if the plan names them."""
         names = run.plan.get("figures")
         stored = dict(figures) if names is None else [figures[name] for name in names if figures]
-        self._write(run, {"trial": trial, "point": point, "figures": stored})
+        self.write(run, trial=trial, point=point, figures=stored)
 
-    def leave_out(self, run: Run, trial: str, why: str) -> None:
-        """Write that a trial counts for no point, and why."""
-        self._write(run, {"trial": trial, "left_out": why})
-
-    def end(self, run: Run, seconds: float, notes: list[str]) -> None:
-        """Write that a run has ended."""
-        self._write(run, {"seconds": seconds, "notes": notes})
-
-    def _write(self, run: Run, record: Mapping[str, Any]) -> None:
+    def write(self, run: Run, **record: Any) -> None:
+        """Write a record of a run: why a trial counts for no point, or that the run has ended."""
         self._append(record)
-        _take(run, record)
+        run.take(record)
 
     def _append(self, record: Mapping[str, Any]) -> None:
         append_line(self.path, json.dumps(record, sort_keys=True, allow_nan=False), durable=True)
-
-
-def _take(run: Run, record: Mapping[str, Any]) -> None:
-    if "figures" in record:
-        figures = record["figures"]
-        if isinstance(figures, list):
-            figures = dict(zip(run.plan["figures"], figures, strict=bool(figures)))
-        run.trials.setdefault(record["trial"], {})[record["point"]] = figures
-    elif "left_out" in record:
-        run.left_out[record["trial"]] = record["left_out"]
-    else:
-        run.seconds = record["seconds"]
-        run.notes = record["notes"]

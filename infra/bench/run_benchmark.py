@@ -89,7 +89,7 @@ def run(
         raise TrilightError(f"bench {experiment.name}: no trial could be measured: {reasons}.")
     # before the end is stored: a run that cannot be drawn is unfinished
     plot(experiment, current, out.with_suffix(".png"))
-    store.end(current, time.perf_counter() - began, notes)
+    store.write(current, seconds=time.perf_counter() - began, notes=notes)
     return current
 
 
@@ -136,7 +136,7 @@ def _measure_missing(
             for name, measure in measures:
                 store.add(current, trial, name, measure(context, trial))
         except (Rejected, ChildFailed) as error:
-            store.leave_out(current, trial, str(error))
+            store.write(current, trial=trial, left_out=str(error))
         trial_done(number, total)
 
 
@@ -148,20 +148,19 @@ def machine_record(device: str) -> dict[str, Any]:
             versions[library] = metadata.version(library)
         except metadata.PackageNotFoundError:
             continue
+    gpu = {}
+    if device == "cuda":
+        import torch
+
+        gpu["gpu"] = torch.cuda.get_device_name() if torch.cuda.is_available() else "no GPU"
     return {
-        **({"gpu": _gpu_name()} if device == "cuda" else {}),
+        **gpu,
         "processor": processor(),
         "cores": os.cpu_count(),
         "system": f"{platform.system()} {platform.machine()}, Python {platform.python_version()}",
         "versions": versions,
         "commit": commit_text(),
     }
-
-
-def _gpu_name() -> str:
-    import torch
-
-    return str(torch.cuda.get_device_name()) if torch.cuda.is_available() else "no GPU"
 
 
 def commit_text(root: Path = ROOT) -> str:

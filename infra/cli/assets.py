@@ -17,7 +17,7 @@ from infra.cli.console import (
     progress_bars,
     suggest_look,
 )
-from infra.cli.options import OutputOptions, command
+from infra.cli.options import command
 from pipeline.assets.settings import AssetSettings, OwnMaterialSettings, Profile
 from pipeline.objects.licences import DEFAULT_ALLOWED
 from pipeline.presets.registry import DATASET_PRESETS, preset_settings
@@ -69,17 +69,17 @@ class AssetOptions:
 
 
 @command("source")
-def assets(options: AssetOptions, output: OutputOptions) -> None:
+def assets(options: AssetOptions) -> None:
     settings = _settings(options)
     source = options.source
     out = options.out
-    first_words(f"Meshes of {safe_url(source)} to {out}", silent=output.json)
+    first_words(f"Meshes of {safe_url(source)} to {out}")
     from pipeline.generation.make_assets import AssetFolder, make_assets
 
     folder = AssetFolder(out)
     with progress_bars() as bars:
-        fetched = bars.add_task("download", total=None, note="", visible=not output.json)
-        task = bars.add_task("objects", total=None, note="", visible=not output.json)
+        fetched = bars.add_task("download", total=None, note="")
+        task = bars.add_task("objects", total=None, note="")
         report = make_assets(
             source,
             folder,
@@ -91,10 +91,8 @@ def assets(options: AssetOptions, output: OutputOptions) -> None:
             on_plan=lambda total: bars.update(task, total=total),
             on_object=lambda: bars.advance(task),
         )
-    if output.json:
-        print_json(report.as_json())
-    else:
-        _print_report(report, options, settings, folder)
+    print_json(report.as_json())
+    _print_report(report, options, settings, folder)
     if not report.rows:
         sys.exit(1)
 
@@ -103,6 +101,8 @@ def _print_report(
     report: "AssetReport", options: AssetOptions, settings: AssetSettings, folder: "AssetFolder"
 ) -> None:
     """Print the result for the objects, the page to look at, and the next command."""
+    from pipeline.generation.prepare_isolated import format_unread
+
     _print_table(report)
     decimated = [row for row in report.rows if row.method != "source"]
     rows = [
@@ -112,7 +112,7 @@ def _print_report(
         *_material_rows(report, settings, folder),
         ("rejected", f"{len(report.failures)}"),
         *(("", f"{count} x {reason}") for _, reason, count in count_by_reason(report.failures)),
-        *_unread_rows(report, folder),
+        *_lines("not read", format_unread(report.unread, folder.logs)),
         ("meshes, catalogue", f"{folder.meshes}, {folder.catalogue}"),
     ]
     print_rows("Assets finished" if report.rows else "No object can be used", rows)
@@ -128,11 +128,8 @@ def _print_report(
         )
 
 
-def _unread_rows(report: "AssetReport", folder: "AssetFolder") -> list[tuple[str, str]]:
-    from pipeline.generation.prepare_isolated import format_unread
-
-    lines = format_unread(report.unread, folder.logs)
-    return [("" if row else "not read", line) for row, line in enumerate(lines)]
+def _lines(name: str, lines: Sequence[str]) -> list[tuple[str, str]]:
+    return [("" if row else name, line) for row, line in enumerate(lines)]
 
 
 def _epsilon_rows(report: "AssetReport", settings: AssetSettings) -> list[tuple[str, str]]:
@@ -157,8 +154,7 @@ def _material_rows(
     num_kept = sum(row.colours is not None for row in report.rows)
     reasons = {row.uid: row.materials.reason for row in report.rows if row.materials}
     lost = format_unread({uid: (why,) for uid, why in reasons.items() if why}, folder.page)
-    lines = [f"{num_kept} of {len(report.rows)}", *lost]
-    return [("" if row else "in their own materials", line) for row, line in enumerate(lines)]
+    return _lines("in their own materials", [f"{num_kept} of {len(report.rows)}", *lost])
 
 
 def _settings(options: AssetOptions) -> AssetSettings:

@@ -36,7 +36,7 @@ _COLUMNS = 8
 """Maximum number of columns side by side; further ones are printed below."""
 
 
-@command("names")
+@command("names", has_json=False)
 def bench(run_options: BenchRunOptions, options: BenchOptions) -> None:
     try:
         from infra.bench.experiment import FULL, QUICK, Store, experiment_of

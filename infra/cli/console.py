@@ -1,11 +1,12 @@
 """Output for people: first lines, tables, progress bars with rate and ETA, and next commands."""
 
+import contextlib
 import json
 import os
 import re
 import shlex
 import time
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from types import MappingProxyType, TracebackType
 from typing import Any, Literal
 
@@ -63,15 +64,20 @@ _LEAST_RATED_S = 1.0
 """Seconds before a task's rate is printed."""
 
 
-def first_words(text: str, *, silent: bool = False) -> None:
-    """Print what begins now, before slow imports and reads.
+@contextlib.contextmanager
+def use_output(*, as_json: bool) -> Iterator[None]:
+    """Print the text of the block, or with `as_json` only what `print_json` receives."""
+    before = console.quiet
+    console.quiet = as_json
+    try:
+        yield
+    finally:
+        console.quiet = before
 
-    Args:
-        text: a sentence without its full stop.
-        silent: print nothing, because the output is JSON.
-    """
-    if not silent:
-        console.print(Text(f"{text} ...", style="dim"), soft_wrap=True)
+
+def first_words(text: str) -> None:
+    """Print what begins now, a sentence without its full stop, before slow imports and reads."""
+    console.print(Text(f"{text} ...", style="dim"), soft_wrap=True)
 
 
 def next_step(*commands: Sequence[str], recorded: Mapping[str, str] = MappingProxyType({})) -> None:
@@ -176,7 +182,7 @@ class Bars(Progress):
             self.console.print(f"{counts}, {note}" if note else counts, soft_wrap=True)
 
     def _begin(self) -> None:
-        if not self.live.is_started and any(map(_is_drawn, self.tasks)):
+        if not (self.live.is_started or self.console.quiet) and any(map(_is_drawn, self.tasks)):
             self.start()
 
 
@@ -234,17 +240,15 @@ def print_result(
     record: Mapping[str, Any],
     *,
     notes: Iterable[str] = (),
-    as_json: bool,
 ) -> None:
     """Print a result: its record as JSON, or its notes and a table of (name, value) rows."""
-    if as_json:
-        print_json(record)
-        return
+    print_json(record)
     for text in notes:
         note(text)
     print_rows(title, rows)
 
 
 def print_json(value: Any) -> None:
-    """Print a value as one JSON document."""
-    console.file.write(json.dumps(value, indent=1, sort_keys=True) + "\n")
+    """Print a value as one JSON document; nothing where text is printed."""
+    if console.quiet:
+        console.file.write(json.dumps(value, indent=1, sort_keys=True) + "\n")

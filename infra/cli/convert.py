@@ -4,7 +4,7 @@ from pathlib import Path
 from typing import Annotated
 
 from infra.cli.console import first_words, print_result, progress_bars
-from infra.cli.options import OutputOptions, command
+from infra.cli.options import command
 from pipeline.exchange.from_description import AlbedoOverOne
 from storage.settings.described import checked
 from storage.settings.ranges import Within
@@ -28,8 +28,8 @@ class ConvertOptions:
 
 
 @command("source", "target")
-def convert(options: ConvertOptions, output: OutputOptions) -> None:
-    first_words(f"Converting {options.source} to {options.target}", silent=output.json)
+def convert(options: ConvertOptions) -> None:
+    first_words(f"Converting {options.source} to {options.target}")
     from pipeline.exchange.convert import convert_scene
     from pipeline.exchange.open_scene import scene_source
 
@@ -40,7 +40,7 @@ def convert(options: ConvertOptions, output: OutputOptions) -> None:
         albedo_over_one=options.albedo_over_one,
     )
     with progress_bars() as bars:
-        task = bars.add_task("files", total=None, note="", visible=not output.json)
+        task = bars.add_task("files", total=None, note="")
         result = convert_scene(
             scene,
             options.target,
@@ -52,4 +52,4 @@ def convert(options: ConvertOptions, output: OutputOptions) -> None:
     more = len(files) - 1
     written = files[0] + (f" and {more} {'files' if more > 1 else 'file'} more" if more else "")
     rows = [("written", written), ("triangles", f"{result.triangles}")]
-    print_result("Converted", rows, record, notes=result.notes, as_json=output.json)
+    print_result("Converted", rows, record, notes=result.notes)

@@ -8,7 +8,7 @@ from rich.table import Table
 from rich.text import Text
 
 from infra.cli.console import console, first_words, print_json
-from infra.cli.options import OutputOptions, command
+from infra.cli.options import command
 from storage.settings.described import checked
 
 if TYPE_CHECKING:
@@ -28,25 +28,23 @@ class DoctorOptions:
 
 
 @command()
-def doctor(options: DoctorOptions, output: OutputOptions) -> None:
-    first_words("Looking at this machine", silent=output.json)
+def doctor(options: DoctorOptions) -> None:
+    first_words("Looking at this machine")
     from infra.doctor import examine
 
     findings = []
     with console.status("") as status:
         for finding in examine(lambda name: status.update(f"looking at: {name}")):
             findings.append(finding)
-            if not output.json:
-                console.print(_row(finding))
+            console.print(_row(finding))
     if options.measure:
-        findings.append(_measure_previews(silent=output.json))
-    if output.json:
-        print_json([asdict(finding) for finding in findings])
+        findings.append(_measure_previews())
+    print_json([asdict(finding) for finding in findings])
     if any(finding.state == "missing" for finding in findings):
         sys.exit(1)
 
 
-def _measure_previews(*, silent: bool) -> "Finding":
+def _measure_previews() -> "Finding":
     from infra.doctor import Finding
     from infra.render.machine_costs import measure_costs
     from infra.render.preview_table import keep_machine_costs, shipped_table
@@ -54,8 +52,7 @@ def _measure_previews(*, silent: bool) -> "Finding":
     with console.status("measuring previews"):
         path = keep_machine_costs(measure_costs(shipped_table()))
     finding = Finding("ok", f"measured, and kept in {path}", name="previews")
-    if not silent:
-        console.print(_row(finding))
+    console.print(_row(finding))
     return finding
 
 

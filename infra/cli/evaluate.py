@@ -9,13 +9,13 @@ from rich.text import Text
 
 from infra.cli.console import console, first_words, print_json, progress_bars, suggest_look
 from infra.cli.leaderboard import judge_methods
-from infra.cli.options import OutputOptions, command
+from infra.cli.options import command
 from infra.torch_library import require_torch
 from train.evaluation.options import EvaluationOptions
 
 
 @command("checkpoint")
-def evaluate(options: EvaluationOptions, output: OutputOptions) -> None:
+def evaluate(options: EvaluationOptions) -> None:
     record: dict[str, Any] = {}
     board = options.leaderboard()
     if options.checkpoint:
@@ -23,25 +23,22 @@ def evaluate(options: EvaluationOptions, output: OutputOptions) -> None:
             from infra.leaderboard import check_leaderboard
 
             check_leaderboard(board)  # the evaluation before it may take hours
-        record, out = _judge_network(options, options.checkpoint, silent=output.json)
+        record, out = _judge_network(options, options.checkpoint)
         board = board and dataclasses.replace(board, out=out)
     if board:
-        standings = judge_methods(board, silent=output.json)
+        standings = judge_methods(board)
         record = record | {"leaderboard": standings} if record else standings
-    if output.json:
-        print_json(record)
+    print_json(record)
 
 
-def _judge_network(
-    options: EvaluationOptions, checkpoint: str, *, silent: bool
-) -> tuple[dict[str, Any], Path]:
-    """Evaluate a network, and print the figures unless `silent`; return figures and folder."""
-    first_words(f"Judging {checkpoint} on the split {options.split}", silent=silent)
+def _judge_network(options: EvaluationOptions, checkpoint: str) -> tuple[dict[str, Any], Path]:
+    """Evaluate a network, and print the figures; return figures and folder."""
+    first_words(f"Judging {checkpoint} on the split {options.split}")
     require_torch("evaluate")
     from infra.judging import judge_network, write_judgement
 
     with progress_bars() as bars:
-        task = bars.add_task("scenes", total=None, note="", visible=not silent)
+        task = bars.add_task("scenes", total=None, note="")
         judgement = judge_network(
             checkpoint,
             data=options.data,
@@ -54,11 +51,10 @@ def _judge_network(
             device=options.device,
             done=lambda now, total: bars.update(task, completed=now, total=total),
         )
-    first_words("Drawing the sheets", silent=silent)
+    first_words("Drawing the sheets")
     record = judgement.record
     out = write_judgement(judgement, options.report_folder)
-    if not silent:
-        _report(record, out)
+    _report(record, out)
     return {name: record[name] for name in ("about", "contestants", "path tracer")}, out
 
 

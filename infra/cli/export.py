@@ -4,7 +4,7 @@ from pathlib import Path
 from typing import Literal
 
 from infra.cli.console import first_words, print_result, progress_bars
-from infra.cli.options import OutputOptions, command
+from infra.cli.options import command
 from pipeline.exchange.exports.export import ExportForm
 from storage.remote.safe_url import safe_url
 from storage.settings.described import checked
@@ -32,14 +32,14 @@ class ExportOptions:
 
 
 @command("source")
-def export(options: ExportOptions, output: OutputOptions) -> None:
-    first_words(f"Exporting {safe_url(options.source)} to {options.out}", silent=output.json)
+def export(options: ExportOptions) -> None:
+    first_words(f"Exporting {safe_url(options.source)} to {options.out}")
     from pipeline.exchange.exports.export import export_dataset  # slow: Pillow
 
     views: list[int] = []
     """Number of views of each written scene."""
     with progress_bars() as bars:
-        task = bars.add_task("scenes", total=None, note="", visible=not output.json)
+        task = bars.add_task("scenes", total=None, note="")
 
         def on_scene(num_views: int) -> None:
             views.append(num_views)
@@ -56,4 +56,4 @@ def export(options: ExportOptions, output: OutputOptions) -> None:
     about = {"form": options.form, "out": str(options.out)}
     record = {**about, "scenes": len(views), "views": sum(views), "notes": list(notes)}
     rows = [*about.items(), ("written", f"{len(views)} scenes, {sum(views)} views")]
-    print_result("Exported", rows, record, notes=notes, as_json=output.json)
+    print_result("Exported", rows, record, notes=notes)

@@ -15,7 +15,7 @@ from typing import TYPE_CHECKING
 from rich.progress import Progress as Bars
 
 from infra.cli.console import first_words, next_step, note, print_json, print_rows, progress_bars
-from infra.cli.options import OutputOptions, command
+from infra.cli.options import command
 from infra.cli.overrides import BaseSettings, with_base_settings
 from pipeline.executors.registry import find_executor
 from pipeline.generation.dataset_writer import require_its_extensions
@@ -52,37 +52,35 @@ class ExecutorOptions:
 
 
 @command("build")
-def generate(
-    options: GenerateOptions, base: BaseSettings, runner: ExecutorOptions, output: OutputOptions
-) -> None:
+def generate(options: GenerateOptions, base: BaseSettings, runner: ExecutorOptions) -> None:
     require_its_extensions(dataset_folder(options.place))
-    make(with_base_settings(options, base), runner, output)
+    make(with_base_settings(options, base), runner)
 
 
-def make(options: GenerateOptions, runner: ExecutorOptions, output: OutputOptions) -> None:
+def make(options: GenerateOptions, runner: ExecutorOptions) -> None:
     """Make a dataset and print the result; raises TrilightError."""
     folder = dataset_folder(options.place)
     started = time.monotonic()
-    first_words(f"Making {folder.display_name} with the preset {options.build}", silent=output.json)
+    first_words(f"Making {folder.display_name} with the preset {options.build}")
     executor = find_executor(runner.runner, runner.address, options.workers)
     from infra.planning import describe_run  # slow: every stage
     from pipeline.generation.generation_run import choose_dataset_variant
 
-    if not output.json and (text := describe_run(options, folder)):
+    if text := describe_run(options, folder):
         first_words(text)
-    if (text := choose_dataset_variant(options, folder).note) and not output.json:
+    if text := choose_dataset_variant(options, folder).note:
         note(f"{text}; see trilight doctor")
-    with show_progress(folder, silent=output.json):
+    with show_progress(folder):
         outcome = executor.make(options, runner.address)
-    report(folder, outcome, time.monotonic() - started, as_json=output.json)
+    report(folder, outcome, time.monotonic() - started)
 
 
 @contextlib.contextmanager
-def show_progress(folder: DatasetFolder, *, silent: bool) -> Iterator[None]:
+def show_progress(folder: DatasetFolder) -> Iterator[None]:
     """Draw progress bars while the block runs."""
     ended = threading.Event()
     with progress_bars() as bars:
-        watcher = threading.Thread(target=_watch, args=(folder, bars, ended, silent), daemon=True)
+        watcher = threading.Thread(target=_watch, args=(folder, bars, ended), daemon=True)
         watcher.start()
         try:
             yield
@@ -91,9 +89,9 @@ def show_progress(folder: DatasetFolder, *, silent: bool) -> Iterator[None]:
             watcher.join()
 
 
-def _watch(folder: DatasetFolder, bars: Bars, ended: threading.Event, silent: bool) -> None:
-    drawn = _Bars(bars, silent=silent)
-    waits = not silent and not folder.contact_sheet.exists()
+def _watch(folder: DatasetFolder, bars: Bars, ended: threading.Event) -> None:
+    drawn = _Bars(bars)
+    waits = not folder.contact_sheet.exists()
     last = False
     while not last:
         last = ended.wait(_POLL_S)
@@ -107,11 +105,10 @@ def _watch(folder: DatasetFolder, bars: Bars, ended: threading.Event, silent: bo
 class _Bars:
     """Three bars: downloads, objects, and views; a view in progress counts as a fraction."""
 
-    def __init__(self, bars: Bars, *, silent: bool) -> None:
+    def __init__(self, bars: Bars) -> None:
         self._bars = bars
         self._downloads, self._objects, self._views = (
-            bars.add_task(name, total=None, note="", visible=not silent)
-            for name in ("download", "objects", "views")
+            bars.add_task(name, total=None, note="") for name in ("download", "objects", "views")
         )
         self._already: float | None = None
         self._most = 0.0
@@ -140,12 +137,10 @@ class _Bars:
         )
 
 
-def report(folder: DatasetFolder, outcome: "Outcome", seconds: float, *, as_json: bool) -> None:
+def report(folder: DatasetFolder, outcome: "Outcome", seconds: float) -> None:
     """Print the result and the next commands."""
     rejected = count_by_reason([*read_failures(folder.failures), *outcome.failures])
-    if as_json:
-        _print_json(folder, outcome, rejected, seconds)
-        return
+    _print_json(folder, outcome, rejected, seconds)
     statistics = outcome.statistics
     used = f"{outcome.num_objects_used} of {outcome.num_objects_found}"
     counts = Counter(entry.licence for entry in read_objects_lock(folder.objects_lock))

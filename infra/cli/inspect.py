@@ -19,7 +19,7 @@ from infra.cli.console import (
     progress_bars,
     suggest_look,
 )
-from infra.cli.options import OutputOptions, command
+from infra.cli.options import command
 from infra.run_record import is_run, run_facts, tensorboard_command
 from storage.aliases import PRESET_ALIASES, name_for_people
 from storage.dataset.dataset import Dataset, open_dataset
@@ -56,17 +56,17 @@ class InspectOptions:
 
 
 @command("source")
-def inspect(options: InspectOptions, output: OutputOptions) -> None:
+def inspect(options: InspectOptions) -> None:
     source = options.source
     if not ("://" in source or Path(source).is_dir()):
-        _inspect_scene(source, options.turntable, json=output.json)
+        _inspect_scene(source, options.turntable)
         return
     if options.turntable is not None:
         raise TrilightError(f"--turntable: {source} is a folder; expected one scene.")
     if is_run(Path(source)):
-        _inspect_run(Path(source), json=output.json)
+        _inspect_run(Path(source))
         return
-    first_words(f"Reading {safe_url(source)}", silent=output.json)
+    first_words(f"Reading {safe_url(source)}")
     opened = open_dataset(source)
     name = opened.display_name
     if not opened.manifest.shards:
@@ -78,25 +78,21 @@ def inspect(options: InspectOptions, output: OutputOptions) -> None:
 
     with progress_bars() as bars:
         total = len(described_shards(opened))
-        task = bars.add_task("shards", total=total, note="", visible=not output.json)
+        task = bars.add_task("shards", total=total, note="")
         statistics = dataset_statistics(opened)
         distributions = dataset_distributions(opened, shard_done=lambda _: bars.advance(task))
     folder = _folder_of_documents(opened, options.out)
     if folder is not None:
         _write(opened, statistics, distributions, folder, options)
-    if output.json:
-        print_json(_as_json(opened, statistics, distributions))
-        return
+    print_json(_as_json(opened, statistics, distributions))
     _print_summary(name, opened, statistics, distributions)
     suggest_look(f"Look at {folder.report} and {folder.contact_sheet}" if folder else _READ_ONLY)
 
 
-def _inspect_run(root: Path, *, json: bool) -> None:
+def _inspect_run(root: Path) -> None:
     """Print the progress of a training run."""
     facts = run_facts(root)
-    print_result(str(root), _fact_rows(facts), facts, as_json=json)
-    if json:
-        return
+    print_result(str(root), _fact_rows(facts), facts)
     suggest_look(f"Curves and pictures: {tensorboard_command(root)}")
     if not facts["finished"]:
         preset = name_for_people(facts["run"], PRESET_ALIASES)
@@ -122,15 +118,15 @@ def _folder_of_documents(opened: Dataset, out: Path | None) -> DatasetFolder | N
     return folder if folder and os.access(folder.root, os.W_OK | os.X_OK) else None
 
 
-def _inspect_scene(source: str, turntable: Path | None, *, json: bool) -> None:
-    first_words(f"Reading {source}", silent=json)
+def _inspect_scene(source: str, turntable: Path | None) -> None:
+    first_words(f"Reading {source}")
     from pipeline.exchange.open_scene import scene_source
     from pipeline.generation.inspect_scene import inspect_scene
 
     result = inspect_scene(scene_source(source), turntable)
     record = {**result.facts, "notes": list(result.notes)}
-    print_result(source, _fact_rows(result.facts), record, notes=result.notes, as_json=json)
-    if turntable is not None and not json:
+    print_result(source, _fact_rows(result.facts), record, notes=result.notes)
+    if turntable is not None:
         suggest_look(f"Look at {turntable}")
 
 

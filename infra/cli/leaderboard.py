@@ -11,41 +11,36 @@ from infra.cli.console import (
     progress_bars,
     suggest_look,
 )
-from infra.cli.options import OutputOptions, command
+from infra.cli.options import command
 from infra.torch_library import require_torch
 from storage.remote.safe_url import safe_url
 from train.evaluation.options import LeaderboardOptions
 
 
 @command("source")
-def leaderboard(options: LeaderboardOptions, output: OutputOptions) -> None:
-    record = judge_methods(options, silent=output.json)
-    if output.json:
-        print_json(record)
+def leaderboard(options: LeaderboardOptions) -> None:
+    print_json(judge_methods(options))
 
 
-def judge_methods(options: LeaderboardOptions, *, silent: bool) -> dict[str, Any]:
-    """Make a leaderboard and print it unless `silent`; return it as JSON values."""
-    first_words(f"Judging on {safe_url(options.source)}, into {options.out}", silent=silent)
+def judge_methods(options: LeaderboardOptions) -> dict[str, Any]:
+    """Make a leaderboard and print it as text; return it as JSON values."""
+    first_words(f"Judging on {safe_url(options.source)}, into {options.out}")
     require_torch("leaderboard")
     from infra.leaderboard import make_leaderboard
 
     with progress_bars() as bars:
-        task = bars.add_task("scenes", total=None, note="", visible=not silent)
+        task = bars.add_task("scenes", total=None, note="")
         board = make_leaderboard(
             options,
             lambda now, total, what: bars.update(task, completed=now, total=total, note=what),
         )
-    if not silent:
-        for one in board.widths:
-            title = f"{one.width} x {one.width} pixels: median psnr_log_db of {one.num_views} views"
-            rows = [_row(each) for each in one.standings]
-            print_table(f"{title}, lead over {board.rival}", rows)
-        for text in board.notes:
-            note(text)
-        suggest_look(
-            f"Read {board.out / 'leaderboard.md'}, look at {board.out / 'leaderboard.png'}"
-        )
+    for one in board.widths:
+        title = f"{one.width} x {one.width} pixels: median psnr_log_db of {one.num_views} views"
+        rows = [_row(each) for each in one.standings]
+        print_table(f"{title}, lead over {board.rival}", rows)
+    for text in board.notes:
+        note(text)
+    suggest_look(f"Read {board.out / 'leaderboard.md'}, look at {board.out / 'leaderboard.png'}")
     return {"out": str(board.out), "rival": board.rival, "widths": _plain(board)}
 
 

@@ -5,7 +5,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
 from infra.cli.console import first_words, print_json, print_rows
-from infra.cli.options import OutputOptions, command
+from infra.cli.options import command
 from storage.errors import TrilightError, expected_one_of
 from storage.settings.described import checked
 from storage.settings.ranges import Within
@@ -38,9 +38,9 @@ class PublishOptions:
 
 
 @command("network")
-def model(options: ModelOptions, files: PublishOptions, output: OutputOptions) -> None:
+def model(options: ModelOptions, files: PublishOptions) -> None:
     name = options.network
-    first_words(f"Looking at {name}", silent=output.json)
+    first_words(f"Looking at {name}")
     try:
         from model.config import SIZES
         from model.costs import Workload, costs
@@ -67,10 +67,8 @@ def model(options: ModelOptions, files: PublishOptions, output: OutputOptions) -
         from model.open import save_published
 
         save_published(network, files.publish)
-    if output.json:
-        records = {"config": dataclasses.asdict(config), "workload": dataclasses.asdict(workload)}
-        print_json({"name": name, **records, **dataclasses.asdict(network_costs)})
-        return
+    records = {"config": dataclasses.asdict(config), "workload": dataclasses.asdict(workload)}
+    print_json({"name": name, **records, **dataclasses.asdict(network_costs)})
     _report(name, workload, network_costs)
 
 

@@ -1,7 +1,7 @@
 """Commands whose options are the fields of settings classes, so that each is described once.
 
     @command("build")
-    def generate(order: GenerateOptions, shown: Shown) -> None: ...
+    def generate(order: GenerateOptions, base: BaseSettings) -> None: ...
 
 makes the argument BUILD, and an option of every other field. Each parameter of the function is a
 class of settings (storage.settings.described) and a section of the help, with the class's first
@@ -15,14 +15,17 @@ import re
 import typing
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import MISSING
+from importlib import import_module
 from pathlib import Path
 from typing import Annotated, Any, get_origin
 
 from cyclopts import Group, Parameter, Token
 
+from infra.cli.console import use_output
 from infra.cli.extend_option import resolve_reference
 from infra.cli.overrides import parse_overrides
 from storage.errors import TrilightError
+from storage.installation import module_name
 from storage.remote.url import parse_local_path
 from storage.settings.described import checked
 from storage.settings.fields import (
@@ -54,17 +57,24 @@ class FileName(Path):
     """Type of an option that takes any text; shells complete it as a file name."""
 
 
-def command(*arguments: str) -> Callable[[Callable[..., None]], Callable[..., None]]:
+_OUTPUT = "output"
+
+
+def command(
+    *arguments: str, has_json: bool = True
+) -> Callable[[Callable[..., None]], Callable[..., None]]:
     """Return a decorator that makes a command of a function of settings classes.
 
     Args:
         arguments: fields that are positional arguments, and required unless they are empty or None
             by default; all other fields are options.
+        has_json: add `--json`, by which the command prints only its JSON.
     """
 
     def decorate(function: Callable[..., None]) -> Callable[..., None]:
-        kinds = typing.get_type_hints(function)
-        kinds.pop("return")
+        parts = typing.get_type_hints(function)
+        parts.pop("return")
+        kinds = {**parts, **({_OUTPUT: OutputOptions} if has_json else {})}
         parameters = {
             field.name: _parameter(field, group, by_place=field.name in arguments)
             for kind in kinds.values()
@@ -80,7 +90,10 @@ def command(*arguments: str) -> Callable[[Callable[..., None]], Callable[..., No
 
         def run(*_words: Any, **_options: Any) -> None:
             arguments_by_name = signature.bind(*_words, **_options).arguments
-            function(**{name: _settings(kind, arguments_by_name) for name, kind in kinds.items()})
+            values = {name: _settings(kind, arguments_by_name) for name, kind in kinds.items()}
+            output = values.pop(_OUTPUT, OutputOptions())
+            with use_output(as_json=output.json):
+                function(**values)
 
         run.__name__ = function.__name__
         run.__signature__ = signature  # type: ignore[attr-defined]
@@ -96,7 +109,7 @@ def _parameter(field: FieldDescription, group: Group, *, by_place: bool) -> insp
     several = is_repeated(field.hint) or takes_names(field.hint)
     choices = choices_of(field.hint)
     kind = kind_of(field.hint)
-    complete = (lambda _: NAMES[field.name]()) if field.name in NAMES else None
+    complete = (lambda _: _known_names(field.name)) if field.name in NAMES else None
     word: Any = bool if kind is bool else str  # numbers are read when the class is made
     if kind is str and not (choices or complete or takes_names(field.hint)):
         word = FileName
@@ -223,34 +236,16 @@ def takes_names(hint: Any) -> bool:
     return get_origin(unwrap(hint)[0]) in (Mapping, dict)
 
 
-def _dataset_presets() -> list[str]:
-    from pipeline.presets.registry import DATASET_PRESETS
-
-    return list(DATASET_PRESETS)
-
-
-def _training_presets() -> list[str]:
-    from train.presets import TRAINING_PRESETS
-
-    return list(TRAINING_PRESETS)
-
-
-def _sizes() -> list[str]:
-    from model.config import SIZES
-
-    return list(SIZES)
-
-
-def _runners() -> list[str]:
-    from pipeline.executors.registry import EXECUTORS
-
-    return list(EXECUTORS)
-
-
-NAMES: dict[str, Callable[[], list[str]]] = {
-    "build": _dataset_presets,
-    "run": _training_presets,
-    "network": _sizes,
-    "runner": _runners,
+NAMES = {
+    "build": ("pipeline.presets.registry", "DATASET_PRESETS"),
+    "run": ("train.presets", "TRAINING_PRESETS"),
+    "network": ("model.config", "SIZES"),
+    "runner": ("pipeline.executors.registry", "EXECUTORS"),
 }
-"""Known names by the field that takes one; a field may also take a name that is not listed."""
+"""Module and constant with the known names, by the field that takes one; a field may also take a
+name that is not listed."""
+
+
+def _known_names(field: str) -> list[str]:
+    module, constant = NAMES[field]
+    return list(getattr(import_module(module_name(module)), constant))

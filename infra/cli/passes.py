@@ -4,7 +4,7 @@ from pathlib import Path
 from typing import Annotated
 
 from infra.cli.console import first_words, print_result, progress_bars
-from infra.cli.options import OutputOptions, command
+from infra.cli.options import command
 from storage.records.exr import MAX_RESOLUTION
 from storage.records.passes.declared import pass_names
 from storage.records.passes.pictures import MOST_A_SIDE
@@ -33,14 +33,14 @@ class PassOptions:
 
 
 @command("source")
-def passes(options: PassOptions, output: OutputOptions) -> None:
+def passes(options: PassOptions) -> None:
     names = pass_names(name for words in options.passes for name in words.split(","))
-    first_words(f"Writing {', '.join(names)} to {options.out}", silent=output.json)
+    first_words(f"Writing {', '.join(names)} to {options.out}")
     from pipeline.exchange.pass_files import write_passes
 
     files: list[Path] = []
     with progress_bars() as bars:
-        task = bars.add_task("views", total=None, note="", visible=not output.json)
+        task = bars.add_task("views", total=None, note="")
 
         def on_file(path: Path) -> None:
             files.append(path)
@@ -58,4 +58,4 @@ def passes(options: PassOptions, output: OutputOptions) -> None:
         )
     record = {"files": list(map(str, files)), "notes": list(notes), "passes": names}
     rows = [("written", f"{len(files)} files"), ("passes", ", ".join(names))]
-    print_result("Passes", rows, record, notes=notes, as_json=output.json)
+    print_result("Passes", rows, record, notes=notes)

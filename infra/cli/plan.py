@@ -12,7 +12,7 @@ from infra.cli.console import (
     print_result,
     progress_bars,
 )
-from infra.cli.options import OutputOptions, command
+from infra.cli.options import command
 from infra.cli.overrides import BaseSettings, with_base_settings
 from infra.cli.process_exit import temporary_folder
 from pipeline.generation.generate_options import GenerateOptions, generate_words
@@ -43,7 +43,6 @@ def plan(
     base: BaseSettings,
     plan_options: PlanOptions,
     core: CorePrice,
-    output: OutputOptions,
 ) -> None:
     if (options.scenes_from, options.revisits, options.shards) != (None,) * 3:
         raise TrilightError(
@@ -54,18 +53,16 @@ def plan(
     build = options.build
     samples = plan_options.samples
     cores = plan_options.cores
-    first_words(f"Measuring {samples} scenes of {build}", silent=output.json)
+    first_words(f"Measuring {samples} scenes of {build}")
     from infra.planning import measure_scenes, predict_cost  # slow: every stage
 
     with progress_bars() as bars, temporary_folder("trilight-plan-") as place:
-        task = bars.add_task("scenes", total=samples, note="", visible=not output.json)
+        task = bars.add_task("scenes", total=samples, note="")
         measured = measure_scenes(options, samples, place, lambda: bars.advance(task))
     prediction = predict_cost(measured, options, cores=cores, usd_per_core_hour=core.price)
     title = f"{build}, {prediction.num_scenes} scenes, predicted from {samples} (90 % intervals)"
     record = dataclasses.asdict(prediction)
-    print_result(title, _rows(prediction, cores), record, as_json=output.json)
-    if output.json:
-        return
+    print_result(title, _rows(prediction, cores), record)
     for text in prediction.notes:
         note(text)
     next_step((*generate_words(options), "--out", _free(options.place)))

@@ -6,7 +6,7 @@ from collections.abc import Iterator, Mapping
 from typing import Any
 
 from infra.cli.console import console, print_json, print_rows, print_table
-from infra.cli.options import OutputOptions, command
+from infra.cli.options import command
 from storage.aliases import NETWORKS, OBJECTS, PRESET_ALIASES, name_for_people
 from storage.settings.described import checked
 
@@ -20,9 +20,9 @@ class PresetOptions:
 
 
 @command("build")
-def presets(options: PresetOptions, output: OutputOptions) -> None:
+def presets(options: PresetOptions) -> None:
     if options.build is not None:
-        _print_settings(options.build, as_json=output.json)
+        _print_settings(options.build)
         return
     tables = {
         "Datasets: trilight generate PRESET": _datasets(),
@@ -31,15 +31,13 @@ def presets(options: PresetOptions, output: OutputOptions) -> None:
         "Network sizes: --set model=SIZE": _sizes(),
         "Objects: --objects SOURCE": _sources(),
     }
-    if output.json:
-        print_json({title.split(":")[0].lower(): rows for title, rows in tables.items()})
-        return
+    print_json({title.split(":")[0].lower(): rows for title, rows in tables.items()})
     for title, rows in tables.items():
         print_table(title, rows)
         console.print()
 
 
-def _print_settings(name: str, *, as_json: bool) -> None:
+def _print_settings(name: str) -> None:
     """Print the settings of the dataset preset and of the training preset of a name."""
     from pipeline.presets.registry import (
         DATASET_PRESETS,
@@ -54,9 +52,7 @@ def _print_settings(name: str, *, as_json: bool) -> None:
     if name in TRAINING_PRESETS:
         settings[f"trilight train {name}"] = TRAINING_PRESETS[name]()
     tables = {title: dict(_values(dataclasses.asdict(each))) for title, each in settings.items()}
-    if as_json:
-        print_json(tables)
-        return
+    print_json(tables)
     for title, values in tables.items():
         rows = [(dotted, json.dumps(value)) for dotted, value in values.items()]
         print_rows(f"{title} --set NAME=VALUE", rows)

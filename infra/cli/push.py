@@ -3,7 +3,7 @@
 from pathlib import Path
 
 from infra.cli.console import first_words, next_step, print_json, print_rows, suggest_look
-from infra.cli.options import OutputOptions, command
+from infra.cli.options import command
 from storage.settings.described import checked
 
 
@@ -22,8 +22,8 @@ class PushOptions:
 
 
 @command("folder", "repository")
-def push(options: PushOptions, output: OutputOptions) -> None:
-    first_words(f"Looking through {options.folder}", silent=output.json)
+def push(options: PushOptions) -> None:
+    first_words(f"Looking through {options.folder}")
     from infra.release.push_to_hub import planned_upload
     from infra.release.push_to_hub import push as upload_all
 
@@ -36,11 +36,9 @@ def push(options: PushOptions, output: OutputOptions) -> None:
         "bytes": upload.num_bytes,
     }
     if not options.dry_run:
-        first_words(f"Uploading to {upload.repository}", silent=output.json)
+        first_words(f"Uploading to {upload.repository}")
         facts["address"] = upload_all(upload, private=options.private)
-    if output.json:
-        print_json(facts)
-        return
+    print_json(facts)
     rows = [(name, str(value)) for name, value in facts.items() if name != "bytes"]
     title = "Would be uploaded" if options.dry_run else "Uploaded"
     print_rows(title, [*rows, ("size", f"{upload.num_bytes / 1e6:.1f} MB")])

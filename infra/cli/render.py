@@ -6,13 +6,13 @@ from rich.progress import Progress
 from rich.text import Text
 
 from infra.cli.console import progress_bars
-from infra.cli.options import OutputOptions, command
+from infra.cli.options import command
 from infra.render.options import RenderOptions
 from storage.renderer import Image, Sampling
 
 
 @command("source")
-def render(options: RenderOptions, output: OutputOptions) -> None:
+def render(options: RenderOptions) -> None:
     from infra.cli.rendered import print_outcome
     from infra.render.plan import plan_render
     from infra.render.run_render import run_plan
@@ -21,23 +21,22 @@ def render(options: RenderOptions, output: OutputOptions) -> None:
     started = time.monotonic()
     with progress_bars() as bars, SceneReader(options.albedo_over_one) as reader:
         plan = plan_render(options, reader)
-        if plan.choice is not None and not output.json:
+        if plan.choice is not None:
             bars.console.print(Text(plan.choice.sentence), soft_wrap=True)
-        outcome = run_plan(plan, reader, _Bars(bars, visible=not output.json))
-    print_outcome(outcome, time.monotonic() - started, as_json=output.json)
+        outcome = run_plan(plan, reader, _Bars(bars))
+    print_outcome(outcome, time.monotonic() - started)
 
 
 class _Bars:
     """Progress bars of finished pictures, and of the samples of the current one."""
 
-    def __init__(self, bars: Progress, *, visible: bool) -> None:
+    def __init__(self, bars: Progress) -> None:
         self._bars = bars
         self._pictures = bars.add_task("pictures", total=None, note="", visible=False)
         self._samples = bars.add_task("samples", total=None, note="", visible=False)
-        self._visible = visible
 
     def on_picture(self, done: int, total: int) -> None:
-        self._bars.update(self._pictures, completed=done, total=total, visible=self._visible)
+        self._bars.update(self._pictures, completed=done, total=total, visible=True)
 
     def on_samples(self, now: Sampling | Image) -> None:
         if isinstance(now, Image):
@@ -48,5 +47,5 @@ class _Bars:
             completed=min(now.spp, now.expected_spp),
             total=now.expected_spp,
             note=note,
-            visible=self._visible,
+            visible=True,
         )

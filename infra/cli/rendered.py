@@ -7,7 +7,7 @@ from typing import Any
 
 import numpy as np
 
-from infra.cli.console import console, note, print_json, print_rows
+from infra.cli.console import note, print_json, print_rows, suggest_look
 from infra.render.networks import NetworkRenderer
 from infra.render.path_tracer import PathTracer
 from infra.render.plan import RenderPlan
@@ -20,54 +20,42 @@ from storage.renderer import Facts, Renderer
 
 Rows = list[tuple[str, str]]
 
-_FLOORS = {
-    "noise_floor_db": "psnr_log_db",
-    "noise_floor_linear_db": "psnr_linear_db",
-    "object_noise_floor_db": "object_psnr_log_db",
-}
-"""Metric by the name of the stated error of a path traced picture."""
-
-_EXPECTED = {
-    "noise_floor_db": "expected_error_db",
-    "noise_floor_linear_db": "expected_error_linear_db",
-    "object_noise_floor_db": "object_expected_error_db",
-}
-"""Expected error by the name of the stated one."""
+_STATED = {
+    "psnr_log_db": ("noise_floor_db", "expected_error_db", ""),
+    "psnr_linear_db": (
+        "noise_floor_linear_db", "expected_error_linear_db", ": linear, clamped to [0, 1]"
+    ),
+    "object_psnr_log_db": (
+        "object_noise_floor_db", "object_expected_error_db", ": where geometry is seen"
+    ),
+}  # fmt: skip
+"""By the metric of a stated error: its fact, that of the expected error, and what it means."""
 
 _FILTERS = {"fast": "one fast denoise", "high": "one denoise", "off": "not denoised"}
 
-_MEANING = {
-    "psnr_linear_db": ": linear, clamped to [0, 1]",
-    "object_psnr_log_db": ": where geometry is seen",
-}
 
-
-def print_outcome(outcome: RenderResult, seconds: float, *, as_json: bool) -> None:
+def print_outcome(outcome: RenderResult, seconds: float) -> None:
     """Print files and figures of the only picture, or a summary of many."""
     plan = outcome.plan
-    if as_json:
-        shots = [_shot_json(shot, timed=plan.choice is not None) for shot in outcome.shots]
-        common = {
-            "engine": plan.engine,
-            "notes": list(outcome.notes),
-            "resolution": plan.resolution,
-            "seconds": round(seconds, 2),
-            "source": plan.source,
-            "view": plan.view,
-        }
-        if plan.choice is not None:
-            common["choice"] = plan.choice.sentence
-        if not plan.output.is_sequence:
-            print_json({**common, **shots[0]})
-            return
-        video = plan.output.video
-        print_json({**common, "pictures": shots, "video": None if video is None else str(video)})
-        return
+    record = {
+        "engine": plan.engine,
+        "notes": list(outcome.notes),
+        "resolution": plan.resolution,
+        "seconds": round(seconds, 2),
+        "source": plan.source,
+        "view": plan.view,
+    }
+    if plan.choice is not None:
+        record["choice"] = plan.choice.sentence
+    shots = [_shot_json(shot, timed=plan.choice is not None) for shot in outcome.shots]
     for text in outcome.notes:
         note(text)
     if plan.output.is_sequence:
+        video = plan.output.video
+        print_json({**record, "pictures": shots, "video": None if video is None else str(video)})
         _print_sequence(plan, outcome.shots, seconds)
     else:
+        print_json({**record, **shots[0]})
         _print_one(plan, outcome.shots[0], seconds)
 
 
@@ -119,7 +107,7 @@ def _print_one(plan: RenderPlan, done: FinishedShot, seconds: float) -> None:
     print_rows("Rendered", rows)
     measure = " and ".join(str(picture.path) for picture in done.pictures.values())
     look = f"Look at {done.shot.png}; measure with {measure}"
-    console.print(f"\n{look}", style="bold")
+    suggest_look(look)
 
 
 def _describe(renderer: Renderer, facts: Facts) -> Rows:
@@ -129,8 +117,7 @@ def _describe(renderer: Renderer, facts: Facts) -> Rows:
             samples = f"{facts['spp']}, {_FILTERS[preview.denoiser]}"
             return [("samples per pixel", samples), ("stated error", unknown)]
         case PathTracer(settings=RenderSettings() as settings):
-            names = _shown_floors(settings)
-            floors = [_floor(settings, facts, name, metric) for name, metric in names.items()]
+            floors = [_floor(settings, facts, metric) for metric in _shown_metrics(settings)]
             rows = [("stated error", floors[0]), *(("", floor) for floor in floors[1:])]
             if settings.stated_error == "calibrated":
                 rows.append(("", _meaning(settings, facts)))
@@ -149,18 +136,18 @@ def _describe(renderer: Renderer, facts: Facts) -> Rows:
     raise TypeError(f"{renderer.name} is a renderer without a description")
 
 
-def _shown_floors(settings: RenderSettings) -> dict[str, str]:
-    """Return the stated errors that were asked for, as `_FLOORS`; JSON has all three."""
-    targets = {name: metric for name, metric in _FLOORS.items() if metric in settings.targets_db}
-    return targets or {"noise_floor_db": "psnr_log_db"}
+def _shown_metrics(settings: RenderSettings) -> list[str]:
+    """Return the metrics of the stated errors that were asked for; JSON has all three."""
+    return [metric for metric in _STATED if metric in settings.targets_db] or ["psnr_log_db"]
 
 
-def _floor(settings: RenderSettings, facts: Facts, name: str, metric: str) -> str:
+def _floor(settings: RenderSettings, facts: Facts, metric: str) -> str:
     """Return the text of one stated error, and whether its target was reached."""
-    floor_db = float(facts[name])
+    stated, expected, means = _STATED[metric]
+    floor_db = float(facts[stated])
     target_db = settings.targets_db.get(metric)
-    probably = f", probably {float(facts[e]):.1f}" if (e := _EXPECTED[name]) in facts else ""
-    text = f"{floor_db:.1f} dB{probably} ({metric}{_MEANING.get(metric, '')}"
+    probably = f", probably {float(facts[expected]):.1f}" if expected in facts else ""
+    text = f"{floor_db:.1f} dB{probably} ({metric}{means}"
     if target_db is None:
         return f"{text})"
     reached = floor_db >= target_db or not facts["at_cap"]  # facts are rounded
@@ -169,7 +156,7 @@ def _floor(settings: RenderSettings, facts: Facts, name: str, metric: str) -> st
 
 def _meaning(settings: RenderSettings, facts: Facts) -> str:
     """Return what a stated error promises, in one sentence."""
-    if _EXPECTED["noise_floor_db"] in facts:
+    if "expected_error_db" in facts:
         return promise_sentence(settings.resolution)
     return f"a bound: pictures like this one are not calibrated ({OUTSIDE})"
 
@@ -177,12 +164,12 @@ def _meaning(settings: RenderSettings, facts: Facts) -> str:
 def _floors(plan: RenderPlan, shots: Sequence[FinishedShot]) -> dict[str, list[float]]:
     """Return the stated errors of all pictures that were asked for, by metric."""
     every = [shot.pictures["mitsuba"].facts for shot in shots if "mitsuba" in shot.pictures]
-    names: dict[str, str] = {}
+    metrics: list[str] = []
     for renderer in plan.renderers:
         match renderer:
             case PathTracer(settings=RenderSettings() as settings):
-                names = _shown_floors(settings)
-    return {metric: [float(facts[name]) for facts in every] for name, metric in names.items()}
+                metrics = _shown_metrics(settings)
+    return {each: [float(facts[_STATED[each][0]]) for facts in every] for each in metrics}
 
 
 def _print_sequence(plan: RenderPlan, shots: Sequence[FinishedShot], seconds: float) -> None:
@@ -207,7 +194,7 @@ def _print_sequence(plan: RenderPlan, shots: Sequence[FinishedShot], seconds: fl
     print_rows("Rendered", rows)
     folder = plan.output.folder
     look = f"Look at {plan.output.video or folder}; measure with the pictures in {folder}"
-    console.print(f"\n{look}", style="bold")
+    suggest_look(look)
 
 
 def _time_rows(plan: RenderPlan, shots: Sequence[FinishedShot]) -> Rows:

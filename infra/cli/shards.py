@@ -16,7 +16,7 @@ from infra.cli.console import (
     progress_bars,
 )
 from infra.cli.everyday import HELP_FLAGS
-from infra.cli.options import OutputOptions, command
+from infra.cli.options import command
 from pipeline.shards.derive import DeriveOptions, Selection
 from pipeline.shards.derive import list_scenes as read_scene_rows
 from pipeline.shards.finished_dataset import open_finished
@@ -85,39 +85,37 @@ class ReshardOptions:
 
 @app.command(help="Merge datasets shard by shard; later ones get new keys.")
 @command("datasets")
-def merge(sources: MergeOptions, new: NewDatasetOptions, output: OutputOptions) -> None:
+def merge(sources: MergeOptions, new: NewDatasetOptions) -> None:
     if len(sources.datasets) < 2:
         raise TrilightError(f"merge: {len(sources.datasets)} dataset; expected at least 2.")
-    _run(sources.datasets, DeriveOptions(operation="merge"), new.out, as_json=output.json)
+    _run(sources.datasets, DeriveOptions(operation="merge"), new.out)
 
 
 @app.command(help="Keep the scenes that meet every condition, under their keys.")
 @command("dataset")
-def select(options: SelectOptions, new: NewDatasetOptions, output: OutputOptions) -> None:
+def select(options: SelectOptions, new: NewDatasetOptions) -> None:
     if options.selection == Selection():
         raise TrilightError("select: expected --where, --split, --template or --min-noise-floor.")
     derive = DeriveOptions(operation="select", selection=options.selection)
-    _run([options.dataset], derive, new.out, as_json=output.json)
+    _run([options.dataset], derive, new.out)
 
 
 @app.command(
     name="list", help="List the scenes that `select` would keep, without making a dataset."
 )
 @command("dataset")
-def list_scenes(chosen: SelectOptions, output: OutputOptions) -> None:
-    first_words(f"Reading {chosen.dataset}", silent=output.json)
+def list_scenes(chosen: SelectOptions) -> None:
+    first_words(f"Reading {chosen.dataset}")
     with progress_bars() as bars:
-        task = bars.add_task("shards", total=None, note="", visible=not output.json)
+        task = bars.add_task("shards", total=None, note="")
         source = open_finished(str(chosen.dataset))
         rows = read_scene_rows(
             source,
             chosen.selection,
             progress=lambda done, total: bars.update(task, completed=done, total=total),
         )
-    if output.json:
-        print_json({"of": source.manifest.num_samples, "scenes": rows})
-        return
     of = source.manifest.num_samples
+    print_json({"of": of, "scenes": rows})
     print_table(
         f"{len(rows)} of {of} scenes; of several views the least, most spp", rows[:_MOST_LISTED]
     )
@@ -137,18 +135,18 @@ def list_scenes(chosen: SelectOptions, output: OutputOptions) -> None:
 
 @app.command(help="Repack the scenes of every split into shards of another size.")
 @command("dataset")
-def reshard(options: ReshardOptions, new: NewDatasetOptions, output: OutputOptions) -> None:
+def reshard(options: ReshardOptions, new: NewDatasetOptions) -> None:
     derive = DeriveOptions(operation="reshard", scenes_per_shard=options.scenes_per_shard)
-    _run([options.dataset], derive, new.out, as_json=output.json)
+    _run([options.dataset], derive, new.out)
 
 
-def _run(datasets: Sequence[Path], derive: DeriveOptions, out: Path, *, as_json: bool) -> None:
-    first_words(f"Making {out}", silent=as_json)
+def _run(datasets: Sequence[Path], derive: DeriveOptions, out: Path) -> None:
+    first_words(f"Making {out}")
     from pipeline.generation.derive_dataset import derive_dataset  # slow: matplotlib
 
     places = [str(path) for path in datasets]
     with progress_bars() as bars:
-        task = bars.add_task("shards", total=None, note="", visible=not as_json)
+        task = bars.add_task("shards", total=None, note="")
         digest, statistics = derive_dataset(
             places,
             derive,
@@ -164,6 +162,5 @@ def _run(datasets: Sequence[Path], derive: DeriveOptions, out: Path, *, as_json:
         "views": statistics.num_views,
     }
     rows = [*statistics.lines(), ("dataset digest", digest)]
-    print_result("Dataset finished", rows, record, as_json=as_json)
-    if not as_json:
-        next_step(["verify", str(out)])
+    print_result("Dataset finished", rows, record)
+    next_step(["verify", str(out)])

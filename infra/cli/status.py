@@ -13,7 +13,7 @@ from infra.cli.console import (
     print_rows,
     suggest_look,
 )
-from infra.cli.options import OutputOptions, command
+from infra.cli.options import command
 from pipeline.generation.price import CorePrice
 from storage.aliases import PRESET_ALIASES, name_for_people
 from storage.dataset.progress import DatasetStatus, missing_shards, read_status
@@ -46,16 +46,13 @@ class StatusOptions:
 
 
 @command("dataset")
-def status(options: StatusOptions, core: CorePrice, output: OutputOptions) -> None:
+def status(options: StatusOptions, core: CorePrice) -> None:
     if options.missing:
-        _print_missing(options, as_json=output.json)
+        _print_missing(options)
         return
     progress = read_status(options.dataset)
     cost = None if progress.core_hours is None else progress.core_hours * core.price
-    if output.json:
-        row = {**dataclasses.asdict(progress), "next": _next(progress), "cost_usd": cost}
-        print_json(row)
-        return
+    print_json({**dataclasses.asdict(progress), "next": _next(progress), "cost_usd": cost})
     objects = f"{progress.objects_done} of {progress.objects_planned}"
     rows = [
         *([("objects", objects)] if progress.objects_done < progress.objects_planned else []),
@@ -80,23 +77,14 @@ def status(options: StatusOptions, core: CorePrice, output: OutputOptions) -> No
         suggest_look(_next(progress))
 
 
-def _print_missing(options: StatusOptions, *, as_json: bool) -> None:
+def _print_missing(options: StatusOptions) -> None:
     each = options.shards_per_task
     tasks = sorted({shard // each for shard in missing_shards(options.dataset)})
     ranges = [f"{task * each}:{(task + 1) * each}" for task in tasks]
-    if as_json:
-        print_json(
-            {
-                "missing": tasks,
-                "array": number_ranges(tasks),
-                "shards": ranges,
-                "shards_per_task": each,
-            }
-        )
-    elif options.lines:
-        console.file.writelines(f"{shards}\n" for shards in ranges)
-    elif tasks:
-        console.print(number_ranges(tasks), soft_wrap=True)
+    array = number_ranges(tasks)
+    print_json({"missing": tasks, "array": array, "shards": ranges, "shards_per_task": each})
+    if tasks:
+        console.print("\n".join(ranges) if options.lines else array, soft_wrap=True)
 
 
 def _next(progress: DatasetStatus) -> str:

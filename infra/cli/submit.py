@@ -17,7 +17,7 @@ from infra.cli.console import (
     progress_bars,
 )
 from infra.cli.everyday import HELP_FLAGS
-from infra.cli.options import OutputOptions, command
+from infra.cli.options import command
 from infra.cli.overrides import BaseSettings, with_base_settings
 from pipeline.executors.slurm_and_kubernetes import (
     ArrayJob,
@@ -107,9 +107,8 @@ def submit(
     runs: FlowRunOptions,
     options: GenerateOptions,
     base: BaseSettings,
-    output: OutputOptions,
 ) -> None:
-    _submit_flow(submission.flow, options, base, runs, output)
+    _submit_flow(submission.flow, options, base, runs)
 
 
 @app.command(name=SLURM, help="Submit the missing shards to Slurm, as an array of tasks.")
@@ -119,10 +118,8 @@ def submit_to_slurm(
     base: BaseSettings,
     array: ArrayOptions,
     batch: SlurmOptions,
-    output: OutputOptions,
 ) -> None:
-    options = with_base_settings(options, base)
-    submit_to_array(options, array, batch, as_json=output.json)
+    submit_to_array(with_base_settings(options, base), array, batch)
 
 
 @app.command(name=KUBERNETES, help="Submit the missing shards to Kubernetes, as an indexed job.")
@@ -132,18 +129,14 @@ def submit_to_kubernetes(
     base: BaseSettings,
     array: ArrayOptions,
     machines: KubernetesOptions,
-    output: OutputOptions,
 ) -> None:
-    options = with_base_settings(options, base)
-    submit_to_array(options, array, machines, as_json=output.json)
+    submit_to_array(with_base_settings(options, base), array, machines)
 
 
 @app.command(name=BY_ARRAY, help="Have a Prefect worker submit the missing shards as an array.")
 @command("build")
-def submit_by_array(
-    options: DatasetByArray, base: BaseSettings, runs: FlowRunOptions, output: OutputOptions
-) -> None:
-    _submit_flow(BY_ARRAY, options, base, runs, output)
+def submit_by_array(options: DatasetByArray, base: BaseSettings, runs: FlowRunOptions) -> None:
+    _submit_flow(BY_ARRAY, options, base, runs)
 
 
 def _submit_flow(
@@ -151,16 +144,15 @@ def _submit_flow(
     options: GenerateOptions,
     base: BaseSettings,
     runs: FlowRunOptions,
-    output: OutputOptions,
 ) -> None:
     """Submit a flow run and report it; once it has ended, name the next commands."""
-    first_words(f"Submitting {flow} with the preset {options.build}", silent=output.json)
+    first_words(f"Submitting {flow} with the preset {options.build}")
     load_prefect()
     from pipeline.flows.submission import parameters
 
     values = parameters(with_base_settings(options, base))
-    ended = run_flow(flow, values, runs, where=options.place, as_json=output.json)
-    if ended and not output.json and Path(options.place).is_dir():
+    ended = run_flow(flow, values, runs, where=options.place)
+    if ended and Path(options.place).is_dir():
         next_step(["verify", options.place], ["inspect", options.place])
 
 
@@ -168,17 +160,13 @@ def submit_to_array(
     options: GenerateOptions,
     array: ArrayOptions,
     scheduler: SlurmOptions | KubernetesOptions,
-    *,
-    as_json: bool,
 ) -> None:
     """Submit the missing shards of a dataset and print the job; raises TrilightError."""
     on = SLURM if isinstance(scheduler, SlurmOptions) else KUBERNETES
-    first_words(f"Looking for what is missing of {options.place}", silent=as_json)
+    first_words(f"Looking for what is missing of {options.place}")
     job = array_job(options, per_task=array.shards_per_task, at_once=array.at_once, on=on)
     if not job.tasks:
-        if as_json:
-            print_json({"job": None, "array": "", "shards_per_task": None})
-            return
+        print_json({"job": None, "array": "", "shards_per_task": None})
         print_rows("Nothing is missing", [("dataset", options.place)])
         next_step(["verify", options.place])
         return
@@ -193,9 +181,7 @@ def submit_to_array(
         words = create_command(manifest)
         line = shlex.join(words)
         record |= {"files": [str(manifest)], "commands": [words], "submitted": not array.dry_run}
-    if as_json:
-        print_json({"job": name, **record})
-        return
+    print_json({"job": name, **record})
     rows = [("tasks", f"{len(job.tasks)}: {numbers}"), ("shards a task", str(job.per_task))]
     rows += [("job", name)] if name else []
     print_rows("Would be submitted" if array.dry_run else "Submitted", rows)
@@ -213,9 +199,7 @@ def _slurm_line(job: ArrayJob, options: Sequence[str]) -> str:
     return " ".join(["mkdir -p logs &&", *settings, shlex.join(sbatch_command(job, options))])
 
 
-def run_flow(
-    flow: str, parameters: Mapping[str, Any], runs: FlowRunOptions, *, where: str, as_json: bool
-) -> bool:
+def run_flow(flow: str, parameters: Mapping[str, Any], runs: FlowRunOptions, *, where: str) -> bool:
     """Run a flow by a worker of the server; print its progress and its summary.
 
     Args:
@@ -231,30 +215,28 @@ def run_flow(
 
     with prefect.server() as client:
         run = prefect.submit(client, flow, runs.deployment, parameters)
-        if not as_json:
-            console.print(f"Run {run.name} of {run.deployment}: {run.page}", soft_wrap=True)
-            ends = f"prefect flow-run cancel {run.id} ends it"
-            console.print(f"Ctrl-C here leaves it running; {ends}", soft_wrap=True)
-            if not prefect.workers_online(client, run.pool):
-                start = f"prefect worker start --pool {run.pool}"
-                text = f"no worker of the pool {run.pool} is online, and the run waits for one"
-                note(f"{text}: {start}")
+        console.print(f"Run {run.name} of {run.deployment}: {run.page}", soft_wrap=True)
+        ends = f"prefect flow-run cancel {run.id} ends it"
+        console.print(f"Ctrl-C here leaves it running; {ends}", soft_wrap=True)
+        if not prefect.workers_online(client, run.pool):
+            start = f"prefect worker start --pool {run.pool}"
+            text = f"no worker of the pool {run.pool} is online, and the run waits for one"
+            note(f"{text}: {start}")
         if runs.no_watch:
-            if as_json:
-                print_json({"flow_run": str(run.id), "deployment": run.deployment})
+            print_json({"flow_run": str(run.id), "deployment": run.deployment})
             return False
-        last = _watch_run(prefect.poll_run(client, run.id), silent=as_json)
-    _report(run, last, where, as_json=as_json)
+        last = _watch_run(prefect.poll_run(client, run.id))
+    _report(run, last, where)
     return True
 
 
-def _watch_run(looks: "Iterable[RunStatus]", *, silent: bool) -> "RunStatus":
+def _watch_run(looks: "Iterable[RunStatus]") -> "RunStatus":
     """Draw the progress of a run, and return its last state."""
     last = None
     with progress_bars() as bars:
-        bar = bars.add_task("percent", total=100, note="", visible=not silent)
+        bar = bars.add_task("percent", total=100, note="")
         for look in looks:
-            if not silent and (last is None or last.state != look.state):
+            if last is None or last.state != look.state:
                 bars.console.print(look.state)
             scenes = dict(look.tables.get("progress", ())).get("scenes in shards")
             note = f"scenes {scenes}" if scenes else ""
@@ -264,19 +246,18 @@ def _watch_run(looks: "Iterable[RunStatus]", *, silent: bool) -> "RunStatus":
     return last
 
 
-def _report(run: "SubmittedRun", last: "RunStatus", where: str, *, as_json: bool) -> None:
+def _report(run: "SubmittedRun", last: "RunStatus", where: str) -> None:
     rows: Sequence[tuple[str, str]] = last.tables.get("summary", ())
-    if as_json:
-        print_json(
-            {
-                "flow_run": str(run.id),
-                "deployment": run.deployment,
-                "state": last.state,
-                "message": last.message,
-                "summary": dict(rows),
-            }
-        )
-    elif last.is_completed:
+    print_json(
+        {
+            "flow_run": str(run.id),
+            "deployment": run.deployment,
+            "state": last.state,
+            "message": last.message,
+            "summary": dict(rows),
+        }
+    )
+    if last.is_completed:
         print_rows(f"{run.deployment} finished", [*rows, ("where", where)])
     if not last.is_completed:
         reason = last.message.rstrip(".") or "no reason given"

@@ -12,7 +12,7 @@ from rich.progress import Progress as Bars
 from rich.progress import TaskID
 
 from infra.cli.console import console, next_step, note, print_rows, progress_bars, suggest_look
-from infra.cli.options import OutputOptions, command
+from infra.cli.options import command
 from infra.cli.overrides import BaseSettings, merge_overrides, run_record
 from infra.run_record import tensorboard_command
 from infra.torch_library import require_torch
@@ -83,13 +83,6 @@ class _BarProgress(TrainProgress):
         _end(text, 1)
 
 
-class _QuietProgress(TrainProgress):
-    """Progress that prints nothing."""
-
-    def report_hang(self, text: str) -> None:
-        _end(text, 1)
-
-
 def _end(text: str, status: int) -> NoReturn:
     """End a process whose main thread may be in a call that does not return."""
     sys.stderr.write(f"\ntrilight: {text}; --resume goes on from the last checkpoint.\n")
@@ -98,9 +91,7 @@ def _end(text: str, status: int) -> NoReturn:
 
 
 @command("run")
-def train(
-    options: TrainOptions, watched: WatchSettings, base: BaseSettings, output: OutputOptions
-) -> None:
+def train(options: TrainOptions, watched: WatchSettings, base: BaseSettings) -> None:
     if base.is_given:
         changes = merge_overrides(
             training_preset(options.run), base, run_record(base), options.changes
@@ -108,30 +99,30 @@ def train(
         options = dataclasses.replace(options, changes=changes)
     settings = options.settings()  # without torch, so that mistakes are named at once
     if options.processes > 1:
-        _launch(options, watched, output)
-    if os.environ.get("RANK", "0") == "0" and not output.json:
+        _launch(options, watched)
+    if os.environ.get("RANK", "0") == "0":
         _announce(options, settings)
-    result = _run_training(options, settings, watched, quiet=output.json)
+    result = _run_training(options, settings, watched)
     if result is None:
         return
-    if output.json:
+    if console.quiet:
         sys.stdout.write(result.folder.summary.read_text())
-    else:
-        _report(result, options.data)
+    _report(result, options.data)
 
 
-def _launch(options: TrainOptions, watched: WatchSettings, output: OutputOptions) -> NoReturn:
+def _launch(options: TrainOptions, watched: WatchSettings) -> NoReturn:
     """Become torchrun, which starts this command once for each process."""
     if "RANK" in os.environ:
         raise TrilightError(
             f"--processes is {options.processes} under torchrun, which sets their number; omit it."
         )
-    words = [*options.command(), *option_words(watched), *option_words(output)]
+    words = [*options.command(), *option_words(watched)]
+    words += ["--json"] if console.quiet else []
     os.execve(words[0], words, child_environment())
 
 
 def _run_training(
-    options: TrainOptions, settings: TrainSettings, watched: WatchSettings, *, quiet: bool
+    options: TrainOptions, settings: TrainSettings, watched: WatchSettings
 ) -> "TrainResult | None":
     """Train by `train.run_training.run_training`; imports torch, which takes seconds."""
     require_torch("train")
@@ -140,7 +131,6 @@ def _run_training(
     from train.run_training import run_training
 
     with join_processes(options.device) as crew, progress_bars() as bars:
-        progress = _QuietProgress() if quiet else _BarProgress(bars)
         try:
             return run_training(
                 settings,
@@ -150,7 +140,7 @@ def _run_training(
                 workers=options.workers,
                 watched=watched,
                 dist_context=crew,
-                progress=progress,
+                progress=_BarProgress(bars),
             )
         except Stopped as stopped:
             if crew.world_size > 1:  # torchrun's own arguments are not known here

@@ -10,7 +10,7 @@ from infra.cli.console import (
     progress_bars,
     suggest_look,
 )
-from infra.cli.options import OutputOptions, command
+from infra.cli.options import command
 from storage.dataset.dataset import open_dataset
 from storage.dataset.derived import derivation_of
 from storage.dataset.progress import read_asked, value_of
@@ -37,36 +37,33 @@ class VerifyOptions:
 
 
 @command("dataset")
-def verify(options: VerifyOptions, output: OutputOptions) -> None:
-    first_words(f"Verifying {safe_url(options.dataset)}", silent=output.json)
-    verification = _verify(options.dataset, fast=options.fast, silent=output.json)
+def verify(options: VerifyOptions) -> None:
+    first_words(f"Verifying {safe_url(options.dataset)}")
+    verification = _verify(options.dataset, fast=options.fast)
     if options.repair and verification.bad_shards and verification.is_finished:
         from infra.repair import repair as make_anew  # slow: the whole pipeline
 
-        if not output.json:
-            _report(verification, fast=options.fast)
-            first_words("Repairing the named shards")
+        _report(verification, fast=options.fast)
+        first_words("Repairing the named shards")
         make_anew(
             options.dataset,
             verification.bad_shards,
             objects=options.objects,
             scenes_from=options.scenes_from,
         )
-        verification = _verify(options.dataset, fast=options.fast, silent=output.json)
-    if output.json:
-        print_json(_as_json(verification))
-    else:
-        _report(verification, fast=options.fast)
-        _print_repair(verification, options.dataset)
+        verification = _verify(options.dataset, fast=options.fast)
+    print_json(_as_json(verification))
+    _report(verification, fast=options.fast)
+    _print_repair(verification, options.dataset)
     if verification.problems or not verification.is_finished:
         sys.exit(1)
 
 
-def _verify(dataset: str, *, fast: bool, silent: bool) -> Verification:
+def _verify(dataset: str, *, fast: bool) -> Verification:
     opened = open_dataset(dataset)
     with progress_bars() as bars:
         total = len(opened.manifest.shards) or None
-        task = bars.add_task("shards", total=total, note="", visible=not silent)
+        task = bars.add_task("shards", total=total, note="")
         return verify_dataset(opened, fast=fast, shard_done=lambda _: bars.advance(task))
 
 

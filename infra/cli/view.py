@@ -35,7 +35,7 @@ class ViewOptions:
     """Print the address only, and open no browser."""
 
 
-@command("source")
+@command("source", has_json=False)
 def view(options: ViewOptions) -> None:
     first_words(f"Opening {safe_url(options.source)}")
     from infra.viewer.open_source import DeferredHandlers, open_handlers, page_of

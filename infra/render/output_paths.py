@@ -64,7 +64,8 @@ def output_paths(out: Path) -> OutputPaths:
             f"--out is {out}; expected picture.exr, or for many pictures a folder, or X.mp4 or "
             "X.webp, beside which they are kept in a folder X."
         )
-    require_encoder(out)
+    if suffix == ".mp4":
+        _av()  # before anything is rendered
     return OutputPaths(stem=None, folder=_writable(out.with_suffix(""), out), video=out)
 
 
@@ -76,12 +77,6 @@ def _writable(folder: Path, out: Path) -> Path:
     except OSError as error:
         raise write_error(out, error) from error
     return folder
-
-
-def require_encoder(path: Path) -> None:
-    """Raise TrilightError where the encoder of a video is missing; cheap, so called first."""
-    if path.suffix.lower() == ".mp4":
-        _av()
 
 
 def write_video(path: Path, frames: Sequence[Path], fps: int) -> None:

@@ -156,17 +156,17 @@ def _renderers(
 
 def _choose(budget: Budget, pairs: Pairs, resolution: int, threads: int | None) -> Choice:
     table = shipped_table()
-    known = known_costs(choose_variant("auto"))
+    costs, source = known_costs(choose_variant("auto"))
     cores = available_cores()
     candidates = price_all(
         table,
-        known.costs,
+        costs,
         width=resolution,
         threads=min(threads or cores, cores),
         per_scene=len(pairs) / len({source for source, _ in pairs}),
         network=importlib.util.find_spec("torch") is not None,
     )
-    return choose(budget, candidates, table, known, resolution)
+    return choose(budget, candidates, scenes=table.scenes, costs=source, width=resolution)
 
 
 def _pairs(options: RenderOptions, reader: SceneReader, output: OutputPaths) -> Pairs:

@@ -104,15 +104,6 @@ class PreviewTable:
     """Mean CPU seconds of the parts over the probe scenes, which other machines time as well."""
 
 
-@dataclass(frozen=True, kw_only=True)
-class KnownCosts:
-    """Costs that apply to this machine, and their source."""
-
-    costs: PictureCosts
-    source: str
-    """Source of the costs, as the end of a sentence."""
-
-
 @functools.cache
 def shipped_table() -> PreviewTable:
     """Return the shipped table."""
@@ -129,8 +120,11 @@ def machine_costs_path() -> Path:
     return cache_folder("previews") / "costs.json"
 
 
-def known_costs(variant: Variant) -> KnownCosts:
-    """Return the measured costs of this machine, or the shipped ones without a measurement."""
+def known_costs(variant: Variant) -> tuple[PictureCosts, str]:
+    """Return the measured costs of this machine, or else the shipped ones; and their source.
+
+    The source is the end of a sentence.
+    """
     shipped = shipped_table().costs
     path = machine_costs_path()
     try:
@@ -143,12 +137,12 @@ def known_costs(variant: Variant) -> KnownCosts:
         why = f"costs as shipped, since {path} cannot be used ({error}): `{MEASURE}` writes it anew"
     else:
         if costs.machine == machine_name(variant):
-            return KnownCosts(costs=costs, source="costs as measured here")
+            return costs, "costs as measured here"
         why = (
             f"costs as shipped, since {path} is of another machine ({costs.machine}): "
             f"`{MEASURE}` measures this one"
         )
-    return KnownCosts(costs=shipped, source=why)
+    return shipped, why
 
 
 def keep_machine_costs(costs: PictureCosts) -> Path:
@@ -308,7 +302,7 @@ def choose_reaching(candidates: Sequence[Priced], db: float, width: int) -> Pric
 
 
 def choose(
-    budget: Budget, candidates: Sequence[Priced], table: PreviewTable, known: KnownCosts, width: int
+    budget: Budget, candidates: Sequence[Priced], *, scenes: int, costs: str, width: int
 ) -> Choice:
     """Return the choice for a budget; raises TrilightError as `choose_reaching`."""
     if isinstance(budget, TimeBudget):
@@ -316,7 +310,7 @@ def choose(
     else:
         priced = choose_reaching(candidates, budget.error_db, width)
         fits = True
-    return Choice(budget=budget, priced=priced, fits=fits, scenes=table.scenes, costs=known.source)
+    return Choice(budget=budget, priced=priced, fits=fits, scenes=scenes, costs=costs)
 
 
 def _part_seconds(costs: PictureCosts, width: int, threads: int) -> dict[str, float]:

@@ -12,6 +12,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from pipeline.renders.calibrated_error import LEAST_ERROR
 from pipeline.renders.noise_floor import Curve, secant_slope
 from pipeline.renders.settings import PASS_SPP, RenderSettings
 from pipeline.renders.tracer import PixelCamera, Tracer, load_tracer, pixel_camera
@@ -21,9 +22,6 @@ from storage.seeds import seed_for
 
 _SEED = 20_261_124
 """Seed of the references' samples; no dataset preset and no run uses it."""
-
-LEAST_ERROR = 1e-10
-"""Squared errors below this, or below 0 by chance, count as this: 100 dB."""
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)

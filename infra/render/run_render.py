@@ -68,12 +68,6 @@ class Flicker:
     """Flicker in dB of the traced pictures' noise alone, an upper bound for any network."""
 
 
-def log_error(neural_rgb: NDArray[np.float32], traced_rgb: NDArray[np.float32]) -> NDArray:
-    """Return the error [R, R, 3] of log10(1 + radiance)."""
-    error: NDArray = log10_radiance(neural_rgb) - log10_radiance(traced_rgb)
-    return error
-
-
 def flicker(before: Frame | None, now: Frame) -> Flicker | None:
     """Return the flicker from one frame to the next; None where their scenes do not belong."""
     if before is None:
@@ -335,7 +329,7 @@ def _finish(
         agreement = psnr_log_db(neural, traced)
         now = Frame(
             source=shot.source,
-            error_RR3=log_error(neural, traced),
+            error_RR3=log10_radiance(neural) - log10_radiance(traced),
             noise_floor_db=float(files["mitsuba"].facts["noise_floor_db"]),
         )
     write_atomically(shot.png, encode_png(pixels))

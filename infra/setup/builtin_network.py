@@ -182,14 +182,11 @@ def _worst(views: Sequence[Mapping[str, Any]]) -> str:
     by_error = sorted(views, key=lambda view: view["scores"][NETWORK]["psnr_log_db"])
     each = [
         f"{view['key']} ({view['scores'][NETWORK]['psnr_log_db']:.1f} dB, {view['template']}, "
-        f"{_lights(view['num_lights'])}, mean roughness {view['roughness']:.2f})"
+        f"{view['num_lights']} light{'s' * (view['num_lights'] != 1)}, "
+        f"mean roughness {view['roughness']:.2f})"
         for view in by_error[:WORST]
     ]
     return f"Worst views, by scene: {'; '.join(each)}."
-
-
-def _lights(count: int) -> str:
-    return f"{count} light{'' if count == 1 else 's'}"
 
 
 if __name__ == "__main__":

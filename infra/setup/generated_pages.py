@@ -3,10 +3,11 @@
 import dataclasses
 import inspect
 import re
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from typing import Any
 
+import numpy as np
 from cyclopts import App
 
 from infra.cli.commands import COMMANDS, app
@@ -376,52 +377,43 @@ def quantities_page() -> str:
 
 
 def maps_page() -> str:
-    """Return the page of the distributions of procedural surfaces and skies."""
+    """Return the page of the distributions of procedural surfaces and skies, in natural colors."""
+    albedo = SurfaceMapSettings().albedo
+    skies = SkyMapSettings()
     parts = [_MAPS.format(least_tint=LEAST_TINT, palest=PALEST), "## Surfaces\n"]
     for name in OUR_SURFACES:
-        parts += _family(name, SURFACES[name], surface_draws(name))
+        parts += _family(
+            name, SURFACES[name], Texels(1), ("natural colours", ": tint"),
+            lambda rng: SurfaceDraws(rng, natural_share=1.0, albedo=albedo),
+        )  # fmt: skip
     parts.append("## Skies\n")
     for name in OUR_SKIES:
-        parts += _family(name, SKIES[name], sky_draws(name))
+        parts += _family(
+            name, SKIES[name], SkyTexels(1), ("coloured lights",),
+            lambda rng: SkyDraws(
+                rng, coloured_share=0.0, sun_elevation_deg=skies.sun_elevation_deg,
+                sun_to_sky=skies.sun_to_sky,
+            ),
+        )  # fmt: skip
     return "\n".join(parts)
 
 
-def surface_draws(name: str) -> Mapping[str, RecordedDraw]:
-    """Return all draws of a family of surfaces by name, for natural colors."""
-    made: dict[str, RecordedDraw] = {}
-    albedo = SurfaceMapSettings().albedo
-    for seed in range(_SEEDS):
-        draws = SurfaceDraws(rng_for(seed, "page"), natural_share=1.0, albedo=albedo)
-        SURFACES[name](draws, Texels(1))
-        made |= draws.made
-    return _but(made, "natural colours", ": tint")
-
-
-def sky_draws(name: str) -> Mapping[str, RecordedDraw]:
-    """Return all draws of a family of skies by name, for natural colors."""
-    made: dict[str, RecordedDraw] = {}
-    settings = SkyMapSettings()
-    for seed in range(_SEEDS):
-        draws = SkyDraws(
-            rng_for(seed, "page"),
-            coloured_share=0.0,
-            sun_elevation_deg=settings.sun_elevation_deg,
-            sun_to_sky=settings.sun_to_sky,
-        )
-        SKIES[name](draws, SkyTexels(1))
-        made |= draws.made
-    return _but(made, "coloured lights")
-
-
-def _but(made: Mapping[str, RecordedDraw], *said_above: str) -> dict[str, RecordedDraw]:
-    return {label: draw for label, draw in made.items() if not label.endswith(said_above)}
-
-
 def _family(
-    name: str, family: Callable[..., object], made: Mapping[str, RecordedDraw]
+    name: str,
+    family: Callable[..., object],
+    texels: object,
+    said_above: tuple[str, ...],
+    new_draws: Callable[[np.random.Generator], Any],
 ) -> Iterator[str]:
+    """Yield the section of a family, with all draws by their labels."""
+    made: dict[str, RecordedDraw] = {}
+    for seed in range(_SEEDS):
+        draws = new_draws(rng_for(seed, "page"))
+        family(draws, texels)
+        made |= draws.made
+    rows = [(label, str(draw)) for label, draw in made.items() if not label.endswith(said_above)]
     yield f"### `{name}`\n\n{' '.join((inspect.getdoc(family) or '').split())}\n"
-    yield table(("drawn", "distribution"), [(label, str(draw)) for label, draw in made.items()])
+    yield table(("drawn", "distribution"), rows)
     yield ""
 
 

@@ -4,6 +4,7 @@ import dataclasses
 import functools
 import json
 import math
+import operator
 import re
 import shlex
 import struct
@@ -51,6 +52,9 @@ _WHERE = {
     "floor": "min(noise_floor_db)",
 }
 """Columns with limits, by their quantity in `trilight shards select --where`."""
+
+_ENDS = {">=": ("min", operator.ge), "<=": ("max", operator.le)}
+"""Suffix of a limit in a query, and its comparison, by the sign in a condition."""
 
 
 @dataclass(frozen=True, kw_only=True, slots=True)
@@ -186,10 +190,8 @@ class SceneFilter:
     """Split of the scenes; empty for all splits."""
     template: str = ""
     """Layout of the scenes; empty for all layouts."""
-    least: Mapping[str, float]
-    """Lower limits, inclusive, by column."""
-    most: Mapping[str, float]
-    """Upper limits, inclusive, by column."""
+    limits: Sequence[tuple[str, str, float]]
+    """Column, `>=` or `<=`, and value of each limit."""
     sort: str = "key"
     descending: bool = False
 
@@ -201,11 +203,7 @@ class SceneFilter:
     def command(self, dataset: Path, out: Path) -> str:
         """Return the command that selects the matching scenes; empty without conditions."""
         words = ["trilight", "shards", "select", str(dataset)]
-        conditions = [
-            f"{_WHERE[name]} {sign} {value:g}"
-            for limits, sign in ((self.least, ">="), (self.most, "<="))
-            for name, value in limits.items()
-        ]
+        conditions = [f"{_WHERE[name]} {sign} {value:g}" for name, sign, value in self.limits]
         options = {"--split": self.split, "--template": self.template}
         options["--where"] = " and ".join(conditions)
         chosen = [word for option, value in options.items() if value for word in (option, value)]
@@ -215,8 +213,7 @@ class SceneFilter:
         return (
             self.split in ("", row.split)
             and self.template in ("", row.template)
-            and all(getattr(row, name) >= value for name, value in self.least.items())
-            and all(getattr(row, name) <= value for name, value in self.most.items())
+            and all(_ENDS[sign][1](getattr(row, name), value) for name, sign, value in self.limits)
         )
 
 
@@ -232,19 +229,16 @@ def filter_of(query: Mapping[str, str]) -> SceneFilter:
     sort = query.get("sort", "key")
     if sort not in SORTED_BY:
         raise TrilightError(f"sort is {sort:.40}; {expected_one_of(sort, list(SORTED_BY))}.")
-    ends = {
-        end: {
-            name: _number(query[f"{name}_{end}"], name)
-            for name in _WHERE
-            if query.get(f"{name}_{end}")
-        }
-        for end in ("min", "max")
-    }
+    limits = [
+        (name, sign, _number(query[f"{name}_{end}"], name))
+        for sign, (end, _) in _ENDS.items()
+        for name in _WHERE
+        if query.get(f"{name}_{end}")
+    ]
     return SceneFilter(
         split=query.get("split", ""),
         template=query.get("template", ""),
-        least=ends["min"],
-        most=ends["max"],
+        limits=limits,
         sort=sort,
         descending=query.get("descending") == "1",
     )

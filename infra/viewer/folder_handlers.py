@@ -10,7 +10,7 @@ from pathlib import Path
 
 from infra.render.path_tracer import PathTracer, RenderChild
 from infra.render.quality import FixedSamples
-from infra.viewer.open_source import SceneList
+from infra.viewer.open_source import scene_list
 from infra.viewer.scene_handlers import (
     MOST_THUMBNAILS,
     OpenScenes,
@@ -36,9 +36,10 @@ _NUMBER = re.compile(r"\d{1,5}", re.ASCII)
 class FolderHandlers:
     """Handlers of a folder, and of its scenes that are open."""
 
-    def __init__(self, files: SceneList, child: RenderChild, checkpoint: str | None) -> None:
-        """Store render child and checkpoint for the pages of the scenes; nothing is read yet."""
-        self._files = files
+    def __init__(self, root: Path, child: RenderChild, checkpoint: str | None) -> None:
+        """List the files; render child and checkpoint are for the pages of the scenes."""
+        self._root = root
+        self._names, self._is_cut = scene_list(root)
         self._child = child
         self._checkpoint = checkpoint
         self._reader = SceneReader()
@@ -64,14 +65,13 @@ class FolderHandlers:
         self._reader.close()
 
     def _facts(self, _: Request) -> Response:
-        files = self._files
-        suffixes = sorted({Path(name).suffix.lower() for name in files.names})
+        suffixes = sorted({Path(name).suffix.lower() for name in self._names})
         return json_response(
             {
-                "name": files.root.resolve().name,
-                "files": list(files.names),
+                "name": self._root.resolve().name,
+                "files": list(self._names),
                 "forms": suffixes,
-                "is_cut": files.is_cut,
+                "is_cut": self._is_cut,
             }
         )
 
@@ -97,13 +97,13 @@ class FolderHandlers:
         if loaded.radiance_rgb is not None and len(loaded.radiance_rgb):
             return thumbnail_png(loaded.radiance_rgb[0], THUMBNAIL_PX)
         tracer = PathTracer(self._child, _THUMBNAIL, THUMBNAIL_PX)
-        traced = tracer.load(loaded.scene, self._files.names[number])
+        traced = tracer.load(loaded.scene, self._names[number])
         image = traced.render(Camera.of_scene(loaded.scene, 0))
         return thumbnail_png(image.radiance_rgb, THUMBNAIL_PX)
 
     def _number(self, request: Request, prefix: str) -> int:
         text = request.path.removeprefix(prefix)
-        if not _NUMBER.fullmatch(text) or int(text) >= len(self._files.names):
+        if not _NUMBER.fullmatch(text) or int(text) >= len(self._names):
             raise NotFound("the folder has no such file.")
         return int(text)
 
@@ -111,15 +111,15 @@ class FolderHandlers:
         """Return a scene; the last one is kept, since the page requests it several times."""
         with self._reading:
             if self._last is None or self._last[0] != number:
-                source = scene_source(str(self._files.root / self._files.names[number]))
+                source = scene_source(str(self._root / self._names[number]))
                 self._last = (number, self._reader.load(source, pictures=True))
             return self._last[1]
 
     def _open_scene(self, key: str) -> SceneHandlers:
         number = int(key)
-        if number >= len(self._files.names):
+        if number >= len(self._names):
             raise NotFound("the folder has no such file.")
-        name = self._files.names[number]
+        name = self._names[number]
         loaded = self._load(number)
-        place = str(self._files.root / name)
+        place = str(self._root / name)
         return handlers_of_scene(name, loaded, place, self._child, self._checkpoint)

@@ -1,9 +1,8 @@
 """Opens the source of `trilight view`; its page is served before, and its requests wait."""
 
 import os
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from concurrent.futures import Future
-from dataclasses import dataclass
 from pathlib import Path
 from typing import Protocol
 
@@ -42,17 +41,6 @@ class DeferredHandlers:
         return dispatch(self.opened.result().routes(), request)
 
 
-@dataclass(frozen=True, kw_only=True)
-class SceneList:
-    """Sorted files that may be scenes."""
-
-    root: Path
-    names: tuple[str, ...]
-    """Paths relative to the folder, with slashes."""
-    is_cut: bool
-    """True where the folder has more files than are listed."""
-
-
 def page_of(source: str) -> str:
     """Return the name of the page of a source; raises TrilightError without such a source."""
     if "://" in source:
@@ -75,9 +63,10 @@ def page_of(source: str) -> str:
     return "scene.html"
 
 
-def scene_list(root: Path) -> SceneList:
-    """Return the files with a scene's suffix in a folder and its subfolders.
+def scene_list(root: Path) -> tuple[Sequence[str], bool]:
+    """Return the files with a scene's suffix in a folder and its subfolders, and whether it is cut.
 
+    Paths are relative to the folder, with slashes, and sorted. A list that is cut leaves out some.
     Hidden folders and links to folders are left out.
 
     Raises:
@@ -97,7 +86,7 @@ def scene_list(root: Path) -> SceneList:
             f"{root}: no dataset, and holds no scene; expected a folder that `trilight generate` "
             f"wrote, or files {' '.join(readable_suffixes())} in it."
         )
-    return SceneList(root=root, names=tuple(names[:MOST_FILES]), is_cut=len(names) > MOST_FILES)
+    return names[:MOST_FILES], len(names) > MOST_FILES
 
 
 def _files(root: Path) -> Iterator[str]:
@@ -132,7 +121,7 @@ def open_handlers(source: str, *, checkpoint: str | None, threads: int | None) -
     page = page_of(source)
     child = RenderChild(choose_variant("auto"), threads)
     if page == "folder.html":
-        return FolderHandlers(scene_list(Path(source)), child, checkpoint)
+        return FolderHandlers(Path(source), child, checkpoint)
     if page == "dataset.html":
         return DatasetHandlers(open_dataset(source), source, child, checkpoint)
     file = scene_source(source)

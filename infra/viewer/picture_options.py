@@ -5,8 +5,9 @@ so that nothing has to be undone.
 """
 
 import dataclasses
+import functools
 from collections.abc import Mapping
-from dataclasses import dataclass, field
+from dataclasses import field
 from typing import Annotated, Any
 
 import numpy as np
@@ -64,7 +65,7 @@ _FAR_M = 10 * MAX_POSITION_M
 
 
 @checked()
-class PictureRequest:
+class PictureOptions:
     """Body of a request for a picture."""
 
     engine: str
@@ -75,24 +76,15 @@ class PictureRequest:
     """Width of the picture, a multiple of 8."""
     view: int | None = None
     """Camera of the scene; none for a free one."""
-    edits: Mapping[str, Any] | None = None
-    """Changes in the form of SceneEdits; none by default."""
+    edits: Mapping[str, Any] = field(default_factory=dict)
+    """Changes in the form of SceneEdits."""
     error_db: Annotated[float, Within(10, 60, unit="dB")] = 45.0
     """Stated error as psnr_log_db at which a path tracer stops."""
 
-
-@dataclass(frozen=True, kw_only=True, eq=False)
-class PictureOptions:
-    """Options of one picture."""
-
-    engine: str
-    camera: Camera
-    resolution: int
-    """Width of the picture in pixels, a multiple of 8."""
-    edits: Mapping[str, Any]
-    """Edits of the scene in the form of SceneEdits."""
-    error_db: float
-    """Stated error as psnr_log_db at which a path tracer stops."""
+    @functools.cached_property
+    def camera(self) -> Camera:
+        """Camera with an orthonormal pose; raises TrilightError where `c2w` is none."""
+        return Camera(c2w=_pose(self.c2w), fov_deg=self.fov, view=self.view)
 
     @property
     def scene_key(self) -> str:
@@ -103,7 +95,7 @@ class PictureOptions:
     def camera_key(self) -> str:
         """Digest of edits, camera and width, by which pictures of engines are compared."""
         pose = [round(float(value), 6) for value in self.camera.c2w.reshape(-1)]
-        return short_digest([self.edits, pose, round(self.camera.fov_deg, 4), self.resolution])
+        return short_digest([self.edits, pose, round(self.fov, 4), self.resolution])
 
 
 def parse_picture_options(body: Any, engines: Mapping[str, Any], views: int) -> PictureOptions:
@@ -112,21 +104,16 @@ def parse_picture_options(body: Any, engines: Mapping[str, Any], views: int) -> 
     Raises:
         TrilightError: an option is missing or invalid.
     """
-    request = from_record(PictureRequest, body)
-    if request.engine not in engines:
-        expected = expected_one_of(request.engine, list(engines))
-        raise TrilightError(f"engine {request.engine:.40}: {expected}.")
-    if request.resolution % 8:
-        raise TrilightError(f"resolution is {request.resolution}; expected a multiple of 8.")
-    if request.view is not None and not 0 <= request.view < views:
-        raise TrilightError(f"view is {request.view}; expected 0 to {views - 1}, or none.")
-    return PictureOptions(
-        engine=request.engine,
-        camera=Camera(c2w=_pose(request.c2w), fov_deg=request.fov, view=request.view),
-        resolution=request.resolution,
-        edits=request.edits or {},
-        error_db=request.error_db,
-    )
+    options = from_record(PictureOptions, body)
+    if options.engine not in engines:
+        expected = expected_one_of(options.engine, list(engines))
+        raise TrilightError(f"engine {options.engine:.40}: {expected}.")
+    if options.resolution % 8:
+        raise TrilightError(f"resolution is {options.resolution}; expected a multiple of 8.")
+    if options.view is not None and not 0 <= options.view < views:
+        raise TrilightError(f"view is {options.view}; expected 0 to {views - 1}, or none.")
+    assert options.camera.c2w.size  # a wrong pose is refused here
+    return options
 
 
 def _pose(numbers: tuple[float, ...]) -> NDArray[np.float32]:

@@ -136,7 +136,7 @@ class PageServer(ThreadingHTTPServer):
             TrilightError: the port cannot be used.
         """
         self.routes = routes
-        self.token = new_token()
+        self.token = secrets.token_urlsafe(24)
         self.slots = threading.BoundedSemaphore(MOST_CONNECTIONS)
         self._awaited: dict[socket.socket, float] = {}
         self._changing = threading.Lock()
@@ -220,31 +220,28 @@ class _Handler(BaseHTTPRequestHandler):
             return
         data = self.rfile.read(int(self.headers["Content-Length"])) if method == "POST" else b""
         self.server.note_arrival(self.connection)
-        status = HTTPStatus.OK
         with self.server.slots:
-            try:
-                response = self._dispatch(method, data)
-            except NotFound as error:
-                status = HTTPStatus.NOT_FOUND
-                sentence = str(error)
-            except TrilightError as error:
-                status = HTTPStatus.UNPROCESSABLE_ENTITY
-                sentence = str(error)
-            except Exception as error:
-                status = HTTPStatus.INTERNAL_SERVER_ERROR
-                sentence = f"The viewer cannot answer this ({type(error).__name__})."
-        if status == HTTPStatus.OK:
-            self._send(status, response)
+            answer = self._dispatch(method, data)
+        if isinstance(answer, Response):
+            self._send(HTTPStatus.OK, answer)
         else:
-            self._send_sentence(status, sentence)
+            self._send_sentence(*answer)
         self.server.await_request(self.connection)
 
-    def _dispatch(self, method: str, data: bytes) -> Response:
+    def _dispatch(self, method: str, data: bytes) -> Response | Refusal:
         path, _, query = self.path.partition("?")
         below = unquote(path.removeprefix(f"/{self.server.token}")).removeprefix("/")
-        body = _parse_body(data) if method == "POST" else None
-        request = Request(method=method, path=below, query=dict(parse_qsl(query)), body=body)
-        return dispatch(self.server.routes, request)
+        try:
+            body = _parse_body(data) if method == "POST" else None
+            request = Request(method=method, path=below, query=dict(parse_qsl(query)), body=body)
+            return dispatch(self.server.routes, request)
+        except NotFound as error:
+            return HTTPStatus.NOT_FOUND, str(error)
+        except TrilightError as error:
+            return HTTPStatus.UNPROCESSABLE_ENTITY, str(error)
+        except Exception as error:
+            sentence = f"The viewer cannot answer this ({type(error).__name__})."
+            return HTTPStatus.INTERNAL_SERVER_ERROR, sentence
 
     def _send_sentence(self, status: HTTPStatus, sentence: str) -> None:
         """Send a sentence: as text where HTML is accepted, else as JSON."""
@@ -276,11 +273,6 @@ def _parse_number(text: str) -> float:
     if not math.isfinite(value):
         raise ValueError(text)
     return int(text) if text.removeprefix("-").isdecimal() else value
-
-
-def new_token() -> str:
-    """Return a new secret token for an address."""
-    return secrets.token_urlsafe(24)
 
 
 def refusal(

@@ -19,7 +19,6 @@ from infra.leaderboard import (
     Leaderboard,
     make_leaderboard,
     picture_folder,
-    picture_folders,
     widths_of,
 )
 from infra.render.methods import DIRECT_LIGHT, TRACED_LIGHT
@@ -280,6 +279,8 @@ def test_mistakes_are_one_line(order: LeaderboardOptions, root: Path) -> None:
     twice = dataclasses.replace(order, checkpoint=(str(root / "renderformer-v1-base"),) * 2)
     with pytest.raises(TrilightError, match=r"is there twice"):
         board_of(twice)
+    with pytest.raises(TrilightError, match="another folder has the same name"):
+        board_of(dataclasses.replace(order, pictures=(root / "perfect",) * 2))
     lacks = dataclasses.replace(order, pictures=(root / "toy",))
     with pytest.raises(TrilightError, match=r"4 of 4 pictures are missing"):
         board_of(lacks)
@@ -333,9 +334,6 @@ def test_pictures_are_shown_as_they_are_at_their_one_width(folder: Path) -> None
     write(folder / picture_name(*SHOWN[0]), picture(9))
     after = picture_folder(folder, SHOWN, WIDTHS)
     assert after.digest(*SHOWN[0]) != before and after.digest(*SHOWN[1]) == one.digest(*SHOWN[1])
-    assert [each.name for each in picture_folders([folder], SHOWN, WIDTHS)] == [one.name]
-    with pytest.raises(TrilightError, match="another folder has the same name"):
-        picture_folders([folder, folder], SHOWN, WIDTHS)
 
 
 BAD_PICTURES: list[tuple[bytes, str]] = [

@@ -34,12 +34,12 @@ from infra.bench.workloads.traced_pictures import (
 from infra.bench_options import BenchOptions
 from infra.render.methods import SAMPLE_SEED
 from infra.render.raw_references import (
-    LEAST_ERROR,
     RawReference,
     first_camera,
     true_error_db,
 )
 from pipeline.presets.training import pretrain_256
+from pipeline.renders.calibrated_error import LEAST_ERROR
 from pipeline.renders.noise_floor import clamped_radiance, secant_slope
 from pipeline.renders.settings import USUAL_FLOOR_DB, RenderSettings
 from storage.conventions import log10_radiance

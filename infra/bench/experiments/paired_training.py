@@ -81,16 +81,16 @@ def _train(context: BenchContext, side: str, seed: int) -> Sequence[Figures]:
     options = context.options
     settings = settings_of(side, seed, context.scale, options)
     px = settings.resolution
-    scenes = context.get_or_make(
+    train, judge, note = context.get_or_make(
         ("scenes", px), lambda: scenes_of(options.data or "", context.scale.held_out, px)
     )
-    context.note(scenes.about)
+    context.note(note)
     side_changes = options.set_a if side == SIDE_A else options.set_b
     changed = ", ".join(f"{name}={value}" for name, value in side_changes.items()) or "as it is"
     context.note(f"{side}: {settings.run}, {settings.num_steps} steps, {changed}")
     if device_of(options) == "cpu":
         torch.set_num_threads(context.cores)
-    return training_figures(scenes, settings, choose_device(device_of(options)))
+    return training_figures(train, judge, settings, choose_device(device_of(options)))
 
 
 EXPERIMENT = Experiment(

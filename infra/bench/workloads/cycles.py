@@ -92,8 +92,7 @@ def render_with_cycles(
 
 def installed_python() -> Path | None:
     """Return the Python that can import Blender, or None if it is not installed."""
-    folder = _folder()
-    return _python_of(folder) if (folder / _READY).is_file() else None
+    return _folder() / "bin" / "python" if (_folder() / _READY).is_file() else None
 
 
 def blender_python() -> Path:
@@ -107,7 +106,7 @@ def blender_python() -> Path:
         return installed
     folder = _folder()
     _run("make its environment", [_base_python(), "-m", "venv", "--clear", str(folder)])
-    python = _python_of(folder)
+    python = folder / "bin" / "python"
     pip = [str(python), "-m", "pip", "install", "--quiet", "--only-binary", ":all:", "--no-deps"]
     _run("install it from the package index", [*pip, "--require-hashes", "-r", str(LOCK)])
     _run("load it", [str(python), "-I", "-c", _PROBE])
@@ -132,37 +131,27 @@ def _folder() -> Path:
     return cache_folder("cycles") / f"bpy-{BLENDER}"
 
 
-def _python_of(folder: Path) -> Path:
-    return folder / "bin" / "python"
-
-
 def _base_python() -> str:
     """Return a Python of the wheel's version: this one, or one on the path."""
     if f"{sys.version_info.major}.{sys.version_info.minor}" == PYTHON:
         return sys.executable
     python = shutil.which(f"python{PYTHON}")
     if python is None:
-        raise _unavailable(f"python{PYTHON} is not on the path; install that version of Python")
+        raise TrilightError(
+            f"Blender {BLENDER}: python{PYTHON} is not on the path; install that version of Python."
+        )
     return python
 
 
 def _run(step: str, command: list[str], *, timeout_s: int = _INSTALL_S, **more: str) -> None:
     """Run a command, with more variables of the environment; raises TrilightError if it fails."""
+    environment = {**os.environ, **more}
     try:
-        result = subprocess.run(
-            command,
-            env={**os.environ, **more},
-            capture_output=True,
-            text=True,
-            timeout=timeout_s,
-            check=False,
+        subprocess.run(
+            command, env=environment, capture_output=True, text=True, timeout=timeout_s, check=True
         )
-    except (OSError, subprocess.TimeoutExpired) as error:
-        raise _unavailable(f"could not {step} ({type(error).__name__})") from error
-    if result.returncode:
-        said = (result.stderr or result.stdout).strip().splitlines()
-        raise _unavailable(f"could not {step}: {said[-1] if said else 'no message'}")
-
-
-def _unavailable(why: str) -> TrilightError:
-    return TrilightError(f"Blender {BLENDER}: {why}.")
+    except (OSError, subprocess.SubprocessError) as error:
+        said = [type(error).__name__]
+        if isinstance(error, subprocess.CalledProcessError):
+            said = (error.stderr or error.stdout).strip().splitlines() or ["no message"]
+        raise TrilightError(f"Blender {BLENDER}: could not {step}: {said[-1]}.") from error

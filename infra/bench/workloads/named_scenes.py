@@ -125,7 +125,6 @@ def _holds_a_scene(path: Path) -> bool:
     return isinstance(record, dict) and bool(record.get("objects")) and bool(record.get("cameras"))
 
 
-MAX_LIGHTS = 32
 _TOTAL_EMISSION = 3750.0
 """Radiance summed over the lights, in the middle of the range of dataset presets."""
 
@@ -142,7 +141,7 @@ def cost_scene(num_triangles: int, num_lights: int) -> Scene:
 
     Args:
         num_triangles: approximate number of all triangles, within a tenth from 100 on.
-        num_lights: 1 to MAX_LIGHTS emitting triangles.
+        num_lights: emitting triangles, 1 or more.
     """
     rng = rng_for(0, "cost scene")
     shell = [
@@ -228,7 +227,7 @@ def _object(
 
 
 def _light(row: int, num_lights: int) -> Emitter:
-    """Return one of MAX_LIGHTS positions on a ring, in an order that spreads the first ones."""
+    """Return a position on a ring, in an order that spreads the first ones."""
     angle = 2 * math.pi * ((row * 0.6180339887) % 1.0)
     centre = np.array([0.8 * math.cos(angle), 0.8 * math.sin(angle) - 0.6, 2.2])
     corners = 0.08 * np.array([[1.0, 0.0, 0.0], [-0.5, -0.866, 0.0], [-0.5, 0.866, 0.0]])

@@ -16,10 +16,7 @@ figure does not depend on whether its reference was cached.
 """
 
 import dataclasses
-import importlib
-import sys
 import time
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -27,13 +24,13 @@ from safetensors.numpy import load, save
 
 from infra.render.methods import SAMPLE_SEED, warm_up_denoiser
 from infra.render.raw_references import (
-    LEAST_ERROR,
     RawReference,
     first_camera,
     raw_reference,
     true_error_db,
 )
 from pipeline.isolation import IsolatedChild
+from pipeline.renders.calibrated_error import LEAST_ERROR
 from pipeline.renders.noise_floor import Curve, clamped_radiance, secant_slope
 from pipeline.renders.renderer import SceneRenderer
 from pipeline.renders.results import RenderedView
@@ -44,8 +41,6 @@ from storage.cache import cache_folder
 from storage.conventions import log10_radiance
 from storage.denoiser import Features, denoise
 from storage.digests import canonical_json, sha256_hex
-from storage.errors import TrilightError
-from storage.installation import IMPORT_ROOT
 from storage.metrics import MAX_DB
 from storage.records.scene import Scene
 from storage.records.scene_file import scene_digest
@@ -146,30 +141,19 @@ def _features(scene: Scene, camera: PixelCamera) -> tuple[Features, float]:
     return features, time.process_time() - started
 
 
-def _oracle(name: str) -> Any:
-    """Return a module of the tests' oracle; raises TrilightError outside a checkout."""
-    sys.path.append(str(IMPORT_ROOT))
-    try:
-        return importlib.import_module(f"tests.oracle.{name}")
-    except ModuleNotFoundError as error:
-        raise TrilightError(
-            f"plain Mitsuba: no tests/oracle/{name}.py below {IMPORT_ROOT}; expected a checkout. "
-            "Run the experiment from one."
-        ) from error
-    finally:
-        sys.path.remove(str(IMPORT_ROOT))
-
-
 class _Plain:
     """Mitsuba scene with its integrator."""
 
     def __init__(self, scene: Scene, sampler: str) -> None:
         import mitsuba  # not before `activate`, which says where compiled kernels are kept
 
+        from tests.oracle.plugin_scene import plugin_scene  # a checkout has it, as this package
+        from tests.oracle.plugin_tracer import stock_sensor
+
         self._mi = mitsuba
         self._sampler = sampler
-        self._scene = _oracle("plugin_scene").plugin_scene(scene)
-        self._sensor = _oracle("plugin_tracer").stock_sensor
+        self._scene = plugin_scene(scene)
+        self._sensor = stock_sensor
         self._path = mitsuba.load_dict(
             {
                 "type": "path",
@@ -217,7 +201,6 @@ def load_or_render_reference(
 
 def figures(view: RenderedView, reference: RawReference) -> dict[str, float]:
     """Return stated and true errors of a picture in dB, with the reference's uncertainty."""
-    mean = 0.5 * (reference.a_rgb + reference.b_rgb)
     stated_db = {
         "log": view.noise_floor_db,
         "linear": view.noise_floor_linear_db,
@@ -226,7 +209,6 @@ def figures(view: RenderedView, reference: RawReference) -> dict[str, float]:
     values = {
         "spp": float(view.spp),
         "at_cap": float(view.at_cap),
-        "brightness": 100 * float(view.radiance_rgb.mean() / mean.mean() - 1),
     }
     for name, curve in _CURVES.items():
         pixels = view.hits if name == "object" else np.ones_like(view.hits)

@@ -3,7 +3,6 @@
 import time
 from collections.abc import Mapping, Sequence
 from contextlib import closing
-from dataclasses import dataclass
 from functools import partial
 
 import numpy as np
@@ -27,18 +26,10 @@ from train.run_training import loader_settings
 from train.settings import TrainSettings, learning_rate
 
 
-@dataclass(frozen=True, kw_only=True, eq=False)
-class TrainingScenes:
-    """Training scenes and held-out scenes of all trainings of an experiment."""
+def scenes_of(data: str, held_out: int, resolution: int) -> tuple[ShardSet, Judge, str]:
+    """Return the training scenes of a dataset, and its first validation scenes to judge on.
 
-    train: ShardSet
-    judge: Judge
-    about: str
-    """Numbers of scenes and digest of the data, for the result's notes."""
-
-
-def scenes_of(data: str, held_out: int, resolution: int) -> TrainingScenes:
-    """Return the scenes of a dataset, with the first ones of its validation split held out.
+    A note on both comes third.
 
     Raises:
         TrilightError: the validation split is empty.
@@ -52,26 +43,23 @@ def scenes_of(data: str, held_out: int, resolution: int) -> TrainingScenes:
         )
     train = opened.split("train")
     count = sum(train.num_samples(number) for number in range(len(train.names)))
-    return TrainingScenes(
-        train=train,
-        judge=Judge(samples, resolution, np.zeros((resolution, resolution, 3))),
-        about=f"{count} scenes seen, {len(samples)} judged on, data {opened.digest[:8]}",
-    )
+    note = f"{count} scenes seen, {len(samples)} judged on, data {opened.digest[:8]}"
+    return train, Judge(samples, resolution, np.zeros((resolution, resolution, 3))), note
 
 
 def training_figures(
-    scenes: TrainingScenes, settings: TrainSettings, device: torch.device
+    train: ShardSet, judge: Judge, settings: TrainSettings, device: torch.device
 ) -> Sequence[Mapping[str, float]]:
     """Train a network from the start and return the figures of each judged scene.
 
     `percent` is 100 times the logarithm of the error, so that differences are per cent of it.
     """
     began = time.perf_counter()
-    model = _trained_network(scenes.train, settings, device)
+    model = _trained_network(train, settings, device)
     seconds = time.perf_counter() - began
-    views = iter(scenes.judge.judge(model).views)
+    views = iter(judge.judge(model).views)
     scores_by_view = []
-    for judged in scenes.judge.scenes:
+    for judged in judge.scenes:
         mine = [next(views) for _ in judged.target_VRR3]
         l1 = float(np.mean([view["log_l1"] for view in mine]))
         figures = {"seconds": seconds, "step_s": seconds / settings.num_steps}

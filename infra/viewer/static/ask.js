@@ -26,6 +26,10 @@ async function sentence(answer) {
   }
 }
 
+export const byId = (name) => document.getElementById(name);
+
+export const some = (count, what) => `${count.toLocaleString("en")} ${what}${count === 1 ? "" : "s"}`;
+
 export function say(error) {
   const place = document.getElementById("mistake");
   place.textContent = error ? String(error.message || error) : "";
@@ -54,6 +58,17 @@ export async function copy(code, button) {
 
 export function download(name, url) {
   element("a", { href: url, download: name }).click();
+}
+
+// Acts a moment after the last change of a form, and once it is reset.
+export function onChange(form, act, calmMs) {
+  let calm;
+  form.addEventListener("input", () => {
+    clearTimeout(calm);
+    calm = setTimeout(act, calmMs);
+  });
+  form.addEventListener("submit", (event) => event.preventDefault());
+  form.addEventListener("reset", () => setTimeout(act));
 }
 
 // What was chosen in a form before its page was left; a choice may come later than the page.

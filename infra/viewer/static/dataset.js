@@ -1,8 +1,7 @@
 // The page of a dataset: any number of scenes, of which only those in sight are fetched.
 
-import { askJson, copy, element, KeptForm, say, sleep } from "./ask.js";
+import { askJson, byId, copy, element, KeptForm, onChange, say, sleep, some } from "./ask.js";
 
-const byId = (name) => document.getElementById(name);
 const form = byId("filters");
 const LOOK_AGAIN_MS = 700;
 const kept = new KeptForm(form);
@@ -55,7 +54,7 @@ function card(row) {
 }
 
 const short = (row) => `${row.template}, ${row.split}; ${row.triangles.toLocaleString("en")} tri, ${
-  row.lights} light${row.lights === 1 ? "" : "s"}; ${row.floor.toFixed(1)} dB`;
+  some(row.lights, "light")}; ${row.floor.toFixed(1)} dB`;
 
 function enlarge(at) {
   const row = rows[at];
@@ -100,13 +99,7 @@ async function watch() {
   }
 }
 
-let calm;
-form.addEventListener("input", () => {
-  clearTimeout(calm);
-  calm = setTimeout(() => show(0), 200);
-});
-form.addEventListener("submit", (event) => event.preventDefault());
-form.addEventListener("reset", () => setTimeout(() => show(0)));
+onChange(form, () => show(0), 200);
 byId("more").addEventListener("click", () => show(rows.length));
 byId("copy").addEventListener("click", () => copy(byId("command"), byId("copy")));
 byId("close").addEventListener("click", () => byId("large").close());

@@ -1,8 +1,7 @@
 // The page of a folder of scene files: names at once, and of those in sight what they hold.
 
-import { askJson, element, KeptForm, say } from "./ask.js";
+import { askJson, byId, element, KeptForm, onChange, say, some } from "./ask.js";
 
-const byId = (name) => document.getElementById(name);
 const form = byId("filters");
 const kept = new KeptForm(form);
 const PAGE = 100;
@@ -47,8 +46,6 @@ async function tell(card) {
   card.dataset.told = "1";
   card.classList.remove("busy");
 }
-
-const some = (count, what) => `${count.toLocaleString("en")} ${what}${count === 1 ? "" : "s"}`;
 
 const about = (found) => [some(found.triangles, "triangle"), some(found.lights, "light"),
   found.textures ? some(found.textures, "texture") : "", some(found.views, "camera"),
@@ -101,12 +98,6 @@ async function begin() {
   document.body.classList.add("ready");
 }
 
-let calm;
-form.addEventListener("input", () => {
-  clearTimeout(calm);
-  calm = setTimeout(filter, 150);
-});
-form.addEventListener("submit", (event) => event.preventDefault());
-form.addEventListener("reset", () => setTimeout(filter));
+onChange(form, filter, 150);
 byId("more").addEventListener("click", more);
 begin().catch(say);

@@ -1,13 +1,12 @@
 // The page of one scene: 3D on one side, the same view by every engine on the other.
 
 import { Matrix4, Vector3 } from "./three/three.module.min.js";
-import { ask, askJson, copy, download, element, say } from "./ask.js";
+import { ask, askJson, byId, copy, download, element, say, some } from "./ask.js";
 import { Edits } from "./edits.js";
 import { Orbit } from "./orbit.js";
 import { Pictures } from "./pictures.js";
 import { Stage } from "./stage.js";
 
-const byId = (name) => document.getElementById(name);
 const canvas = byId("stage");
 const now = { view: 0, fov: 40 };
 
@@ -71,7 +70,6 @@ function fillChoices(facts) {
 function describe(facts) {
   document.title = `${facts.name} – Trilight`;
   byId("name").textContent = facts.name;
-  const some = (count, what) => `${count.toLocaleString("en")} ${what}${count === 1 ? "" : "s"}`;
   byId("facts").textContent = [some(facts.triangles, "triangle"), some(facts.lights, "light"),
     some(facts.materials, "material"), some(facts.textures, "texture"),
     some(facts.views, "camera"), facts.template].filter(Boolean).join(", ");

@@ -30,7 +30,7 @@ from infra.bench.experiment import (
     every_experiment,
     experiment_of,
 )
-from infra.bench.experiments.calibration import FIGURES, KINDS, LOOKS, has_wide, use_of
+from infra.bench.experiments.calibration import FIGURES, LOOKS, has_wide, use_of
 from infra.bench.rows import Row, plot, rows_of, table_of
 from infra.bench.run_benchmark import commit_text, machine_record, run
 from infra.bench.stated_errors import (
@@ -225,7 +225,7 @@ def _resume(store: Store, wanted: dict) -> Run:
     for trial in current.missing_trials():
         for point, figures in wanted[trial].items():
             store.add(current, trial, point, figures)
-    store.end(current, 1.0, ["a note"])
+    store.write(current, seconds=1.0, notes=["a note"])
     found = store.newest()
     assert found is not None and found.notes == ["a note"] and not found.missing_trials()
     return found
@@ -373,16 +373,7 @@ def made_up_looks(num_layouts: int, seed: int = 0) -> list[Look]:
                     true = np.sqrt(errors[1] * errors[3]) * 10 ** (rng.normal(0, 0.5) / 10)
                     figures |= {f"{metric}_true": float(true), f"{metric}_open": 0.1 * float(true)}
                     figures[f"bound_{metric}"] = -10 * float(np.log10(2e-6 * true))
-                looks.append(
-                    Look(
-                        layout=layout,
-                        source="builtin:",
-                        family="plane-single",
-                        kind=KINDS[layout % len(KINDS)],
-                        px=px,
-                        figures=figures,
-                    )
-                )
+                looks.append(Look(layout=layout, px=px, figures=figures))
     return looks
 
 
@@ -443,8 +434,7 @@ def test_fitted_weights_do_not_depend_on_the_unit_of_a_measure() -> None:
 
 def _written(path: Path, looks: list[Look], versions: dict[str, str]) -> None:
     trials = {
-        look.layout: f"layout {look.layout}, {look.source}, {look.family}, {look.kind}, "
-        f"{use_of(look.layout)}"
+        look.layout: f"layout {look.layout}, builtin:, plane, plain, {use_of(look.layout)}"
         for look in looks
     }
     points = [f"{px} px, {spp} samples" for px, spps in LOOKS.items() for spp in spps]
@@ -468,21 +458,17 @@ def _written(path: Path, looks: list[Look], versions: dict[str, str]) -> None:
 
 
 def test_rows_come_to_a_file_that_pictures_are_stated_by(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     rows, file = tmp_path / "rows.jsonl", tmp_path / "stated_errors.json"
-    page = tmp_path / "page.md"
-    page.write_text("# Head\n\nMade by `python -m infra.bench.stated_errors`: stale\n")
     monkeypatch.setattr(stated_errors, "FILE", file)
-    monkeypatch.setattr(stated_errors, "PAGE", page)
     looks = made_up_looks(33)
     _written(rows, looks, versions_of_pictures())
     assert len(read_looks(rows)) == len(looks)
     main([str(rows)])
     statement = load_statement(file)
     assert statement is not None and statement.spp == (32, 288) and statement.widths == (64, 256)
-    text = page.read_text()
-    assert text.startswith("# Head\n") and "stale" not in text and text.count("| six measures") == 2
+    assert capsys.readouterr().out.count("| log | ") == 3, "one a width"
 
 
 def test_rows_of_other_versions_do_not_count(tmp_path: Path) -> None:

@@ -43,11 +43,6 @@ COMPLETED = {
 }
 
 
-def test_every_command_is_there_with_those_within() -> None:
-    assert {name.split()[0] for name in ALL} == set(COMMANDS)
-    assert {"shards merge", "shards select", "shards reshard"} < set(ALL)
-
-
 def test_every_option_says_what_it_is_and_its_default() -> None:
     """At 80 columns no text is lost: Rich would take `[builtin:]` for a style and drop it."""
     for name in ALL:

@@ -21,7 +21,7 @@ from infra.cli.overrides import (
     read_settings_file,
     with_base_settings,
 )
-from infra.cli.train import _BarProgress, _QuietProgress, _report, _validation_rows
+from infra.cli.train import _BarProgress, _report, _validation_rows
 from model.checkpoint_format import saved_steps
 from pipeline.generation.generate_options import GenerateOptions
 from pipeline.presets.registry import DATASET_PRESETS, preset_settings
@@ -152,14 +152,13 @@ def test_a_second_ctrl_c_ends_a_step_that_does_not(tmp_path: Path) -> None:
     assert "ended at once; --resume goes on from the last checkpoint" in mistake
 
 
-@pytest.mark.parametrize("quiet", [False, True])
 def test_a_run_that_hangs_and_is_to_stop_ends_with_status_1(
-    quiet: bool, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     ended: list[int] = []
     monkeypatch.setattr(os, "_exit", ended.append)
     with progress_bars() as bars:
-        (_QuietProgress() if quiet else _BarProgress(bars)).report_hang("training: step 7 hangs")
+        _BarProgress(bars).report_hang("training: step 7 hangs")
     assert ended == [1]
     said = capsys.readouterr().err
     assert "trilight: training: step 7 hangs; --resume goes on from the last checkpoint." in said

@@ -17,7 +17,6 @@ from infra.render.preview_table import (
     MEASURE,
     NETWORK_SCENE,
     NETWORK_VIEW,
-    KnownCosts,
     PartCost,
     PictureCosts,
     PreviewError,
@@ -156,10 +155,15 @@ def test_the_network_is_a_way_by_its_figures_where_it_was_judged_and_torch_is() 
 
 def test_a_choice_says_what_it_is_and_whether_it_fits() -> None:
     table = shipped_table()
-    known = KnownCosts(costs=table.costs, source="costs as shipped")
     ways = [priced(0.25, 30.0, spp=4)]
     for seconds, lead in ((1.0, "chosen"), (1e-9, "nothing is as quick; the quickest is chosen")):
-        choice = choose(TimeBudget(seconds=seconds), ways, table, known, 64)
+        choice = choose(
+            TimeBudget(seconds=seconds),
+            ways,
+            scenes=table.scenes,
+            costs="costs as shipped",
+            width=64,
+        )
         assert choice.sentence == (
             f"--seconds {seconds:g}: {lead}: 4 samples a pixel, filter fast; expected 30.0 dB in "
             f"the median of {table.scenes} scenes at 64 pixels (25.0 in the worst), in 0.25 s "
@@ -186,25 +190,25 @@ def costs_of_here() -> PictureCosts:
 
 
 def test_costs_that_were_measured_here_win(cache: Path) -> None:
-    found = known_costs(VARIANT)
-    assert found.costs == shipped_table().costs
-    assert f"costs as shipped: `{MEASURE}` measures this machine" == found.source
+    costs, source = known_costs(VARIANT)
+    assert costs == shipped_table().costs
+    assert f"costs as shipped: `{MEASURE}` measures this machine" == source
     path = keep_machine_costs(costs_of_here())
     assert path == machine_costs_path() and path.is_relative_to(cache)
-    found = known_costs(VARIANT)
-    assert found.costs == costs_of_here()
-    assert found.source == "costs as measured here"
+    costs, source = known_costs(VARIANT)
+    assert costs == costs_of_here()
+    assert source == "costs as measured here"
 
 
 @pytest.mark.usefixtures("cache")
 def test_costs_of_another_machine_are_not_used() -> None:
     keep_machine_costs(dataclasses.replace(costs_of_here(), machine="another, 128 cores"))
-    found = known_costs(VARIANT)
-    assert found.costs == shipped_table().costs
-    assert "is of another machine (another, 128 cores)" in found.source
+    costs, source = known_costs(VARIANT)
+    assert costs == shipped_table().costs
+    assert "is of another machine (another, 128 cores)" in source
     keep_machine_costs(costs_of_here())
     card = dataclasses.replace(VARIANT, name="cuda_ad_rgb")
-    assert "of another machine" in known_costs(card).source, "a graphics card is another machine"
+    assert "of another machine" in known_costs(card)[1], "a graphics card is another machine"
 
 
 def _record(**changes: Any) -> bytes:
@@ -229,14 +233,14 @@ def test_damaged_costs_are_not_used() -> None:
             path = machine_costs_path()
             path.parent.mkdir(parents=True, exist_ok=True)
             path.write_bytes(data)
-            found = known_costs(VARIANT)
-            assert found.costs == shipped_table().costs
-            assert f"since {path} cannot be used" in found.source and said in found.source
-            assert f"`{MEASURE}` writes it anew" in found.source
-            assert "\n" not in found.source
+            costs, source = known_costs(VARIANT)
+            assert costs == shipped_table().costs
+            assert f"since {path} cannot be used" in source and said in source
+            assert f"`{MEASURE}` writes it anew" in source
+            assert "\n" not in source
     machine_costs_path().unlink()
     machine_costs_path().mkdir()
-    assert "cannot be used" in known_costs(VARIANT).source
+    assert "cannot be used" in known_costs(VARIANT)[1]
 
 
 CORES = 8

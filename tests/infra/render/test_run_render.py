@@ -14,7 +14,7 @@ from infra.render.output_paths import OutputPaths, output_paths, write_video
 from infra.render.plan import RenderPlan, shots
 from infra.render.run_render import FinishedShot, run_plan
 from infra.render.sources import orbit, own_camera, pair_cameras
-from infra.render.tone_mapping import Look, enlarge, enlargement, tone_mapped
+from infra.render.tone_mapping import Look, tone_mapped
 from pipeline.exchange.open_scene import SceneSource
 from storage.conventions import preview_srgb8
 from storage.errors import TrilightError
@@ -22,7 +22,6 @@ from storage.records.exr import decode_exr
 from storage.records.scene import Scene
 from storage.records.scene_file import encode_scene
 from storage.renderer import Camera, Image, ReadyScene
-from tests.for_each import case
 from tests.infra.render.test_methods import HereReader
 from tests.scenes_by_hand import tiny_scene
 
@@ -163,18 +162,6 @@ def test_another_look_needs_no_other_picture(turn: Pairs, tmp_path: Path) -> Non
     run([again], out, turn, Look(tone_map="filmic"))
     assert again.rendered == 0
     assert (np.asarray(Picture.open(out / "000000.png")) != darker).any()
-
-
-def test_small_pictures_are_enlarged_by_whole_numbers() -> None:
-    for width, factor in [(8, 32), (64, 4), (96, 3), (248, 2), (256, 1)]:
-        with case(width):
-            pixels = np.random.default_rng(0).integers(0, 256, (width, width, 3)).astype(np.uint8)
-            found = enlarge(pixels)
-            assert enlargement(width) == factor
-            assert found.shape == (factor * width, factor * width, 3)
-            for row in range(factor):
-                for column in range(factor):
-                    np.testing.assert_array_equal(found[row::factor, column::factor], pixels)
 
 
 def test_the_film_like_curve_keeps_what_the_plain_one_clips() -> None:

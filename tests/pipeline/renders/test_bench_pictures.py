@@ -50,10 +50,6 @@ def test_every_look_is_recorded_with_its_true_error() -> None:
     assert looks[-1]["hits"] == pytest.approx(view.hits.mean(), rel=1e-3)
     for name in ("log_true", "linear_true", "log_agreement"):
         assert looks[0][name] > looks[-1][name] > 0, name
-    once = [(look["log_jackknife"] > 0, look["linear_oracle"] > 0) for look in looks]
-    assert once == [(True, True), (False, False), (False, False)]
-    # three other pictures of as many samples: equal errors but for chance
-    assert 0.3 < looks[0]["log_oracle"] / looks[0]["log_true"] < 3
 
 
 @pytest.mark.slow("references")
