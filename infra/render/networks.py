@@ -152,12 +152,13 @@ class DirectLightRenderer(RendererHere):
 
     def load(self, scene: Scene, name: str) -> SceneHere:
         """Sort the triangles of a scene for its rays."""
-        from model.config import hits_smoke
+        from model.config import hit_stage, hits_smoke
         from model.hits.lit_scene import LitScene
         from model.hits.radiosity import SceneLight
         from model.hits.view_inputs import Channel, view_inputs
         from storage.records.material import PUBLISHED_COLUMNS, chosen_columns
 
+        stage = hit_stage(hits_smoke())
         began = time.perf_counter()
         began_s = time.process_time()
         rows = chosen_columns(scene.materials, PUBLISHED_COLUMNS)[scene.material_index]
@@ -171,7 +172,8 @@ class DirectLightRenderer(RendererHere):
         def view(camera: Camera) -> NDArray[np.float32]:
             inputs = view_inputs(
                 lit, light, camera.c2w, camera.fov_deg, self.resolution,
-                rays_a_side=hits_smoke().hit_rays, anchors_a_side=1, gather_rays=0,
+                rays_a_side=stage.hit_rays, anchors_a_side=1, gather_rays=0,
+                shades_each_ray=not stage.denoises(self.resolution),
             )  # fmt: skip
             of_lamps = inputs.pixels[..., Channel.SHOWN_DIFFUSE]
             return of_lamps + inputs.pixels[..., Channel.DIRECT_SPECULAR]
