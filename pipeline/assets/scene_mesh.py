@@ -10,14 +10,12 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from pipeline.assets.cleaning.clean import clean, normalize
-from pipeline.assets.cleaning.guards import check_raw
+from pipeline.assets.cleaning.clean import check_raw, clean, normalize
 from pipeline.assets.decimation.decimate import decimate, safe_method
 from pipeline.assets.recipe import methods_of
 from pipeline.assets.settings import AssetSettings, Profile
-from pipeline.foreign.load_mesh import load_mesh
 from pipeline.foreign.mesh import TriangleMesh
-from pipeline.foreign.source_file import read_source
+from pipeline.foreign.source_file import load_mesh, read_source
 from storage.errors import Rejected
 
 

@@ -15,8 +15,12 @@ from pipeline.assets.quality.measure import (
 )
 from pipeline.assets.settings import AssetSettings, OwnMaterialSettings
 from pipeline.assets.source_materials.bake import DIFFUSE, BakedTextures, bake, level_emission
-from pipeline.assets.source_materials.nearest import FacePoints, barycentric
-from pipeline.assets.source_materials.source_surface import SourceSurface, match_source_surface
+from pipeline.assets.source_materials.source_surface import (
+    FacePoints,
+    SourceSurface,
+    barycentric,
+    match_source_surface,
+)
 from pipeline.foreign.gltf.materials import GltfMaterials
 from pipeline.foreign.gltf.primitives import gltf_textured_mesh
 from pipeline.foreign.material import TexturedMesh

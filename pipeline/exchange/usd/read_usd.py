@@ -18,9 +18,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from pipeline.exchange.loaded_scene import LoadedScene
 from pipeline.exchange.pictures import MAX_BYTES
-from pipeline.exchange.textured_triangles import MAX_ROWS
+from pipeline.exchange.textured_triangles import MAX_ROWS, LoadedScene
 from pipeline.exchange.usd import prim_names as names
 from pipeline.exchange.usd.foreign_scene import build_stage_scene
 from pipeline.exchange.usd.write_materials import (

@@ -20,10 +20,9 @@ from numpy.typing import NDArray
 from pipeline.foreign.limits import ReadLimits
 from pipeline.foreign.material_files import MaterialFiles
 from pipeline.foreign.mesh import TriangleMesh, join_meshes
-from pipeline.foreign.usd.placed import PlacedPrim, placed_prims
+from pipeline.foreign.usd.placed import PlacedPrim, UnposedMesh, placed_prims
 from pipeline.foreign.usd.polygons import CutMesh, cut_mesh
 from pipeline.foreign.usd.shaders import StatedMaterial, read_bindings, read_material
-from pipeline.foreign.usd.skins import UnposedMesh
 from pipeline.foreign.usd.solids import SOLIDS
 from pipeline.foreign.usd.stage import OpenedStage, OutsideFile, read_quietly
 from pipeline.foreign.usd.texture_nodes import TextureNode, asset_bytes

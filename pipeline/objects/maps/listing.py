@@ -19,8 +19,13 @@ from pipeline.objects.licences import (
     stated_licence,
 )
 from pipeline.objects.listing import failure
-from pipeline.objects.local.catalogue import only_catalogue, read_catalogue
-from pipeline.objects.local.folder import file_record, is_below, walk_files
+from pipeline.objects.local.folder import (
+    file_record,
+    is_below,
+    only_catalogue,
+    read_catalogue,
+    walk_files,
+)
 from pipeline.objects.maps.texture_names import PICTURES, group_textures
 from storage.errors import TrilightError
 from storage.records.objects import SKY, TEXTURE, Failure, ObjectRecord

@@ -7,11 +7,11 @@ from collections.abc import Callable
 import numpy as np
 import pytest
 
-from pipeline.assets.quality.level_checks import check_level
 from pipeline.assets.quality.measure import (
     MeasuredSource,
     Surface,
     area_variation,
+    check_level,
     count_edges,
     intersection_over_union,
     label_components,

@@ -11,10 +11,9 @@ import trimesh
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from pipeline.assets.cleaning import surface_around
+from pipeline.assets import watertight
 from pipeline.assets.cleaning.orient import orient_outward
-from pipeline.assets.quality.level_checks import require_watertight
-from pipeline.assets.quality.measure import Surface
+from pipeline.assets.quality.measure import Surface, require_watertight
 from pipeline.assets.recipe import methods_of
 from pipeline.assets.settings import AssetSettings, GateSettings
 from pipeline.foreign.mesh import TriangleMesh
@@ -48,7 +47,7 @@ CELLS = 24
 @pytest.fixture(autouse=True, scope="module")
 def _coarse_grid() -> Iterator[None]:
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(surface_around, "_CELLS", CELLS)
+        patch.setattr(watertight, "_CELLS", CELLS)
         yield
 
 
@@ -112,7 +111,7 @@ def test_a_surface_around_anything_is_closed_oriented_and_manifold(
     mesh: TriangleMesh, fills: bool
 ) -> None:
     source = cleaned(mesh)
-    around = surface_around.surface_around(source, fills=fills)
+    around = watertight.surface_around(source, fills=fills)
     require_watertight(around)
     assert is_watertight(around)
     squared = igl.point_mesh_squared_distance(around.positions, source.positions, source.faces)[0]

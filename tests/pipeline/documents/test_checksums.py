@@ -12,7 +12,7 @@ import pytest
 from pipeline.documents.checksums import SUMS, published_files, renew_sums, stale_sums, write_sums
 from pipeline.documents.dataset_documents import write_documents
 from pipeline.documents.rights import encode_attribution
-from pipeline.documents.scene_choice import ChosenScene, choose_scenes
+from pipeline.documents.sheets import ChosenScene, choose_scenes
 from storage.dataset.dataset import Dataset
 from storage.dataset.manifest import ShardEntry, read_manifest
 from storage.digests import sha256_of_file

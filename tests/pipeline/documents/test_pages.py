@@ -16,12 +16,16 @@ from numpy.typing import NDArray
 from PIL import Image
 
 from pipeline.documents.distributions import dataset_distributions
-from pipeline.documents.gallery import Card, gallery_filters, make_card
 from pipeline.documents.pages import is_address, render_page
 from pipeline.documents.quality_page import Pair, encode_quality_page
-from pipeline.documents.report import write_report
-from pipeline.documents.scene_page import Neighbours, encode_scene_page
-from pipeline.documents.scene_passes import depth_grays, finite_range, id_colors
+from pipeline.documents.report import Card, gallery_filters, make_card, write_report
+from pipeline.documents.scene_page import (
+    Neighbours,
+    depth_grays,
+    encode_scene_page,
+    finite_range,
+    id_colors,
+)
 from storage.conventions import look_at_c2w, preview_gain, preview_srgb8
 from storage.dataset.dataset import open_dataset
 from storage.dataset.manifest import write_manifest

@@ -21,8 +21,7 @@ from pipeline.documents.figures import (
     draw_panels,
     short_label,
 )
-from pipeline.documents.gallery import write_gallery
-from pipeline.documents.report import _rejections, write_report
+from pipeline.documents.report import _rejections, write_gallery, write_report
 from pipeline.documents.scene_page import Neighbours, encode_scene_page, shown_maps
 from storage.dataset.dataset import Dataset, open_dataset
 from storage.dataset.layout import DatasetFolder

@@ -9,10 +9,12 @@ import numpy as np
 import pytest
 
 from pipeline.exchange.convert import write_scene
-from pipeline.exchange.renderformer_cells import CELLS, compute_cells, filled_cell_mask
 from pipeline.exchange.renderformer_h5 import (
+    CELLS,
     FAR,
     NEAR,
+    compute_cells,
+    filled_cell_mask,
     read_renderformer_h5,
     write_renderformer_h5,
 )

@@ -9,15 +9,14 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from pipeline.foreign.gltf.container import data_uri_bytes, local_path
+from pipeline.foreign.gltf.document import data_uri_bytes, local_path
 from pipeline.foreign.limits import ReadLimits
-from pipeline.foreign.load_mesh import load_mesh
 from pipeline.foreign.material import SourceMaterial
 from pipeline.foreign.mesh import FileMesh
 from pipeline.foreign.mesh_materials import read_textured_mesh
 from pipeline.foreign.picture import Decoder
 from pipeline.foreign.polygons import triangulate
-from pipeline.foreign.source_file import SourceFile, read_source
+from pipeline.foreign.source_file import SourceFile, load_mesh, read_source
 from storage.conventions import linear_from_srgb8
 from storage.errors import Rejected
 from storage.records.exr import encode_channels

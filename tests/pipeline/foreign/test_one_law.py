@@ -9,9 +9,8 @@ from typing import Any
 import numpy as np
 from pxr import Gf, Usd, UsdGeom, UsdLux, UsdShade
 
-from pipeline.assets.source_materials.nearest import FacePoints
 from pipeline.assets.source_materials.skin import _parts
-from pipeline.assets.source_materials.source_surface import SourceSurface
+from pipeline.assets.source_materials.source_surface import FacePoints, SourceSurface
 from pipeline.exchange.open_scene import load_source, scene_source
 from pipeline.exchange.renderformer_json import read_description
 from pipeline.foreign.material import LEAST_ROUGHNESS

@@ -13,7 +13,7 @@ from PIL import Image
 
 from infra.bench.workloads import cycles as environment
 from infra.bench.workloads.traced_pictures import fixed_samples, render_shot
-from pipeline.exchange.loaded_scene import LoadedScene
+from pipeline.exchange.textured_triangles import LoadedScene
 from pipeline.exchange.usd.read_usd import read_usd
 from pipeline.exchange.usd.write_usd import write_usd
 from pipeline.isolation import ChildLimits, IsolatedChild

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from pxr import Sdf, Usd, UsdGeom
 
-from pipeline.exchange.loaded_scene import LoadedScene
+from pipeline.exchange.textured_triangles import LoadedScene
 from pipeline.exchange.usd.read_usd import read_usd
 from pipeline.exchange.usd.write_usd import CENTER, write_usd
 from storage.records.material import PUBLISHED_COLUMNS
