@@ -98,9 +98,8 @@ def select_scenes(
 ) -> list[SelectedScene]:
     """Return the selected scenes, in the order of the sources and of their shards.
 
-    Args:
-        offsets: what is added to the keys of each source.
-        value_names: names of values to read for each scene beside those of the condition.
+    `offsets` are added to the keys of each source. Beside the values of the condition, those of
+    `value_names` are read.
 
     Raises:
         TrilightError: two sources hold the same scene, or a source is damaged.
@@ -241,8 +240,7 @@ def list_scenes(
 ) -> list[dict[str, object]]:
     """Return a row for each scene that a selection takes, in the order of the shards.
 
-    Args:
-        progress: called with the number of shards read so far, and the total.
+    `progress` is called with the number of shards read so far, and the total.
 
     Raises:
         TrilightError: a shard is damaged.
@@ -307,10 +305,8 @@ def derive_shards(
 ) -> None:
     """Write shards, lock, failures and manifest of the new dataset; the manifest comes last.
 
-    Args:
-        sources: finished datasets; `select` and `reshard` take one.
-        out: an empty folder.
-        progress: called with the number of shards read or written so far, and the total.
+    `select` and `reshard` take one source, and `out` is an empty folder. `progress` is called with
+    the number of shards read or written so far, and the total.
 
     Raises:
         TrilightError: the sources do not fit together, one is damaged, nothing is selected, an
@@ -464,9 +460,7 @@ def derive_dataset(
 ) -> tuple[str, Statistics]:
     """Make a dataset of finished ones by merging, selecting or resharding.
 
-    Args:
-        out: folder of the new dataset, which must not exist or be empty.
-        progress: called with the number of shards read or written so far, and the total.
+    `out` must not exist or be empty; `progress` is as in `derive_shards`.
 
     Returns:
         The dataset digest, and the statistics of the dataset.

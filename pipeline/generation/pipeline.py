@@ -84,10 +84,7 @@ def make_dataset(
 ) -> Outcome:
     """Make a dataset: all its missing shards, or those of a range.
 
-    Args:
-        options: the dataset, and the range of shards to make.
-        runner: runs the tasks.
-        watch: called after each task.
+    `watch` is called after each task.
 
     Raises:
         TrilightError: an error that the user can fix; finished scenes stay on disk.

@@ -88,11 +88,9 @@ def pack_shard(
     the staged scenes are deleted after it: a kill in between loses nothing and repeats little.
 
     An existing shard stays: the first writer wins. A growing one is replaced. Where a file system
-    carries no locks, who comes second returns what the first has packed.
-
-    Args:
-        scene_indices: indices of its scenes, all of which are staged.
-        grows: True if the manifest lists the shard as growing; then call while holding its mutex.
+    carries no locks, who comes second returns what the first has packed. All scenes of
+    `scene_indices` are staged. If the manifest lists the shard as growing, pass `grows` and hold
+    its mutex.
 
     Raises:
         TrilightError: the disk is full, the folder cannot be written, or a staged file vanished.
@@ -157,8 +155,7 @@ def unpack_here(folder: DatasetFolder, name: str, scenes: range, manifest: Manif
 def unpack_shard(folder: DatasetFolder, note: ShardNote, scenes: range, stream: BinaryIO) -> None:
     """Stage the scenes of a shard again, byte for byte, so that it can be packed with more.
 
-    Args:
-        scenes: indices of its scenes; one that the file lacks was given up.
+    A scene that the file lacks was given up.
     """
     name = note.shard.name
     samples = dict(ShardReader(stream, name))
@@ -182,8 +179,7 @@ class PublishedShards:
     def names_in_part(self, part: int, ends: Mapping[str, range]) -> Iterator[str]:
         """Yield the names of the published shards of a part of the dataset, growing ones too.
 
-        Args:
-            ends: shards of a bucket with fewer scenes than planned; their scenes are staged here.
+        `ends` are shards of a bucket with fewer scenes than planned; their scenes are staged here.
         """
         if self._store.is_here:
             return shard_names_in_part(self._folder.root, part)
@@ -477,10 +473,8 @@ class UnfinishedShard:
     ) -> None:
         """Stage a finished or given-up scene as `stage_scene`, and log its cost.
 
-        Args:
-            sample: the finished scene; None if it was given up.
-            began: start of the work on it, by `time.monotonic`.
-            cores: number of cores that the work kept busy.
+        The sample is None if the scene was given up. The work began at `began` (`time.monotonic`)
+        and kept so many cores busy.
         """
         stage_scene(self._staged, scene_index, sample, failures, profile)
         seconds = time.monotonic() - began

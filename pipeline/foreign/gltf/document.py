@@ -79,11 +79,8 @@ class GltfDocument:
     ) -> NDArray[np.float64]:
         """Return rows [N, K] of an accessor; integers as fractions where they are normalized.
 
-        Args:
-            index: index of the accessor.
-            widths: allowed numbers of components K.
-            rows: rows to return.
-            is_unit: whether integers are fractions; as the accessor states by default.
+        `widths` are the allowed numbers of components K. `is_unit` tells whether integers are
+        fractions, by default as the accessor states.
 
         Raises:
             Rejected: cut_off, unsupported_accessor, load_error.
@@ -216,11 +213,7 @@ class GltfDocument:
 def open_gltf(data: bytes, suffix: str, files: SourceFolder, limits: ReadLimits) -> GltfDocument:
     """Return a glTF with its buffers, and with its pictures where the limits include materials.
 
-    Args:
-        data: the file.
-        suffix: suffix of its name, `.glb` or `.gltf`.
-        files: the folder of the file; no buffer outside of it is read.
-        limits: bounds of what is read.
+    The suffix is `.glb` or `.gltf`; no buffer outside of the file's folder is read.
 
     Raises:
         Rejected: as `read_container`, `check_tree`, and of a buffer external_uri or missing_file.

@@ -8,10 +8,10 @@ import pytest
 
 from pipeline.assets.cleaning.clean import GRID, geometry_sha256
 from pipeline.assets.cleaning.orient import orient_outward
-from pipeline.assets.scene_mesh import load_scene_mesh
 from pipeline.assets.settings import AssetSettings
+from pipeline.exchange.scene_files import load_mesh_file
 from pipeline.foreign.mesh import TriangleMesh
-from storage.errors import Rejected
+from storage.errors import TrilightError
 from tests.for_each import for_each
 from tests.pipeline.assets.meshes_by_hand import (
     as_rows,
@@ -32,8 +32,8 @@ SETTINGS = AssetSettings()
 def test_remeshing_keeps_size_place_and_number_and_needs_some_area(tmp_path: Path) -> None:
     mesh = moved(knot(), 3, [5, -2, 1])
     path = write_obj(tmp_path / "knot.obj", mesh)
-    as_it_is = load_scene_mesh(path, SETTINGS, None).mesh
-    even = load_scene_mesh(path, SETTINGS, 1000).mesh
+    as_it_is = load_mesh_file(path, "knot", "knot", SETTINGS, "MIT")
+    even = load_mesh_file(path, "knot", "knot", SETTINGS, "MIT", 1000)
     assert len(as_it_is.faces) == len(mesh.faces)
     assert 500 < len(even.faces) <= 1000
     for end in ("min", "max"):
@@ -44,9 +44,9 @@ def test_remeshing_keeps_size_place_and_number_and_needs_some_area(tmp_path: Pat
         positions=np.outer(np.arange(6.0), [1.0, 2.0, 3.0]), faces=np.array([[0, 1, 2], [3, 4, 5]])
     )
     path = write_obj(tmp_path / "line.obj", line)
-    assert len(load_scene_mesh(path, SETTINGS, None).mesh.faces) == 2
-    with pytest.raises(Rejected, match="remesh_failed"):
-        load_scene_mesh(path, SETTINGS, 100)
+    assert len(load_mesh_file(path, "line", "line", SETTINGS, "MIT").faces) == 2
+    with pytest.raises(TrilightError, match="line: remesh_failed"):
+        load_mesh_file(path, "line", "line", SETTINGS, "MIT", 100)
 
 
 def same(a: TriangleMesh, b: TriangleMesh) -> bool:
