@@ -145,13 +145,9 @@ class ListedObjects:
     ) -> FoundObjects:
         """Download the selected objects and return them with the failures.
 
-        Downloads stay in the user's cache (`storage.cache`; Objaverse in the folder of its
-        package) and are not repeated.
-
-        Args:
-            is_selected: returns True for the uid of a selected object.
-            downloaded: called with the number of finished downloads, failed ones included, and the
-                total; from the calling thread.
+        Downloads stay in the user's cache (`storage.cache`; Objaverse in the folder of its package)
+        and are not repeated. `downloaded` is called with the number of finished downloads, failed
+        ones included, and the total, from the calling thread.
 
         Raises:
             TrilightError: none of the selected objects could be downloaded.

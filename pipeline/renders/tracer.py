@@ -94,16 +94,14 @@ class Tracer(Protocol):
     def split_lights(self, *, bounces: bool, lobes: bool) -> "Tracer":
         """Return the same loaded scene, whose sums of passes are by part.
 
-        Args:
-            bounces: keep direct and indirect light apart.
-            lobes: keep the diffuse and the specular lobe of the visible surface apart.
+        `bounces` keeps direct and indirect light apart, `lobes` the diffuse and the specular lobe
+        of the visible surface.
         """
 
     def for_views(self, cameras: Sequence[PixelCamera]) -> "Tracer":
         """Return the same loaded scene, which traces light paths of one seed once for all views.
 
-        Args:
-            cameras: of the views, in the order in which they will be asked for.
+        The cameras are in the order in which they will be asked for.
         """
 
     def radiance(
