@@ -1,6 +1,11 @@
-"""Reads pages as a browser would, and holds text that means harm."""
+"""Reads pages as a browser would, and holds text and rows of objects that mean harm."""
 
+import dataclasses
 from html.parser import HTMLParser
+from typing import Any
+
+from storage.records.asset import AssetRow
+from tests.pipeline.scenes.small_pool import QUALITY, SOURCE
 
 HARM = """<script>alert(1)</script><img src=x onerror=alert(2)>"'&"""
 VOID = {"meta", "img", "br", "input"}
@@ -46,3 +51,20 @@ def read(page: bytes) -> Tags:
     tags.close()
     assert tags._open == []
     return tags
+
+
+def row(uid: str = "made/ball", **changes: Any) -> AssetRow:
+    plain = AssetRow(
+        uid=uid,
+        path="meshes/ball.ply",
+        title="Ball",
+        licence="CC0-1.0",
+        licence_source="tests",
+        attribution="its maker",
+        source_url="https://example.org/ball",
+        num_faces=1280,
+        method="source",
+        quality=QUALITY,
+        source=SOURCE,
+    )
+    return dataclasses.replace(plain, **changes)

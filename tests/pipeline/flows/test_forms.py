@@ -1,13 +1,22 @@
-"""Forms of the flows: every setting with its sentence, wrong values refused by name, no secrets."""
+"""Flows: forms of every setting, wrong values refused by name, and who makes a dataset's parts."""
 
+import contextlib
 import dataclasses
-from typing import Any
+import signal
+import sys
+from collections.abc import Iterator
+from pathlib import Path
+from types import SimpleNamespace
+from typing import Any, cast
 
 import pytest
 from prefect.exceptions import ParameterTypeError
 
 from infra.serving.train_model import train_model
-from pipeline.flows.forms import DatasetOverrides, changed_values, options_of_form
+from pipeline.flows import flow_executors
+from pipeline.flows import prefect_flows as building
+from pipeline.flows import prefect_runner as runner
+from pipeline.flows.forms import DatasetInRuns, DatasetOverrides, changed_values, options_of_form
 from pipeline.flows.prefect_flows import (
     build_dataset,
     generate_scenes,
@@ -15,7 +24,9 @@ from pipeline.flows.prefect_flows import (
     prepare_assets,
 )
 from pipeline.flows.prefect_runner import is_retryable
+from pipeline.flows.prefect_server import GPU_LIMIT, run_to_end
 from pipeline.generation.generate_options import GenerateOptions
+from pipeline.generation.generation_run import shard_ranges
 from pipeline.presets.settings import DatasetSettings
 from storage.errors import EnvironmentFailure, TrilightError
 from tests.for_each import for_each
@@ -158,3 +169,133 @@ def test_only_what_can_pass_is_tried_again() -> None:
         )
     }
     assert list(outcomes.values()) == [True, True, False, False]
+
+
+def _parameters(**given: Any) -> dict[str, Any]:
+    example = DatasetInRuns()
+    plain = {name: getattr(example, name) for name in DatasetInRuns.__dataclass_fields__}
+    return {**plain, "changes": None, **given}
+
+
+@pytest.fixture
+def made(monkeypatch: pytest.MonkeyPatch) -> list[str | None]:
+    """Which ranges are made, those of other runs first; nothing is."""
+    ranges: list[str | None] = []
+
+    def started(deployment: str, *, parameters: dict[str, Any], **options: Any) -> None:
+        ranges.append(f"{deployment} {parameters['shards']}")
+
+    status = SimpleNamespace(shards_planned=10)
+    monkeypatch.setattr(building, "prepare_assets", lambda **given: None)
+    monkeypatch.setattr(building, "read_status", lambda out: status)
+    monkeypatch.setattr(building, "run_deployment", started)
+    monkeypatch.setattr(building, "generate_scenes", lambda **given: ranges.append(given["shards"]))
+    return ranges
+
+
+def test_so_many_flow_runs_are_so_many_in_all(made: list[str | None]) -> None:
+    flow: Any = building.build_dataset
+    flow.fn(**_parameters(flow_runs=3, deployment="d/x"))
+    assert made == ["d/x 3:6", "d/x 6:10", "0:3", None]
+    made.clear()
+    flow.fn(**_parameters())
+    assert made == [None]
+
+
+def test_there_are_no_more_ranges_than_shards() -> None:
+    assert shard_ranges(2, 5) == ["0:1", "1:2"]
+    assert shard_ranges(7, 1) == ["0:7"]
+
+
+@for_each(
+    ("given", "message"),
+    [
+        ({"flow_runs": 0}, "flow_runs is 0; expected a whole number from 1"),
+        ({"flow_runs": 10**6}, "flow_runs is 1000000"),
+        ({"shards": "0:2"}, "shards is '0:2'; expected no range"),
+    ],
+)
+def test_wrong_numbers_of_runs_are_named(given: dict[str, Any], message: str) -> None:
+    with pytest.raises(TrilightError, match=message):
+        options_of_form(_parameters(**given), DatasetInRuns)
+
+
+@for_each(("device", "held"), [("gpu", [1]), ("cpu", [])])
+def test_rendering_on_a_gpu_takes_its_limit(
+    monkeypatch: pytest.MonkeyPatch, device: str, held: list[int]
+) -> None:
+    taken: list[int] = []
+
+    @contextlib.contextmanager
+    def limit(name: str, *, occupy: int, strict: bool) -> Iterator[None]:
+        assert name == GPU_LIMIT
+        taken.append(occupy)
+        yield
+
+    monkeypatch.setattr(runner, "concurrency", limit)
+    monkeypatch.setattr(runner, "make_task", lambda job, pieces: (job, pieces, list(taken)))
+    monkeypatch.setattr(runner.make_scenes, "submit", cast(Any, runner.make_scenes).fn)
+    job, pieces = SimpleNamespace(device=device), (SimpleNamespace(shard_index=0, first=0),)
+    submit = cast(Any, runner.PrefectRunner().submit)
+    assert submit(pieces, job) == (job, pieces, held)
+
+
+def test_documents_are_tried_again_where_that_can_help() -> None:
+    task = cast(Any, runner.write_documents_task)
+    assert task.retries == cast(Any, runner.make_scenes).retries > 0
+    assert task.retry_condition_fn is runner.is_retryable
+
+
+def test_a_dask_worker_that_sees_another_folder_is_named_before_any_work(tmp_path: Path) -> None:
+    class Client:
+        """Two workers, of which the second is on another machine."""
+
+        def run(self, function: Any, *arguments: Any) -> dict[str, bool]:
+            return {"tcp://a:1": function(*arguments), "tcp://b:1": False}
+
+    order = GenerateOptions(out=str(tmp_path / "set"))
+    with pytest.raises(TrilightError, match="1 of 2 Dask workers do not see.*such as tcp://b:1"):
+        flow_executors._require_shared(cast(Any, Client()), order)
+    assert list((tmp_path / "set" / ".staging").iterdir()) == []
+
+
+def test_a_dask_scheduler_that_does_not_answer_is_named() -> None:
+    pytest.importorskip("distributed", reason="needs the package distributed (setup-all)")
+    with (
+        pytest.raises(TrilightError, match="--address http://127.0.0.1:1: no Dask scheduler"),
+        flow_executors._client("http://127.0.0.1:1"),
+    ):
+        pass
+
+
+SAVES = """
+import signal, sys, time
+from pathlib import Path
+told = []
+signal.signal(signal.SIGTERM, lambda *_: told.append(1))
+print("begun", flush=True)
+while not told:
+    time.sleep(0.01)
+print("x" * 200_000, flush=True)  # more than a pipe holds
+time.sleep(0.3)
+Path(sys.argv[1]).write_text(str(len(told)))
+"""
+
+
+class Cancelled(BaseException):
+    """As Prefect raises it for a SIGTERM."""
+
+
+def test_what_is_cancelled_saves_and_status_and_lines_are_passed_on(tmp_path: Path) -> None:
+    def cancel(line: str) -> None:
+        raise Cancelled
+
+    with pytest.raises(Cancelled):
+        run_to_end([sys.executable, "-c", SAVES, str(tmp_path / "saved")], cancel)
+    assert (tmp_path / "saved").read_text() == "1"
+    lines: list[str] = []
+    program = "import os, sys; print('a'); print(os.getpgid(0) == os.getpid()); sys.exit(3)"
+    assert run_to_end([sys.executable, "-c", program], lines.append) == (3, "True")
+    assert lines == ["a", "True"]
+    ended = run_to_end([sys.executable, "-c", "import os; os.kill(os.getpid(), 9)"], lines.append)
+    assert ended == (-signal.SIGKILL, "")

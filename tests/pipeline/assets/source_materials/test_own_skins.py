@@ -38,20 +38,18 @@ from tests.pipeline.assets.source_materials.textured_kit import (
     OWN,
     SQUARE,
     STORED,
+    TEXTURE,
     UV_UP,
     F,
     assert_corners,
+    connect_texture,
     picture_bytes,
     seen_at,
+    set_inputs,
     textured_glb,
     textured_gltf,
     textured_obj,
     textured_tree,
-)
-from tests.pipeline.assets.source_materials.usd_kit import (
-    TEXTURE,
-    connect_texture,
-    set_inputs,
     textured_usd,
 )
 

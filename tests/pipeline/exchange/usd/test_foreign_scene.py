@@ -21,8 +21,7 @@ from storage.records.material import EMISSION
 from storage.records.scene import Scene
 from tests.for_each import for_each
 from tests.pipeline.assets.source_materials.textured_kit import F
-from tests.pipeline.exchange.exchange_kit import row_at
-from tests.pipeline.exchange.strangers_stage import L_SHAPE, mesh, write_stage
+from tests.pipeline.exchange.exchange_kit import L_SHAPE, mesh, row_at, write_stage
 from tests.scenes_by_hand import tiny_scene
 
 
