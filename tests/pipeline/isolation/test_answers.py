@@ -27,7 +27,6 @@ from numpy.typing import NDArray
 from pipeline.exchange.convert import convert_sources
 from pipeline.exchange.formats import SceneSource
 from pipeline.exchange.open_scene import load_cameras, load_source, source_keys
-from pipeline.generation.inspect_scene import _facts
 from pipeline.isolation import ChildFailed, ChildLimits, IsolatedChild, answers
 from pipeline.isolation.answers import (
     CLASS,
@@ -382,7 +381,7 @@ def test_a_real_answer_is_as_declared(tmp_path: Path) -> None:
     write_scene(tiny_scene(), tmp_path / "scene.json")
     source = SceneSource(path=tmp_path / "scene.json", key=None)
     calls: list[tuple[Callable[..., Any], Any]] = [
-        (each, each(source)) for each in (load_source, load_cameras, source_keys, _facts)
+        (each, each(source)) for each in (load_source, load_cameras, source_keys)
     ]
     calls.append((convert_sources, convert_sources([source], tmp_path / "out.glb", None)))
     for function, value in calls:
