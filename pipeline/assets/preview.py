@@ -6,8 +6,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pipeline.assets.cleaning.clean import clean, normalize
-from pipeline.assets.cleaning.orient import orient_outward
-from pipeline.assets.outside_rays import first_faces
+from pipeline.assets.cleaning.orient import first_faces, orient_outward
 from pipeline.assets.quality.measure import level_mesh
 from pipeline.assets.settings import AssetSettings
 from pipeline.assets.source_materials.source_surface import barycentric

@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pipeline.assets.cleaning.clean import clean
-from pipeline.assets.outside_rays import first_faces, outside_rays
+from pipeline.assets.cleaning.orient import first_faces, outside_rays
 from pipeline.assets.settings import GateSettings
 from pipeline.foreign.mesh import TriangleMesh
 from storage.errors import Rejected
