@@ -458,15 +458,12 @@ def derive_dataset(
     *,
     progress: Callable[[int, int], None] = lambda done, total: None,
 ) -> tuple[str, Statistics]:
-    """Make a dataset of finished ones by merging, selecting or resharding.
+    """Make a dataset of finished ones; return its digest and its statistics.
 
     `out` must not exist or be empty; `progress` is as in `derive_shards`.
 
-    Returns:
-        The dataset digest, and the statistics of the dataset.
-
     Raises:
-        TrilightError: as `pipeline.generation.derive_dataset.derive_shards`, or `out` is not empty.
+        TrilightError: as `derive_shards`, or `out` is not empty.
     """
     out = Path(os.path.realpath(out))
     if out.exists() and (not out.is_dir() or any(out.iterdir())):

@@ -111,8 +111,7 @@ class ObjectLock:
     def prepare(self) -> ListedObjects | None:
         """Prepare objects cooperatively, without holding the objects mutex, unless they are frozen.
 
-        Returns:
-            The listed source, for `freeze`; None if the objects are frozen already.
+        The listed source is returned, for `freeze`; None if they are frozen already.
 
         Raises:
             TrilightError: as `list_objects` and `prepare_in_batches`.

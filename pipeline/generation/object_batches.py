@@ -207,15 +207,12 @@ def prepare_in_batches(
     should_stop: Callable[[], bool] = lambda: False,
     retry_transient: bool = True,
 ) -> PrepareResult:
-    """Prepare objects together with all other workers; return when all are done.
+    """Prepare objects with all other workers; return accepted and rejected ones when all are done.
 
     Objects are sorted by uid, and `workers` of them are prepared here at the same time. `done` is
     called with a number of objects that are done, here or elsewhere, from any thread. `should_stop`
     returns True if the remaining objects are no longer needed. With `retry_transient`, objects that
     failed for a transient reason before are tried again.
-
-    Returns:
-        The accepted objects and the rejected ones, both in the order of `records`.
 
     Raises:
         TrilightError: as `prepare_assets`, or the dataset cannot be written.

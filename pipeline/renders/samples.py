@@ -165,8 +165,7 @@ class TileChoice:
     def __init__(self, visible: NDArray[np.bool_]) -> None:
         """Begin with nothing seen.
 
-        Args:
-            visible: [R, R] pixels that may have light at all.
+        `visible` [R, R] are pixels that may have light at all.
         """
         self._weight = tile_means(visible.astype(np.float64))
         self._seen: list[NDArray[np.int64]] = []

@@ -109,14 +109,10 @@ class Tracer(Protocol):
     ) -> NDArray[np.float32]:
         """Return the mean of one pass of samples, linear radiance [R, R, 3]; 0 if not chosen.
 
-        Equal arguments give equal bits, whatever the number of threads. With other pixels chosen,
-        a pixel's samples may be others.
-
-        Args:
-            camera: the view.
-            seed: 31 bits; passes with different seeds are independent.
-            spp: samples per pixel, a square of a power of two.
-            chosen: the pixels that are wanted. A tracer may trace the others too.
+        Equal arguments give equal bits, whatever the number of threads. With other pixels chosen, a
+        pixel's samples may be others. The seed has 31 bits; passes with different seeds are
+        independent. `spp` is a square of a power of two. A tracer may trace pixels that are not
+        chosen too.
         """
 
     def pass_sum(self, camera: PixelCamera) -> PassSum: ...

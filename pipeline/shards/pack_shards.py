@@ -242,8 +242,7 @@ class PublishedShards:
     def publish(self, note: ShardNote) -> ShardNote | None:
         """Publish a packed shard with its log and note; the cache keeps the bytes of a sent one.
 
-        Returns:
-            The published note; None if another worker publishes or published it, or it grows.
+        None is returned if another worker publishes or published it, or it grows.
         """
         name = note.shard.name
         if self._folder.shard(name).exists():  # else another machine, or process, has sent it
@@ -482,11 +481,7 @@ class UnfinishedShard:
         log_scene(folder, self.name, scene_index, seconds=seconds, cores=cores, num_rejected=count)
 
     def pack(self) -> ShardEntry | None:
-        """Pack the shard if all its scenes are staged, unless another worker does.
-
-        Returns:
-            The shard if this call packed it, else None.
-        """
+        """Pack and return the shard if all its scenes are staged, unless another worker does."""
         scenes, grows = self._plan()
         if self._is_packed() or not all(is_staged(self._staged, index) for index in scenes):
             return None
