@@ -46,13 +46,17 @@ from storage.records.sample import Sample
 from storage.records.scene import Scene
 from tests.command_line import trilight
 from tests.pipeline.documents.dataset_by_hand import (
+    HARM,
     SETTINGS,
+    Tags,
     five_scenes,
     furnished,
+    read,
+    row,
     sample,
+    text_of,
     write_dataset,
 )
-from tests.pipeline.documents.pages_read import HARM, Tags, read, row, text_of
 from tests.scenes_by_hand import tiny_scene
 
 

@@ -30,14 +30,17 @@ from storage.records.objects import Failure
 from storage.records.scene import SceneObject
 from storage.records.texture import MapSource, Texture
 from tests.pipeline.documents.dataset_by_hand import (
+    HARM,
+    Tags,
     edit_manifest,
     five_scenes,
     furnished,
     locked,
+    read,
     sample,
+    text_of,
     write_dataset,
 )
-from tests.pipeline.documents.pages_read import HARM, Tags, read, text_of
 from tests.pipeline.documents.test_card import card_of
 from tests.scenes_by_hand import tiny_scene
 from tests.textured_by_hand import sky, textured_scene
