@@ -28,9 +28,8 @@ from pipeline.assets.cleaning.orient import orient_outward
 from pipeline.assets.preview import preview
 from pipeline.assets.settings import AssetSettings
 from pipeline.executors.threads import ThreadRunner
-from pipeline.foreign.load_mesh import load_mesh
 from pipeline.foreign.mesh import TriangleMesh
-from pipeline.foreign.source_file import read_source
+from pipeline.foreign.source_file import load_mesh, read_source
 from pipeline.generation.generate_options import GenerateOptions
 from pipeline.generation.pipeline import make_dataset
 from pipeline.renders.mitsuba_variant import choose_variant

@@ -1,7 +1,7 @@
 """Scene settings of the published sets, with every number stated.
 
 A frozen set asks no list of families or layouts and takes no default: those may change, and sets
-that networks are compared on may not. Test: tests/pipeline/presets/test_frozen_presets.py. The
+that networks are compared on may not. Test: tests/pipeline/presets/test_registry.py. The
 layouts that are named here are frozen with it; another `plane` is registered under another name.
 """
 

@@ -44,7 +44,7 @@ LLVM_TARGET = ("haswell", 8)
 """What Dr.Jit compiles for in both, and its lanes: the least that it supports."""
 
 CHOSEN = (
-    "tests/pipeline/presets/test_frozen_presets.py",
+    "tests/pipeline/presets/test_registry.py",
     "tests/model/hits/test_decoder.py",
     "tests/model/hits/test_view_inputs.py",
     "tests/model/test_open.py",
@@ -53,7 +53,7 @@ CHOSEN = (
     "tests/pipeline/objects/builtin/test_builtin.py",
     "tests/pipeline/renders/test_stored_pictures.py",
     "tests/pipeline/scenes/test_compose.py",
-    "tests/pipeline/scenes/test_mesh_collision.py",
+    "tests/pipeline/scenes/test_views.py",
     "tests/scene_templates/skies/test_procedural_skies.py",
     "tests/scene_templates/surfaces/test_procedural_textures.py",
     "tests/storage/test_metrics.py",

@@ -17,8 +17,8 @@ from infra.cli.console import (
 )
 from infra.cli.everyday import HELP_FLAGS
 from infra.cli.options import command
-from pipeline.shards.derive import DeriveOptions, Selection
-from pipeline.shards.derive import list_scenes as read_scene_rows
+from pipeline.generation.derive_dataset import DeriveOptions, Selection
+from pipeline.generation.derive_dataset import list_scenes as read_scene_rows
 from pipeline.shards.finished_dataset import open_finished
 from storage.errors import TrilightError
 from storage.settings.described import checked

@@ -13,7 +13,7 @@ from infra.render.path_tracer import PathTracer, RenderChild
 from infra.render.quality import FixedSamples
 from pipeline.documents.pages import Figure, render_page
 from pipeline.documents.png import encode_png
-from pipeline.documents.scene_choice import ChosenScene, choose_scenes, read_chosen
+from pipeline.documents.sheets import ChosenScene, choose_scenes, read_chosen
 from pipeline.renders.mitsuba_variant import choose_variant
 from storage.atomic import write_atomically
 from storage.conventions import SPLITS, preview_srgb8

@@ -14,7 +14,7 @@ from infra.render.networks import NetworkRenderer, RendererHere, SceneHere
 from infra.render.path_tracer import PathTracer, RenderChild
 from infra.render.quality import FixedSamples, ToStatedError
 from infra.viewer.picture_options import PictureOptions
-from pipeline.documents.scene_passes import PASS_VIEWS, PassView
+from pipeline.documents.scene_page import PASS_VIEWS, PassView
 from pipeline.renders.preview import usual_filter
 from pipeline.renders.settings import NoiseTargets
 from storage.errors import Unrenderable

@@ -6,20 +6,22 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from pipeline.assets.cleaning.clean import clean, geometry_sha256, normalize
-from pipeline.assets.cleaning.guards import check_clean, check_raw
+from pipeline.assets.cleaning.clean import check_clean, check_raw, clean, geometry_sha256, normalize
 from pipeline.assets.cleaning.orient import orient_outward
 from pipeline.assets.decimation.decimate import decimate, safe_method, smallest_passing
-from pipeline.assets.quality.level_checks import check_level, require_watertight
-from pipeline.assets.quality.measure import MeasuredSource, count_edges
+from pipeline.assets.quality.measure import (
+    MeasuredSource,
+    check_level,
+    count_edges,
+    require_watertight,
+)
 from pipeline.assets.recipe import RECIPE
 from pipeline.assets.settings import AssetSettings
 from pipeline.assets.source_materials.skin import add_source_materials
 from pipeline.assets.stage import AssetAttempt
 from pipeline.assets.watertight import LevelBase, make_watertight
-from pipeline.foreign.load_mesh import load_mesh
 from pipeline.foreign.mesh import TriangleMesh
-from pipeline.foreign.source_file import read_source
+from pipeline.foreign.source_file import load_mesh, read_source
 from storage.errors import Rejected
 from storage.records.asset import Asset, Level, LevelQuality, LevelRecord, SourceFacts
 
@@ -29,11 +31,9 @@ def prepare_asset(
 ) -> AssetAttempt:
     """Return the clean, outward oriented object at every budget that passes the quality checks.
 
-    Args:
-        path: the only file that is opened, with the buffers that a glTF names below its folder.
-        settings: profile, budgets and limits.
-        method: a name of `recipe.methods_of`, for levels other than the unchanged source.
-        root: folder of its pictures, as in `read_source`.
+    No other file than `path` is opened, but the buffers that a glTF names, and pictures below
+    `root` (`read_source`). `method` is a name of `recipe.methods_of`, for levels other than the
+    unchanged source.
 
     Raises:
         Rejected: the object is unusable by any method; each step has its reason codes.

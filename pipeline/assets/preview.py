@@ -6,14 +6,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pipeline.assets.cleaning.clean import clean, normalize
-from pipeline.assets.cleaning.orient import orient_outward
-from pipeline.assets.outside_rays import first_faces
+from pipeline.assets.cleaning.orient import first_faces, orient_outward
 from pipeline.assets.quality.measure import level_mesh
 from pipeline.assets.settings import AssetSettings
-from pipeline.assets.source_materials.nearest import barycentric
-from pipeline.foreign.load_mesh import load_mesh
+from pipeline.assets.source_materials.source_surface import barycentric
 from pipeline.foreign.mesh import TriangleMesh
-from pipeline.foreign.source_file import read_source
+from pipeline.foreign.source_file import load_mesh, read_source
 from storage.conventions import srgb8
 from storage.records.asset import Level, LevelSkin
 from storage.records.lookup import texture_values

@@ -1,20 +1,173 @@
 """Writes the documents beside the shards of a finished dataset, for readers and hubs."""
 
 import dataclasses
+from collections import Counter
+from collections.abc import Collection, Mapping, Sequence
+from typing import Any
 
-from pipeline.documents.card import encode_card
+from markupsafe import Markup
+
 from pipeline.documents.checksums import renew_sums
 from pipeline.documents.croissant import encode_croissant
-from pipeline.documents.distributions import dataset_distributions
+from pipeline.documents.distributions import MEASURED, Distributions, dataset_distributions, setting
+from pipeline.documents.pages import render_markdown
 from pipeline.documents.report import write_report
-from pipeline.documents.rights import attribution_of, encode_licences, rights_of
+from pipeline.documents.rights import (
+    Rights,
+    attribution_of,
+    encode_licences,
+    hub_licence,
+    licence_facts,
+    rights_of,
+)
 from pipeline.documents.sheets import write_contact_sheet
 from storage.atomic import write_atomically
 from storage.dataset.dataset import Dataset
+from storage.dataset.derived import derivation_of
 from storage.dataset.layout import DatasetFolder
-from storage.dataset.manifest import read_manifest, write_manifest
+from storage.dataset.manifest import Manifest, read_manifest, write_manifest
 from storage.dataset.statistics import Statistics, dataset_statistics
 from storage.digests import sha256_hex, sha256_of_file
+from storage.markdown import front_matter
+from storage.records.objects import SKY, TEXTURE
+from storage.records.profiles import PLAIN
+from storage.records.quantities import summary
+
+_TAGS = (
+    "neural-rendering", "path-tracing", "renderformer", "3d", "hdr", "openexr", "webdataset",
+    "trilight",
+)  # fmt: skip
+_SETTINGS = (
+    ("seed", "seed"),
+    ("objects from", "source"),
+    ("picture width, pixels", "renders.resolution"),
+    ("target stated error, dB", "renders.noise_floor_db"),
+    ("target as linear PSNR, dB", "renders.noise_floor_linear_db"),
+    ("target over geometry, dB", "renders.noise_floor_objects_db"),
+    ("most samples per pixel", "renders.max_spp"),
+    ("longest light path", "renders.max_depth"),
+    ("views of a scene", "scenes.num_views"),
+    ("most triangles of a scene", "scenes.max_triangles"),
+    ("scenes of a shard", "splits.scenes_per_shard"),
+    ("profile", "storage.profile"),
+)
+"""Labels and names of the settings that the card shows; the manifest has all of them."""
+_ENVIRONMENT = (("Mitsuba variant", "mitsuba_variant"), ("processor", "processor"))
+
+
+def encode_card(
+    folder: DatasetFolder, manifest: Manifest, distributions: Distributions, rights: Rights
+) -> bytes:
+    """Return the card; of `folder` only the names of the dataset's documents are used."""
+    title = f"Trilight dataset {manifest.build}"
+    layouts = Counter[str]()
+    for (template, _), count in sorted(distributions.scenes.items()):
+        layouts[template] += count
+    settings = [(label, setting(manifest.settings, name)) for label, name in _SETTINGS]
+    settings += [(label, manifest.environment.get(name)) for label, name in _ENVIRONMENT]
+    return render_markdown(
+        "card.jinja",
+        front=Markup(front_matter(_front(folder, manifest, rights, title))),
+        title=title,
+        folder=folder,
+        manifest=manifest,
+        found=distributions,
+        resolution=setting(manifest.settings, "renders.resolution"),
+        splits=_by_split(manifest, distributions),
+        states_expected=summary(distributions.all("expected_error_db"))["count"] > 0,
+        layouts=layouts,
+        triangles=summary(distributions.all("triangles_per_scene")),
+        num_scenes=sum(distributions.scenes.values()),
+        families=Counter(kind for kind, _ in distributions.maps),
+        user_maps=_user_maps(distributions),
+        derivation=derivation_of(manifest.settings),
+        settings=[(label, value) for label, value in settings if value is not None],
+        arrays=" or ".join(_arrays(distributions.packings)),
+        **licence_facts(rights),
+    )
+
+
+def _front(folder: DatasetFolder, manifest: Manifest, rights: Rights, title: str) -> dict[str, Any]:
+    files = [
+        {"split": split, "path": _patterns(manifest, split)}
+        for split in ("train", "validation", "test")
+        if any(shard.split == split for shard in manifest.shards)
+    ]
+    return {
+        **hub_licence(rights, link=folder.licences.name),
+        "pretty_name": title,
+        "size_categories": [_size_category(manifest.num_samples)],
+        "task_categories": ["other"],
+        "tags": list(_TAGS),
+        "configs": [{"config_name": "default", "data_files": files}],
+    }
+
+
+def _patterns(manifest: Manifest, split: str) -> list[str]:
+    names = [shard.name for shard in manifest.shards if shard.split == split]
+    patterns = {f"part-*/{split}-*.tar" if "/" in name else f"{split}-*.tar" for name in names}
+    return sorted(patterns, reverse=True)
+
+
+def _size_category(num_scenes: int) -> str:
+    """Return Hugging Face's name for a number of samples."""
+    bounds = [(1_000, "1K"), (10_000, "10K"), (100_000, "100K"), (1_000_000, "1M"), (10**7, "10M")]
+    below = "n"
+    for bound, name in bounds:
+        if num_scenes < bound:
+            return f"n<{name}" if below == "n" else f"{below}<n<{name}"
+        below = name
+    return "n>10M"
+
+
+def _by_split(manifest: Manifest, distributions: Distributions) -> list[Sequence[object]]:
+    """Return the cells of each split's row."""
+    rows: list[Sequence[object]] = []
+    for split in distributions.splits:
+        floors = {name: summary(distributions.values[split][name]) for name in MEASURED.values()}
+        num_views = int(floors["noise_floor_db"]["count"])
+        shards = [shard for shard in manifest.shards if shard.split == split]
+        reached = distributions.reaches_targets(split)
+        rows.append(
+            (
+                split,
+                sum(shard.num_samples for shard in shards),
+                num_views,
+                len(shards),
+                _three(floors, "median") + _probably(distributions, split) if num_views else "",
+                _three(floors, "p5") if num_views else "",
+                f"{reached.mean():.0%}" if reached is not None and num_views else "",
+                f"{distributions.views_at_cap.get(split, 0) / max(num_views, 1):.0%}",
+            )
+        )
+    return rows
+
+
+def _three(floors: Mapping[str, Mapping[str, float]], statistic: str) -> str:
+    log, linear, objects = (numbers[statistic] for numbers in floors.values())
+    return f"{log:.1f} ({linear:.1f}, {objects:.1f})"
+
+
+def _probably(distributions: Distributions, split: str) -> str:
+    """Return the median of the expected errors of a split behind a comma; empty without one."""
+    expected = summary(distributions.values[split]["expected_error_db"])
+    return f", probably {expected['median']:.1f}" if expected["count"] else ""
+
+
+def _user_maps(distributions: Distributions) -> list[tuple[str, int, int]]:
+    """Return how many of the user's textures and of the maps there are and are used, if any."""
+    rows = []
+    for kind, name in ((TEXTURE, "textures"), (SKY, "skies")):
+        uids = {entry.uid for entry in distributions.user_maps if entry.kind == kind}
+        if uids:
+            rows.append((name, len(uids), len(uids & set(distributions.map_uses))))
+    return rows
+
+
+def _arrays(packings: Collection[str]) -> list[str]:
+    """Return expressions for a sample's arrays; a merged dataset may have both packings."""
+    *rest, last = sorted(packings) or [PLAIN]
+    return [*(f'sample.get("{packing}")' for packing in rest), f'sample["{last}"]']
 
 
 def write_documents(dataset: Dataset, out: DatasetFolder | None = None) -> Statistics:

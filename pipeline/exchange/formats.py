@@ -22,11 +22,11 @@ from pipeline.exchange import renderformer_h5, renderformer_json
 from pipeline.exchange.from_description import AlbedoOverOne, scaled_albedo_notes
 from pipeline.exchange.gltf import write_gltf as gltf
 from pipeline.exchange.gltf.read_gltf import read_gltf
-from pipeline.exchange.loaded_scene import LoadedScene as LoadedScene
-from pipeline.exchange.loaded_scene import Pictures as Pictures
 from pipeline.exchange.renderformer_h5 import read_renderformer_h5, write_renderformer_h5
 from pipeline.exchange.renderformer_json import describe_scene
 from pipeline.exchange.scene_files import build_scene, read_scene_cameras, read_scene_description
+from pipeline.exchange.textured_triangles import LoadedScene as LoadedScene
+from pipeline.exchange.textured_triangles import Pictures as Pictures
 from pipeline.exchange.usd import write_usd as usd
 from pipeline.exchange.usd.read_usd import read_usd, usd_keys
 from pipeline.exchange.usd.write_usd import write_usd, write_usd_shard

@@ -139,6 +139,7 @@ class LoadedMesh:
     centre: NDArray[np.float64]  # [3] mean of the vertices in the file
     reach: float  # distance of the farthest vertex from `centre`
     unread: tuple[str, ...] = ()  # parts of the file that were ignored
+    sha256: str = ""  # digest of the file, in hex
 
 
 def scene_from_description(

@@ -4,14 +4,16 @@ import os
 from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
 
-from pipeline.exchange.loaded_scene import LoadedScene
 from pipeline.exchange.open_scene import scene_source
 from pipeline.exchange.reader import SceneReader
-from pipeline.exchange.select_samples import select_samples
+from pipeline.exchange.textured_triangles import LoadedScene
 from storage.atomic import write_atomically
-from storage.dataset.dataset import open_dataset
+from storage.conventions import SPLITS
+from storage.dataset.dataset import Dataset, open_dataset
+from storage.errors import TrilightError
 from storage.raycast.first_hits import require_row
 from storage.records.passes.pictures import passes_exr
+from storage.records.sample import Sample, sample_key
 
 _RESOLUTION = 256
 """Width and height in pixels for scenes without pictures."""
@@ -31,16 +33,11 @@ def write_passes(
     """Write `SCENE.VIEW.passes.exr` into a folder for each chosen view; return notes.
 
     With the resolution and the single ray of a dataset that stores the same passes, the files equal
-    the stored ones byte for byte.
-
-    Args:
-        source: a dataset (folder or URL), or a scene in any form that `trilight convert` reads.
-        out: the folder, which is created.
-        names: of the passes.
-        scene, view: key of the only scene, with or without zeros, and the only view; None for all.
-        resolution: width and height in pixels; None for that of the dataset's pictures, or 256.
-        rays_a_side: rays along each side of a pixel.
-        done: called with each written file.
+    the stored ones byte for byte. The source is a dataset (folder or URL), or a scene in any form
+    that `trilight convert` reads. A key, with or without zeros, and a view choose one; None stands
+    for all. The resolution, width and height in pixels, is by default that of the dataset's
+    pictures, or 256. `rays_a_side` are rays along each side of a pixel, and `done` is called with
+    each written file.
 
     Raises:
         TrilightError: the source is unusable, there is no such scene, view or pass, or the folder
@@ -76,3 +73,33 @@ def _scenes(source: str, key: str | None) -> Iterator[tuple[str, LoadedScene, in
         for each in reader.scenes_of(whole_source):
             name = each.path.stem if each.key is None else each.key
             yield name, reader.load(each), _RESOLUTION
+
+
+def select_samples(
+    dataset: Dataset, *, split: str | None = None, scene: str | None = None
+) -> Iterator[tuple[str, Sample]]:
+    """Yield (split, sample) of a dataset in its order, with pictures.
+
+    `split` and `scene` choose one; the key of a scene may lack the zeros before it.
+
+    Raises:
+        TrilightError: the split or scene does not exist, or the dataset is empty or damaged.
+    """
+    if split is not None and split not in SPLITS:
+        raise TrilightError(f"split is {split!r}; expected one of {', '.join(SPLITS)}.")
+    scene_key = sample_key(int(scene)) if scene is not None and scene.isdecimal() else scene
+    has_samples = False
+    for shard in dataset.manifest.shards:
+        if split not in (None, shard.split):
+            continue
+        keys = [key for key in dataset.keys(shard) if scene_key in (None, key)]
+        has_samples = has_samples or bool(keys)
+        for sample in dataset.read_samples(shard, keys):
+            yield shard.split, sample
+    if not has_samples:
+        which = f"scene {scene_key}" if scene_key else "scene"
+        where = "" if split is None else f" in split {split}"
+        raise TrilightError(
+            f"{dataset.display_name}: no {which}{where}; expected one of its "
+            f"{dataset.manifest.num_samples}. List them with `trilight inspect`."
+        )

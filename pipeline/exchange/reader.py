@@ -35,8 +35,7 @@ class SceneReader(contextlib.AbstractContextManager["SceneReader"]):
     def __init__(self, albedo_over_one: AlbedoOverOne = "scale") -> None:
         """Create the reader; the child starts with the first call.
 
-        Args:
-            albedo_over_one: treatment of albedos over 1 in RenderFormer's JSON.
+        Albedos over 1 in RenderFormer's JSON are treated so.
         """
         self._child = file_child()
         self._over_one = albedo_over_one
@@ -69,7 +68,7 @@ class SceneReader(contextlib.AbstractContextManager["SceneReader"]):
         """
         self._child.allow_files(reach(files=[path]))
         arguments = (path, path.name, path.name, AssetSettings(), licence)
-        mesh, _ = self._call(path.name, load_mesh_file, *arguments)
+        mesh = self._call(path.name, load_mesh_file, *arguments)
         if mesh.unread:
             log.warning("%s: not read: %s", path.name, "; ".join(mesh.unread))
         return mesh
@@ -121,8 +120,7 @@ def file_child(confined_to: Reach = NO_FILES) -> IsolatedChild:
 def unconfined_child(address_space: Callable[[int], int]) -> IsolatedChild:
     """Return an unconfined child with limits, for scenes that are already read; close it.
 
-    Args:
-        address_space: returns the memory limit for what the child renders with, of the usual one.
+    `address_space` returns the memory limit for what the child renders with, of the usual one.
     """
     memory_bytes = address_space(_LIMITS.memory_bytes)
     return IsolatedChild(limits=dataclasses.replace(_LIMITS, memory_bytes=memory_bytes))

@@ -10,9 +10,13 @@
 | `img` | f16 [V, H, W, 4] | linear radiance, premultiplied RGBA; where there are pictures |
 | `mvp` | f32 [V, 4, 4] | world to clip space, near 0.05, far 5; where there are pictures |
 
-- A texture fills its cells (x, y) with x + y <= 32, which are 559 of 1024; the others are zero.
-  Published files hold one value in all of them. Textures of a scene become cells, and varying cells
-  become textures (pipeline.exchange.renderformer_cells).
+- A texture lies in 32 x 32 cells as a right triangle: the column x of a cell is the weight of the
+  first vertex and its row y that of the second, in 32nds, so that the third vertex is at the corner
+  x = y = 0. The cells with x + y <= 32, which are 559 of 1024, hold the mean of the texture over
+  their area inside the triangle, those beyond it continue the texture; the others are zero.
+- Published files hold one value in all cells; the successor fills them. When read, every triangle
+  whose cells vary becomes a square of an atlas, with a border of one cell so that no look-up
+  touches a neighbor.
 - The normal channels are (.5, .5, 1): no bump, in the file's tangent space.
 - The texture of an emitter states diffuse (1, 1, 1) and roughness 1, as published, though emitters
   reflect nothing here (nor do the published ones when rendered).
@@ -38,15 +42,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from pipeline.exchange.loaded_scene import LoadedScene
-from pipeline.exchange.renderformer_cells import (
-    CELLS,
-    MAX_VARYING,
-    build_atlas,
-    compute_cells,
-    filled_cell_mask,
-    textured_triangles,
-)
+from pipeline.exchange.linear_maps import color_textures, number_texture
 from pipeline.exchange.safe_h5 import (
     iterate_blocks,
     list_names,
@@ -55,11 +51,12 @@ from pipeline.exchange.safe_h5 import (
     read_whole,
     require_finite,
 )
-from pipeline.exchange.textured_triangles import index_corners
+from pipeline.exchange.textured_triangles import LoadedScene, index_corners
 from storage.atomic import write_atomically
 from storage.errors import TrilightError
 from storage.records.environment import Environment
 from storage.records.exr import MAX_RESOLUTION, to_half
+from storage.records.lookup import texture_values
 from storage.records.material import (
     DIFFUSE,
     EMISSION,
@@ -69,6 +66,7 @@ from storage.records.material import (
     SPECULAR,
     default_rows,
     distinct_rows,
+    laid_out,
 )
 from storage.records.retextured import with_textures, without_constant_textures
 from storage.records.scene import (
@@ -78,7 +76,7 @@ from storage.records.scene import (
     Scene,
     SceneObject,
 )
-from storage.records.texture import CONSTANT, TEXTURED, MapSource
+from storage.records.texture import CONSTANT, TEXTURED, MapSource, Texture
 
 CARRIED = frozenset(
     {"vertex_positions", "vertex_normals", "faces", "material_index", "c2w", "fov_deg", "textures"}
@@ -109,9 +107,7 @@ def write_renderformer_h5(
     """Write a scene, and its pictures [V, R, R, 3] if given; equal scenes give equal bytes.
 
     The file appears whole or not at all; memory is its compressed size and one block of textures.
-
-    Returns:
-        Sentences about members in CARRIED that lose something.
+    Sentences about members in CARRIED that lose something are returned.
 
     Raises:
         TrilightError: a picture exceeds half floats, or the file cannot be written.
@@ -445,3 +441,95 @@ def _read_small(file: Any, name: str) -> NDArray[np.float32]:
         return read_whole(plain_array(file, name, (), 1))
     except TrilightError:
         return read_whole(plain_array(file, name, (None,), 16))
+
+
+CELLS = 32
+REFLECTED = 7
+"""Number of channels that a material may have textured: two colors and a roughness."""
+
+MAX_VARYING = 8192
+"""Maximum number of triangles whose cells become an atlas; each takes 28 kB meanwhile."""
+
+_BORDER = 1
+_TILE = CELLS + 2 * _BORDER
+_MOST_STEPS = 16  # maximum number of samples along the side of a cell
+
+
+def filled_cell_mask() -> NDArray[np.bool_]:
+    """Return a mask [32, 32] of the cells that hold a texture: those with x + y <= 32."""
+    x, y = np.meshgrid(np.arange(CELLS), np.arange(CELLS))
+    return x + y <= CELLS
+
+
+def textured_triangles(scene: Scene) -> NDArray[np.bool_]:
+    """Return a mask [T] of the triangles that have a texture and emit nothing."""
+    if scene.material_textures is None:
+        return np.zeros(scene.num_triangles, np.bool_)
+    textured = (scene.material_textures != CONSTANT).any(axis=1)
+    return np.asarray(textured[scene.material_index] & ~scene.triangle_emits)
+
+
+def compute_cells(scene: Scene, triangle: int) -> list[tuple[slice, NDArray[np.float32]]]:
+    """Return the channels and cells [C, 32, 32] of each textured column of a triangle."""
+    assert scene.material_textures is not None and scene.uv is not None
+    index = scene.material_textures[scene.material_index[triangle]]
+    uv = scene.uv.reshape(-1, 3, 2)[triangle].astype(np.float64)
+    column_slices = {column.name: part for column, part in laid_out()}
+    return [
+        (column_slices[name], _compute_means(scene.textures[row], uv))
+        for name, row in zip(TEXTURED, index, strict=True)
+        if row != CONSTANT
+    ]
+
+
+def _compute_means(texture: Texture, uv: NDArray[np.float64]) -> NDArray[np.float32]:
+    """Return the means [C, 32, 32] of a texture over the cells of a triangle with corners [3, 2].
+
+    Samples are as dense as the texels, up to 16 x 16 in a cell.
+    """
+    height, width = texture.texels.shape[:2]
+    edges = (uv[:2] - uv[2]) * [width, height] / CELLS  # in texels, along a cell
+    steps = int(np.clip(np.ceil(np.abs(edges).max()), 2, _MOST_STEPS))
+    offsets = (np.arange(steps) + 0.5) / steps
+    means = np.zeros((texture.channels, CELLS, CELLS), np.float32)
+    x, y = np.meshgrid(np.arange(CELLS), np.arange(CELLS))
+    for row in range(CELLS):  # one row of cells at a time: 131 k samples at most
+        columns = x[row][filled_cell_mask()[row]]
+        one = (columns[:, None, None] + offsets[None, None, :]) / CELLS
+        two = (y[row][: len(columns), None, None] + offsets[None, :, None]) / CELLS
+        one, two = np.broadcast_arrays(one, two)
+        weights = np.stack([one, two, 1 - one - two], axis=-1)
+        values = texture_values(texture, np.einsum("csuk,kd->csud", weights, uv))
+        inside = (weights[..., 2] >= -1e-9) | ~(weights[..., 2] >= -1e-9).any((1, 2), keepdims=True)
+        total = np.einsum("csu,csuk->ck", inside.astype(np.float64), values)
+        means[:, row, : len(columns)] = (total / inside.sum(axis=(1, 2))[:, None]).T
+    return means
+
+
+def build_atlas(
+    cells: NDArray[np.float32], source: MapSource
+) -> tuple[tuple[Texture, Texture, Texture], NDArray[np.float32]]:
+    """Return cells [N, 7, 32, 32] as textures of 8 bits: diffuse, specular and roughness.
+
+    The second value has the texture coordinates [N, 3, 2] of the corners of each triangle.
+
+    The diffuse albedo is lowered where both add up to more than 1. Cells that no look-up reaches
+    get the mean of the others, so that a texture's mean is that of its triangles.
+    """
+    count = len(cells)
+    across = int(np.ceil(np.sqrt(count)))
+    up = -(-count // across)
+    inner = np.moveaxis(np.clip(cells, 0, 1), 1, -1)
+    means = inner[:, filled_cell_mask()].mean(axis=1)
+    inner = np.where(filled_cell_mask()[..., None], inner, means[:, None, None])
+    tiles = np.zeros((across * up, _TILE, _TILE, REFLECTED), np.float32) + means.mean(axis=0)
+    tiles[:count] = np.pad(inner, ((0, 0), (_BORDER, _BORDER), (_BORDER, _BORDER), (0, 0)), "edge")
+    sheet = tiles.reshape(up, across, _TILE, _TILE, REFLECTED).swapaxes(1, 2)
+    sheet = sheet.reshape(up * _TILE, across * _TILE, REFLECTED)
+    colors = color_textures(sheet[..., DIFFUSE], sheet[..., SPECULAR], source)
+    roughness = number_texture(sheet[..., ROUGHNESS : ROUGHNESS + 1], source)
+    row, column = np.divmod(np.arange(count), across)
+    corner = np.stack([column, row], axis=-1)[:, None] * _TILE + _BORDER
+    offsets = np.array([[CELLS, 0], [0, CELLS], [0, 0]])
+    uv = (corner + offsets) / [across * _TILE, up * _TILE]
+    return (*colors, roughness), uv.astype(np.float32)

@@ -127,9 +127,10 @@ def build_scene(
             path = _below(root, described.mesh_path, where)
             uid = path.relative_to(root).as_posix()
             display_name = f"{where} is {described.mesh_path}"
-            meshes[key], digests[uid] = load_mesh_file(
+            meshes[key] = load_mesh_file(
                 path, uid, display_name, settings, licence, described.remesh_faces
             )
+            digests[uid] = meshes[key].sha256
             if notes is not None:
                 notes += (f"{uid}: {text}" for text in meshes[key].unread)
     scene = scene_from_description(
@@ -161,33 +162,46 @@ def load_mesh_file(
     settings: AssetSettings,
     licence: str,
     remesh_faces: int | None = None,
-) -> tuple[LoadedMesh, str]:
-    """Read the mesh of a scene, and the sha256 of its file; only child processes call this.
+) -> LoadedMesh:
+    """Read the mesh of a scene; only child processes call this.
 
-    The mesh gets the identifier `uid`; messages call it `display_name`. `remesh_faces` is the
-    maximum number of triangles after remeshing; None keeps the mesh.
+    A scene file states where each vertex lies: unlike objects for random scenes, its meshes are not
+    centered, welded, repaired or flipped. The mesh gets the identifier `uid`; messages call it
+    `display_name`. `remesh_faces` is the maximum number of triangles after remeshing; None keeps
+    the mesh.
 
     Raises:
         TrilightError: the file is not a usable mesh, or cannot be read.
     """
-    from pipeline.assets.scene_mesh import load_scene_mesh  # mesh libraries: in children only
+    from pipeline.assets.cleaning.clean import check_raw
+    from pipeline.foreign.source_file import load_mesh, read_source
 
     try:
-        loaded = load_scene_mesh(path, settings, remesh_faces)
+        source = read_source(path, settings.read_limits)
+        raw = load_mesh(source)
+        check_raw(raw, settings, is_single=source.is_single)
+        if not np.isfinite(raw.positions).all():
+            raise Rejected("nonfinite_vertices", "a vertex without a triangle is not finite")
+        mesh = raw
+        if remesh_faces is not None:
+            from pipeline.assets.scene_mesh import remesh  # mesh libraries: in children only
+
+            mesh = remesh(raw, remesh_faces)
     except Rejected as rejection:
         raise TrilightError(f"{display_name}: {rejection}; expected a usable mesh.") from rejection
     except OSError as error:
         raise TrilightError(f"{display_name}: cannot be read ({error.strerror}).") from error
-    mesh = LoadedMesh(
+    centre = raw.positions.mean(axis=0)
+    return LoadedMesh(
         uid=uid,
         licence=licence,
-        positions=loaded.mesh.positions,
-        faces=loaded.mesh.faces,
-        centre=loaded.centre,
-        reach=loaded.reach,
-        unread=loaded.unread,
+        positions=mesh.positions,
+        faces=mesh.faces,
+        centre=centre,
+        reach=float(np.sqrt(np.sum(np.square(raw.positions - centre), axis=1).max())),
+        unread=source.unread,
+        sha256=source.sha256,
     )
-    return mesh, loaded.sha256
 
 
 def _read_scene_file(root: Path, name: str) -> bytes:

@@ -1,7 +1,8 @@
 """Joins triangles with materials and textures, and cameras, of other programs to a Scene.
 
 Each triangle has three separate corners. Corners of equal position and normal become one vertex,
-and equal materials one row. Textures of one color become constants.
+and equal materials one row. Textures of one color become constants. `LoadedScene` is what every
+reader of a scene format returns.
 """
 
 import dataclasses
@@ -29,6 +30,22 @@ from storage.records.material import (
 from storage.records.retextured import with_textures
 from storage.records.scene import ObjectKind, Scene, SceneObject
 from storage.records.texture import CONSTANT, TEXTURED, Texture
+
+Pictures = NDArray[np.float32] | None
+"""[V, R, R, 3] linear radiance of all views, or None."""
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class LoadedScene:
+    """A scene that was read, with notes on what it lacks."""
+
+    scene: Scene
+    """The scene, which passes `Scene.check`."""
+    notes: tuple[str, ...]
+    """Sentences about unknown fields of the file and what could not be read."""
+    radiance_rgb: Pictures = None
+    """Pictures of all views, where they were requested and the source has them."""
+
 
 TextureSet = tuple[Texture | None, Texture | None, Texture | None]
 """Textures in the order of TEXTURED; None where the material column is the value."""

@@ -52,8 +52,7 @@ class RequestGuard:
     def __init__(self, inner: Application, names: Collection[str]) -> None:
         """Guard an application.
 
-        Args:
-            names: host names of this server, beside localhost and addresses.
+        `names` are host names of this server, beside localhost and addresses.
         """
         self._inner = inner
         self._names = {"localhost", *(name.lower() for name in names)}

@@ -15,9 +15,10 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from pipeline.foreign.gltf.document import GltfDocument, open_gltf
+from pipeline.foreign.gltf.primitives import gltf_mesh
 from pipeline.foreign.limits import SUFFIXES, USD_SUFFIXES, ReadLimits
 from pipeline.foreign.material_files import MaterialFiles, SourceFolder, obj_files
-from pipeline.foreign.mesh import FileMesh
+from pipeline.foreign.mesh import FileMesh, TriangleMesh
 from pipeline.foreign.obj import read_obj
 from pipeline.foreign.off import read_off
 from pipeline.foreign.ply import check_face_count, list_ply_pictures, read_ply
@@ -108,12 +109,8 @@ def needs_child(path: Path) -> bool:
 def read_source(path: Path, limits: ReadLimits, root: Path | None = None) -> SourceFile:
     """Return a source after the checks that need no mesh library.
 
-    Call it in a child process where `needs_child` says so.
-
-    Args:
-        path: the file.
-        limits: bounds beyond which the source is refused.
-        root: folder below which pictures and materials may lie; that of the file by default.
+    Call it in a child process where `needs_child` says so. Pictures and materials may lie below
+    `root`, by default the folder of the file.
 
     Raises:
         Rejected: missing_file, unsupported_format, too_large_bytes, archive_refused,
@@ -190,3 +187,28 @@ def _read_regular(path: Path, max_bytes: int) -> bytes:
         return path.read_bytes()
     except (FileNotFoundError, NotADirectoryError) as error:
         raise Rejected("missing_file", f"there is no file {path.name!r}") from error
+
+
+def load_mesh(source: SourceFile) -> TriangleMesh:
+    """Return all triangles of a source in its own units, node transforms applied, +Z up.
+
+    glTF defines +Y as up and is rotated. USD states its up axis and its units, and is converted to
+    meters. The other formats define neither and stay as they are. The vertices are as the file has
+    them: unwelded, some unused, possibly not finite.
+
+    Raises:
+        Rejected: load_error, index_range, point_cloud, no_faces, header_size_mismatch, cut_off; of
+            glTF also unsupported_accessor; of USD also too_many_faces and offset_precision.
+    """
+    if source.usd is not None:
+        return source.usd.mesh
+    if source.gltf is not None:
+        return gltf_mesh(source.gltf)
+    mesh = source.contents.mesh
+    unread = "; ".join(source.contents.unread)
+    if len(mesh.faces) == 0:
+        reason = "point_cloud" if len(mesh.positions) and not unread else "no_faces"
+        raise Rejected(
+            reason, "the file holds no triangles" + (f"; not read: {unread}" if unread else "")
+        )
+    return mesh

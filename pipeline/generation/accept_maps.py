@@ -100,8 +100,7 @@ def accept_maps(
 ) -> AcceptedMaps:
     """Prepare the textures and maps of folders.
 
-    Args:
-        workers: number of files that are decoded at the same time.
+    `workers` files are decoded at the same time.
 
     Raises:
         TrilightError: a folder is missing or empty, none of its files can be used, or the cache

@@ -21,12 +21,7 @@ from pipeline.renders.mitsuba_variant import device_of
 from pipeline.shards.pack_shards import (
     PLANNED,
     PublishedShards,
-    adopt,
-    fetch,
-    fetch_lock,
-    merge_failures,
     publish_plan,
-    published_head,
     unpack_here,
 )
 from storage.atomic import write_atomically
@@ -164,13 +159,13 @@ class DatasetWriter:
         Another worker may have made the file in the meantime: then it is here. The holder publishes
         it. Only one process of a machine holds a claim at a time.
         """
-        fetch(self.folder, self.store, path)
+        self._shards.fetch(path)
         if path.exists():
             yield True
             return
         with self.store.hold_lock(self.folder.name_of(path)) as ours:
             if ours:
-                fetch(self.folder, self.store, path)  # its last holder may have published it
+                self._shards.fetch(path)  # its last holder may have published it
             yield ours
 
     def frozen_objects(self) -> dict[str, LockedObject] | None:
@@ -192,7 +187,7 @@ class DatasetWriter:
         theirs = self.store.get(name)
         with self._lock_manifest():
             if theirs in (None, lock):
-                merge_failures(self.folder, self.store)
+                self._shards.merge_failures()
                 self.publish(self.folder.failures)
             if theirs is None and not self.store.create_if_absent(name, lock):
                 theirs = self.store.get(name)
@@ -210,9 +205,9 @@ class DatasetWriter:
         """Take over the lock and its index if another worker has frozen the objects."""
         if self.manifest.objects_lock_sha256:
             return
-        head = published_head(self.folder, self.store)
+        head = self._shards.read_published_head()
         if head and head.objects_lock_sha256:
-            fetch_lock(self.folder, self.store, head.objects_lock_sha256)
+            self._shards.fetch_lock(head.objects_lock_sha256)
             with self._lock_manifest():
                 self._write(objects_lock_sha256=head.objects_lock_sha256)
 
@@ -348,10 +343,10 @@ class DatasetWriter:
         """List all shards in the manifest of the folder, and clear the notes away."""
         folder = self.folder
         if not self.store.is_here:  # what the bucket's manifest lists is no news
-            merge_failures(folder, self.store)
+            self._shards.merge_failures()
             theirs = published_manifest(self.store)
             if self.left_to_others:
-                fetch_lock(folder, self.store, theirs.objects_lock_sha256)
+                self._shards.fetch_lock(theirs.objects_lock_sha256)
             else:
                 theirs = dataclasses.replace(self.manifest, shards=theirs.shards)
             write_manifest(folder.manifest, theirs)
@@ -500,7 +495,7 @@ def begin_or_resume_dataset(
             )
             write_manifest(folder.manifest, manifest)
         if is_new and not store.create_if_absent(folder.manifest.name, folder.manifest):
-            adopt(folder, store)  # another machine was first
+            PublishedShards(folder, store).adopt()  # another machine was first
         manifest = read_head(folder.manifest)
         _require_same_dataset(folder, manifest, settings, environment, accept_environment)
         writer = DatasetWriter(store, folder, manifest, settings.splits)

@@ -1,22 +1,454 @@
-"""Makes a dataset of finished datasets: its shards, then its documents.
+"""Makes a dataset of finished ones, by merging, selecting or resharding: shards, then documents.
 
-It is written into a hidden folder beside its path, which is renamed when it is complete. A killed
-run leaves that folder, and the next one clears it.
+The keys of the first source stay; each following source's keys are raised by one number, which the
+manifest states as `key_offset`. So every scene can be found in its source, and keys are unique.
+Members are copied byte for byte under their new keys, one sample at a time. The result depends on
+the sources, their order and the arguments alone. It is written into a hidden folder beside its
+path, which is renamed when it is complete. A killed run leaves that folder, and the next one clears
+it.
 """
 
+import dataclasses
+import itertools
 import os
 import shutil
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from dataclasses import dataclass
 from pathlib import Path
+from typing import Any, Literal
+
+import numpy as np
 
 from pipeline.documents.dataset_documents import write_documents
-from pipeline.shards.derive import DeriveOptions, derive_shards
-from pipeline.shards.finished_dataset import open_finished
+from pipeline.shards.expression import Condition, condition
+from pipeline.shards.finished_dataset import FinishedDataset, SceneFacts, open_finished, read_facts
 from storage.atomic import write_error
+from storage.conventions import MANIFEST_VERSION, SPLITS
 from storage.dataset.dataset import open_dataset
+from storage.dataset.derived import (
+    Derivation,
+    common,
+    derivation_of,
+    derived_settings,
+    source_record,
+)
 from storage.dataset.layout import DatasetFolder
+from storage.dataset.manifest import Manifest, ShardEntry, index_shard, write_manifest
+from storage.dataset.shard import write_shard
+from storage.dataset.splits import named_shard
 from storage.dataset.statistics import Statistics
+from storage.digests import canonical_json, sha256_hex
 from storage.errors import TrilightError
+from storage.records.objects import (
+    Failure,
+    LockedObject,
+    encode_objects_lock,
+    write_failures,
+    write_objects_lock,
+)
+from storage.records.quantities import QUANTITIES
+from storage.records.sample import sample_key
+
+
+@dataclass(frozen=True, kw_only=True)
+class Selection:
+    """Conditions that a selected scene must meet; by default none."""
+
+    split: str | None = None  # take only scenes of this split
+    template: str | None = None  # take only scenes of this layout
+    min_noise_floor_db: float | None = None
+    """Take only scenes whose views all have at least this stated error (psnr_log_db)."""
+    where: str | None = None
+    """Take only scenes for which this condition holds (pipeline.shards.expression)."""
+
+    def __post_init__(self) -> None:
+        if self.split not in (None, *SPLITS):
+            raise TrilightError(f"--split is {self.split!r}; expected one of {', '.join(SPLITS)}.")
+        if self.where is not None:
+            self.condition()
+
+    def condition(self) -> Condition | None:
+        """Return the parsed `where`, or None; raises TrilightError if it is malformed."""
+        return None if self.where is None else condition(self.where)
+
+    def takes(self, facts: SceneFacts) -> bool:
+        return (
+            self.split in (None, facts.shard.split)
+            and self.template in (None, facts.template)
+            and (self.min_noise_floor_db is None or facts.noise_floor_db >= self.min_noise_floor_db)
+        )
+
+
+@dataclass(frozen=True, kw_only=True)
+class SelectedScene:
+    """One scene of the new dataset."""
+
+    source: int  # number of its source, from 0
+    facts: SceneFacts  # its facts in the source
+    key: str  # its new key
+
+
+def select_scenes(
+    sources: Sequence[FinishedDataset],
+    offsets: Sequence[int],
+    selection: Selection,
+    *,
+    value_names: Sequence[str] = (),
+    shard_done: Callable[[], None],
+) -> list[SelectedScene]:
+    """Return the selected scenes, in the order of the sources and of their shards.
+
+    `offsets` are added to the keys of each source. Beside the values of the condition, those of
+    `value_names` are read.
+
+    Raises:
+        TrilightError: two sources hold the same scene, or a source is damaged.
+    """
+    where = selection.condition()
+    names = {*value_names, *(where.names if where else ())}
+    selected: list[SelectedScene] = []
+    seen: dict[str, SelectedScene] = {}
+    for row, source in enumerate(sources):
+        for facts in read_facts(source, names=names, shard_done=shard_done):
+            if not selection.takes(facts) or not (where is None or where.holds(facts.values)):
+                continue
+            entry = SelectedScene(source=row, facts=facts, key=offset_key(facts.key, offsets[row]))
+            first = seen.setdefault(facts.arrays_sha256, entry)
+            if first.source != row:
+                raise TrilightError(
+                    f"scene {facts.key} of {source.folder.root} is scene {first.facts.key} of "
+                    f"{sources[first.source].folder.root}; expected each scene once. Leave one of "
+                    "the datasets out, or generate it with another --seed."
+                )
+            selected.append(entry)
+    return selected
+
+
+def key_offsets(sources: Sequence[FinishedDataset]) -> list[int]:
+    """Return the offset of the keys of each source: 0, then beyond all keys before.
+
+    Scenes that could not be made count too: `failures.jsonl` names them.
+    """
+    offsets = []
+    following = 0
+    for source in sources:
+        offsets.append(following)
+        following += max(_last_key(source) + 1, source.manifest.num_scenes)
+    return offsets
+
+
+def _last_key(source: FinishedDataset) -> int:
+    """Return the largest key of a derived dataset; -1 for a generated one (keys are indices)."""
+    if not derivation_of(source.manifest.settings):
+        return -1
+    keys = (key for shard in source.manifest.shards for key in source.keys(shard))
+    return max((int(key) for key in keys if key.isdecimal()), default=-1)
+
+
+def offset_key(key: str, offset: int) -> str:
+    """Return a key raised by an offset; raises TrilightError if it is not a number."""
+    if not offset:
+        return key
+    if not (key.isascii() and key.isdecimal()):
+        raise TrilightError(f"sample {key!r}: expected a number as key, to raise it by {offset}.")
+    return sample_key(int(key) + offset)
+
+
+def used_objects(
+    sources: Sequence[FinishedDataset], selected: Sequence[SelectedScene]
+) -> list[LockedObject]:
+    """Return the locked objects that the selected scenes use.
+
+    Raises:
+        TrilightError: an object is in scenes of two splits, known by its uid or by its asset: what
+            is learnt from one would be judged on the other. Or an object is in no lock.
+    """
+    splits: dict[str, tuple[str, SelectedScene]] = {}
+    used: dict[LockedObject, None] = {}
+    for entry in selected:
+        source = sources[entry.source]
+        for uid in entry.facts.uids:
+            if uid not in source.objects:
+                raise TrilightError(
+                    f"{source.folder.root}: object {uid!r} of scene {entry.facts.key} is not in "
+                    "objects.lock.jsonl; run `trilight verify`."
+                )
+            for locked in source.objects[uid]:
+                used[locked] = None
+                for name in (f"uid {uid}", f"asset {locked.asset_sha256}"):
+                    split, first = splits.setdefault(name, (entry.facts.shard.split, entry))
+                    if split != entry.facts.shard.split:
+                        raise TrilightError(_leak(uid, sources, first, entry))
+    return list(used)
+
+
+def _leak(
+    uid: str, sources: Sequence[FinishedDataset], first: SelectedScene, second: SelectedScene
+) -> str:
+    places = " and in ".join(
+        f"{entry.facts.shard.split} of {sources[entry.source].folder.root} (scene "
+        f"{entry.facts.key})"
+        for entry in (first, second)
+    )
+    return (
+        f"object {uid!r} is in {places}; expected every object in one split only. Generate both "
+        "with the same splits.held_out_objects, or take one split of each with `trilight shards "
+        "select` first."
+    )
+
+
+def even_shards(
+    selected: Sequence[SelectedScene], scenes_per_shard: int
+) -> list[list[SelectedScene]]:
+    """Return the scenes of each split in shards of one size; the last of a split may be smaller.
+
+    Shards are ordered by their first scene, so that numbers follow keys.
+
+    Raises:
+        TrilightError: the size is below 1.
+    """
+    if scenes_per_shard < 1:
+        raise TrilightError(f"--scenes-per-shard is {scenes_per_shard}; expected at least 1.")
+    of_split: Mapping[str, list[SelectedScene]] = {
+        split: [entry for entry in selected if entry.facts.shard.split == split] for split in SPLITS
+    }
+    shards = [
+        entries[start : start + scenes_per_shard]
+        for entries in of_split.values()
+        for start in range(0, len(entries), scenes_per_shard)
+    ]
+    return sorted(shards, key=lambda entries: entries[0].key)
+
+
+_TEXTS = ("split", "template")
+_COLUMNS = {
+    "triangles_per_scene": ("triangles", np.min),
+    "lights_per_scene": ("lights", np.min),
+    "coverage": ("coverage", np.min),
+    "noise_floor_db": ("floor", np.min),
+    "noise_floor_linear_db": ("linear", np.min),
+    "spp": ("spp", np.max),
+}
+"""Quantities with the name of their column, and the function that reduces several values."""
+
+
+def list_scenes(
+    source: FinishedDataset,
+    selection: Selection,
+    *,
+    progress: Callable[[int, int], None] = lambda done, total: None,
+) -> list[dict[str, object]]:
+    """Return a row for each scene that a selection takes, in the order of the shards.
+
+    `progress` is called with the number of shards read so far, and the total.
+
+    Raises:
+        TrilightError: a shard is damaged.
+    """
+    done = itertools.count(1)
+    total = len(source.manifest.shards)
+    selected = select_scenes(
+        [source],
+        [0],
+        selection,
+        value_names=(*_TEXTS, *_COLUMNS),
+        shard_done=lambda: progress(next(done), total),
+    )
+    return [{"key": entry.key, **_row(entry.facts.values)} for entry in selected]
+
+
+def _row(values: Mapping[str, Any]) -> dict[str, object]:
+    row: dict[str, object] = {name: values[name] for name in _TEXTS}
+    for name, (column, of_several) in _COLUMNS.items():
+        number = round(float(of_several(values[name])), QUANTITIES[name].digits)
+        row[column] = number if QUANTITIES[name].digits else int(number)
+    return row
+
+
+Operation = Literal["merge", "select", "reshard"]
+
+_SAME = (
+    "renders.resolution",
+    "renders.per_light",
+    "renders.split",
+    "renders.split_lobes",
+    "storage.passes",
+)
+"""Settings that all samples of a dataset share."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class DeriveOptions:
+    """Operation on finished datasets, with its arguments."""
+
+    operation: Operation  # what it is called
+    selection: Selection = dataclasses.field(default_factory=Selection)  # which scenes are taken
+    scenes_per_shard: int | None = None
+    """Scenes of each new shard; `merge` keeps shards, `select` fills them as its source does."""
+
+    @property
+    def arguments(self) -> dict[str, Any]:
+        """The user's arguments, as the manifest states them."""
+        arguments = {
+            **dataclasses.asdict(self.selection),
+            "scenes_per_shard": self.scenes_per_shard,
+        }
+        return {name: value for name, value in arguments.items() if value is not None}
+
+
+def derive_shards(
+    sources: Sequence[FinishedDataset],
+    derive: DeriveOptions,
+    out: DatasetFolder,
+    *,
+    progress: Callable[[int, int], None] = lambda done, total: None,
+) -> None:
+    """Write shards, lock, failures and manifest of the new dataset; the manifest comes last.
+
+    `select` and `reshard` take one source, and `out` is an empty folder. `progress` is called with
+    the number of shards read or written so far, and the total.
+
+    Raises:
+        TrilightError: the sources do not fit together, one is damaged, nothing is selected, an
+            object would be in two splits, or the disk is full.
+    """
+    _require_alike(sources)
+    total = sum(len(source.manifest.shards) for source in sources)
+    done = itertools.count(1)
+    offsets = key_offsets(sources)
+    selected = select_scenes(
+        sources, offsets, derive.selection, shard_done=lambda: progress(next(done), total)
+    )
+    if not selected:
+        num_scenes = sum(source.manifest.num_samples for source in sources)
+        raise TrilightError(f"none of the {num_scenes} scenes is selected; expected at least one.")
+    objects = sorted(
+        used_objects(sources, selected), key=lambda row: canonical_json(dataclasses.asdict(row))
+    )
+    groups, scenes_per_shard = _group_scenes(sources, derive, selected)
+    write_objects_lock(out.objects_lock, objects)
+    write_failures(out.failures, _failures(sources, offsets, selected))
+    shards = []
+    for number, group in enumerate(groups):
+        name = named_shard(number, group[0].facts.shard.split)
+        write_shard(out.shard(name), _samples(sources, group))
+        shards.append(index_shard(out.shard(name)))
+        progress(next(done), total + len(groups))
+    derivation = Derivation(
+        operation=derive.operation,
+        arguments=derive.arguments,
+        sources=[
+            source_record(source.manifest, key_offset=offset)
+            for source, offset in zip(sources, offsets, strict=True)
+        ],
+    )
+    settings = derived_settings(derivation, scenes_per_shard=scenes_per_shard)
+    write_manifest(out.manifest, _manifest(sources, settings, objects, tuple(shards)))
+
+
+def _group_scenes(
+    sources: Sequence[FinishedDataset], derive: DeriveOptions, selected: Sequence[SelectedScene]
+) -> tuple[list[list[SelectedScene]], int | None]:
+    """Return the scenes of each new shard, and the shard size if it is not the sources'."""
+    if derive.operation == "merge":
+        groups: dict[tuple[int, str], list[SelectedScene]] = {}
+        for entry in selected:
+            groups.setdefault((entry.source, entry.facts.shard.name), []).append(entry)
+        return list(groups.values()), None
+    size = derive.scenes_per_shard
+    if size is None:
+        size = max(shard.num_samples for shard in sources[0].manifest.shards)
+    return even_shards(selected, size), size
+
+
+def _samples(
+    sources: Sequence[FinishedDataset], group: Sequence[SelectedScene]
+) -> Iterator[tuple[str, Mapping[str, bytes]]]:
+    for (source, _), entries in itertools.groupby(
+        group, key=lambda entry: (entry.source, entry.facts.shard.name)
+    ):
+        first, *following = entries
+        with sources[source].open_shard(first.facts.shard, checked=True) as opened:
+            for entry in (first, *following):
+                yield entry.key, opened.members(entry.facts.key)
+
+
+def _manifest(
+    sources: Sequence[FinishedDataset],
+    settings: Mapping[str, Any],
+    objects: Sequence[LockedObject],
+    shards: tuple[ShardEntry, ...],
+) -> Manifest:
+    manifests = [source.manifest for source in sources]
+    builds = {manifest.build for manifest in manifests}
+    return dataclasses.replace(
+        manifests[0],
+        build=builds.pop() if len(builds) == 1 else "merged",
+        settings=settings,
+        environment=_environment(manifests),
+        extensions=_extensions(manifests),
+        num_scenes=sum(shard.num_samples for shard in shards),
+        schema_version=MANIFEST_VERSION,
+        objects_lock_sha256=sha256_hex(encode_objects_lock(objects)),
+        shards=shards,
+    )
+
+
+def _environment(manifests: Sequence[Manifest]) -> Mapping[str, Any]:
+    """Return the common environment of all sources; if they differ, also that of each."""
+    environments = [dict(manifest.environment) for manifest in manifests]
+    if all(environment == environments[0] for environment in environments):
+        return environments[0]
+    return {**common(environments), "of_sources": environments}
+
+
+def _extensions(manifests: Sequence[Manifest]) -> Mapping[str, str]:
+    """Return the extensions of all sources; one name may have several digests."""
+    digests: dict[str, set[str]] = {}
+    for manifest in manifests:
+        for name, sha256 in manifest.extensions.items():
+            digests.setdefault(name, set()).update(sha256.split(" "))
+    return {name: " ".join(sorted(several)) for name, several in sorted(digests.items())}
+
+
+def _failures(
+    sources: Sequence[FinishedDataset], offsets: Sequence[int], selected: Sequence[SelectedScene]
+) -> list[Failure]:
+    """Return the rejections of the selected scenes, and of objects.
+
+    A given-up scene is never selected. `merge` and `reshard`, which select all scenes, keep its
+    rejections too.
+    """
+    keys = {(entry.source, entry.facts.key) for entry in selected}
+    held = sum(source.manifest.num_samples for source in sources)
+    rows = []
+    for row, (source, offset) in enumerate(zip(sources, offsets, strict=True)):
+        for failure in source.failures():
+            key, dot, view = failure.item.partition(".")
+            if failure.stage not in ("scenes", "renders"):
+                rows.append(failure)
+            elif (row, key) in keys or held == len(selected):
+                item = f"{offset_key(key, offset)}{dot}{view}"
+                rows.append(dataclasses.replace(failure, item=item))
+    return rows
+
+
+def _require_alike(sources: Sequence[FinishedDataset]) -> None:
+    def facts(source: FinishedDataset) -> dict[str, Any]:
+        of = source.manifest
+        pairs = ((name, *name.split(".")) for name in _SAME)
+        settings = {name: of.settings.get(a, {}).get(b, False) for name, a, b in pairs}
+        return {"number of views": of.num_views, **settings}
+
+    first = sources[0]
+    expected = facts(first)
+    for other in sources[1:]:
+        for name, now in facts(other).items():
+            if (before := expected[name]) != now:
+                raise TrilightError(
+                    f"{other.folder.root}: its {name} is {now}; expected {before}, as "
+                    f"{first.folder.root} has it. Generate one of them again."
+                )
 
 
 def derive_dataset(
@@ -26,17 +458,12 @@ def derive_dataset(
     *,
     progress: Callable[[int, int], None] = lambda done, total: None,
 ) -> tuple[str, Statistics]:
-    """Make a dataset of finished ones by merging, selecting or resharding.
+    """Make a dataset of finished ones; return its digest and its statistics.
 
-    Args:
-        out: folder of the new dataset, which must not exist or be empty.
-        progress: called with the number of shards read or written so far, and the total.
-
-    Returns:
-        The dataset digest, and the statistics of the dataset.
+    `out` must not exist or be empty; `progress` is as in `derive_shards`.
 
     Raises:
-        TrilightError: as `pipeline.shards.derive.derive_shards`, or `out` is not empty.
+        TrilightError: as `derive_shards`, or `out` is not empty.
     """
     out = Path(os.path.realpath(out))
     if out.exists() and (not out.is_dir() or any(out.iterdir())):

@@ -122,9 +122,7 @@ class SplitPool(Sequence[PooledAsset]):
 def user_maps(rows: Iterable[tuple[LockedObject, Path]], split: str) -> OwnMaps:
     """Return the maps that scenes of a split may use, sorted by uid; no file is read yet.
 
-    Args:
-        rows: rows of a lock with the prepared files; objects among them are left out.
-        split: train, validation or test.
+    Objects among the rows are left out.
     """
     of_split = sorted(
         ((locked, path) for locked, path in rows if locked.split == split),

@@ -12,8 +12,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from pipeline.exchange.open_scene import SceneSource, load_source
-from pipeline.exchange.reader import file_child, reach_of, unconfined_child
+from pipeline.exchange.open_scene import SceneSource
+from pipeline.exchange.reader import SceneReader, unconfined_child
 from pipeline.isolation import ChildFailed, call_with_retries
 from pipeline.renders.mitsuba_variant import Variant, activate, choose_variant
 from pipeline.renders.settings import RenderSettings
@@ -55,38 +55,33 @@ def inspect_scene(source: SceneSource, turntable: Path | None) -> InspectedScene
     """
     if turntable is not None and turntable.suffix.lower() != ".png":
         raise TrilightError(f"--turntable is {turntable}; expected the name of a file X.png.")
-    child = file_child(reach_of(source))
     try:
-        inspected = call_with_retries(child, _facts, source)
+        with SceneReader() as reader:
+            loaded = reader.load(source)
+        notes = list(loaded.notes)
         if turntable is not None:
             from pipeline.documents.png import encode_png
 
-            scene = call_with_retries(child, load_source, source).scene
             variant = choose_variant("auto")
             with contextlib.closing(unconfined_child(variant.address_space)) as renderer:
-                sheet = call_with_retries(renderer, _turntable, scene, variant)
+                sheet = call_with_retries(renderer, _turntable, loaded.scene, variant)
             write_atomically(turntable, encode_png(sheet))
             if variant.note:
-                note = f"{variant.note}; see trilight doctor"
-                inspected = dataclasses.replace(inspected, notes=(*inspected.notes, note))
+                notes.append(f"{variant.note}; see trilight doctor")
     except ChildFailed as failure:
         raise TrilightError(f"{source.name}: cannot be inspected ({failure}).") from failure
     except Rejected as rejection:
         raise TrilightError(f"{source.name}: cannot be rendered ({rejection}).") from rejection
-    finally:
-        child.close()
-    return inspected
+    return InspectedScene(facts=_facts(loaded.scene), notes=tuple(notes))
 
 
-def _facts(source: SceneSource) -> InspectedScene:
-    loaded = load_source(source)
-    scene = loaded.scene
+def _facts(scene: Scene) -> dict[str, Any]:
     low = scene.vertex_positions.min(axis=0)
     high = scene.vertex_positions.max(axis=0)
     kinds = Counter(entry.kind for entry in scene.objects)
     licences = Counter(scene.licences)
     added = unread_columns(scene.materials, PUBLISHED_COLUMNS)
-    facts = {
+    return {
         "triangles": scene.num_triangles,
         "vertices": len(scene.vertex_positions),
         "objects": ", ".join(f"{count} {kind}" for kind, count in sorted(kinds.items())),
@@ -102,7 +97,6 @@ def _facts(source: SceneSource) -> InspectedScene:
         "made_by": str(scene.provenance.get("template", "unknown")),
         "scene_digest": scene_digest(scene),
     }
-    return InspectedScene(facts=facts, notes=loaded.notes)
 
 
 def _maps(scene: Scene) -> dict[str, Any]:

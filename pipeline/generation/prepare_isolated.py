@@ -51,8 +51,7 @@ class MeshWork:
     def __init__(self, settings: AssetSettings, workers: int) -> None:
         """Configure the children; each starts when an object needs it.
 
-        Args:
-            workers: number of objects that are prepared at the same time.
+        `workers` objects are prepared at the same time.
         """
         self._settings = settings
         self._workers = workers

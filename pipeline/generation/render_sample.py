@@ -99,8 +99,7 @@ def render_sample(
 ) -> Sample:
     """Render every view of a scene.
 
-    Args:
-        failures: receives a row for each camera that was rejected and replaced.
+    `failures` receives a row for each camera that was rejected and replaced.
 
     Raises:
         Rejected: the scene cannot be rendered, or a view has no camera left.

@@ -72,10 +72,8 @@ NO_FILES = Reach()
 def reach(*, files: Iterable[Path] = (), writes: Iterable[Path] = ()) -> Reach:
     """Return the reach of a child that reads some files with their folders, and writes others.
 
-    Args:
-        files: files or folders to read. A file's folder is included: meshes and scenes refer to
-            their textures, and never to files above or beside their folder.
-        writes: existing folders to write.
+    A file's folder is included: meshes and scenes refer to their textures, and never to files above
+    or beside their folder. Folders to write exist.
     """
     folders: set[Path] = set()
     for path in files:
@@ -143,9 +141,7 @@ def code_of(*functions: Callable[..., object]) -> frozenset[Path]:
 def confine(allowed: Reach, code: frozenset[Path]) -> None:
     """Confine this process by all features that the kernel supports; it must have one thread.
 
-    Args:
-        allowed: user files that stay accessible.
-        code: Python files and packages that the process has to load.
+    Accessible are the user files that are allowed, and the Python files and packages of `code`.
 
     Raises:
         EnvironmentFailure: the kernel refuses a feature that it reports.

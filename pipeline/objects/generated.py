@@ -14,16 +14,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pipeline.objects.builtin.furniture import sample_furniture
-from pipeline.objects.builtin.gear import sample_gear
 from pipeline.objects.builtin.lattice import sample_lattice
 from pipeline.objects.builtin.plant import sample_plant
-from pipeline.objects.builtin.rock import sample_rock
 from pipeline.objects.builtin.shell import sample_shell
-from pipeline.objects.builtin.solids import Mesh
+from pipeline.objects.builtin.solids import Mesh, sample_gear, sample_rock, sample_vase
 from pipeline.objects.builtin.superquadric import sample_superquadric
 from pipeline.objects.builtin.torus_knot import sample_torus_knot
 from pipeline.objects.builtin.tree import sample_tree
-from pipeline.objects.builtin.vase import sample_vase
 from storage.atomic import write_atomically
 from storage.dataset.layout import numbered_path
 from storage.errors import TrilightError, expected_one_of

@@ -66,9 +66,8 @@ class LandedLight:
     ) -> Any:
         """Return the picture of a view, once.
 
-        Args:
-            paths: what tells these light paths from others.
-            land: returns the picture of each of some cameras.
+        `paths` tells these light paths from others, and `land` returns the picture of each of some
+        cameras.
         """
         picture = self._kept.pop((_view_name(camera), paths), None)
         if picture is not None:

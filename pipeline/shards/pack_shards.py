@@ -88,11 +88,9 @@ def pack_shard(
     the staged scenes are deleted after it: a kill in between loses nothing and repeats little.
 
     An existing shard stays: the first writer wins. A growing one is replaced. Where a file system
-    carries no locks, who comes second returns what the first has packed.
-
-    Args:
-        scene_indices: indices of its scenes, all of which are staged.
-        grows: True if the manifest lists the shard as growing; then call while holding its mutex.
+    carries no locks, who comes second returns what the first has packed. All scenes of
+    `scene_indices` are staged. If the manifest lists the shard as growing, pass `grows` and hold
+    its mutex.
 
     Raises:
         TrilightError: the disk is full, the folder cannot be written, or a staged file vanished.
@@ -157,8 +155,7 @@ def unpack_here(folder: DatasetFolder, name: str, scenes: range, manifest: Manif
 def unpack_shard(folder: DatasetFolder, note: ShardNote, scenes: range, stream: BinaryIO) -> None:
     """Stage the scenes of a shard again, byte for byte, so that it can be packed with more.
 
-    Args:
-        scenes: indices of its scenes; one that the file lacks was given up.
+    A scene that the file lacks was given up.
     """
     name = note.shard.name
     samples = dict(ShardReader(stream, name))
@@ -182,8 +179,7 @@ class PublishedShards:
     def names_in_part(self, part: int, ends: Mapping[str, range]) -> Iterator[str]:
         """Yield the names of the published shards of a part of the dataset, growing ones too.
 
-        Args:
-            ends: shards of a bucket with fewer scenes than planned; their scenes are staged here.
+        `ends` are shards of a bucket with fewer scenes than planned; their scenes are staged here.
         """
         if self._store.is_here:
             return shard_names_in_part(self._folder.root, part)
@@ -246,8 +242,7 @@ class PublishedShards:
     def publish(self, note: ShardNote) -> ShardNote | None:
         """Publish a packed shard with its log and note; the cache keeps the bytes of a sent one.
 
-        Returns:
-            The published note; None if another worker publishes or published it, or it grows.
+        None is returned if another worker publishes or published it, or it grows.
         """
         name = note.shard.name
         if self._folder.shard(name).exists():  # else another machine, or process, has sent it
@@ -313,6 +308,65 @@ class PublishedShards:
             write_manifest(path, theirs.with_grown(shard))
             self._store.put("manifest.json", path)
 
+    def read_published_head(self) -> Manifest | None:
+        """Return the published manifest without shards, with the digest of the published lock."""
+        place = f"{self._folder.display_name}/manifest.json"
+        start = self._store.get("manifest.json", _HEAD_BYTES)
+        if start is None:
+            return None
+        try:
+            head = decode_head(io.BytesIO(start), place)
+        except TrilightError:  # the head is longer, or malformed: read it all
+            head = decode_head(io.BytesIO(self._store.get("manifest.json") or b""), place)
+        if head.objects_lock_sha256:
+            return head
+        lock = self._store.get(self._folder.objects_lock.name)
+        return dataclasses.replace(head, objects_lock_sha256=sha256_hex(lock) if lock else "")
+
+    def fetch(self, path: Path) -> None:
+        """Take over a published file that is not in the folder."""
+        if not path.exists() and (data := self._store.get(self._folder.name_of(path))) is not None:
+            write_atomically(path, data)
+
+    def fetch_lock(self, sha256: str) -> None:
+        """Take over the published lock, of a digest, and its index, unless it is here."""
+        lock = self._folder.objects_lock
+        if not sha256 or (lock.exists() and sha256_of_file(lock) == sha256):
+            return
+        for path in (lock, self._folder.staged_index):
+            if (data := self._store.get(self._folder.name_of(path))) is not None:
+                write_atomically(path, data)
+
+    def merge_failures(self) -> None:
+        """Add the published rejections to the folder's; call while holding the manifest's mutex."""
+        theirs = decode_failures(self._store.get(self._folder.failures.name) or b"")
+        write_failures(self._folder.failures, [*read_failures(self._folder.failures), *theirs])
+
+    def adopt(self) -> None:
+        """Give the folder before a bucket the bucket's state; call while no other process uses it.
+
+        Staged scenes stay only if the bucket holds the same dataset.
+        """
+        theirs = self.read_published_head()
+        own_head = None
+        with contextlib.suppress(TrilightError):
+            own_head = read_head(self._folder.manifest)
+        if not (theirs and own_head and own_head.identity == theirs.identity):
+            own_head = None
+            self._folder.clear()
+        shutil.rmtree(self._folder.staged_sent, ignore_errors=True)  # it is looked at again
+        if theirs is None:
+            return
+        publish_plan(self._store, theirs.num_scenes)
+        if own_head:  # as the shards here were packed
+            theirs = dataclasses.replace(
+                theirs, num_scenes=own_head.num_scenes, growing=own_head.growing
+            )
+        self.fetch_lock(theirs.objects_lock_sha256)
+        if not theirs.objects_lock_sha256:
+            self.merge_failures()
+        write_manifest(self._folder.manifest, theirs)
+
     def _read_note(self, name: str) -> ShardNote | None:
         data = self._store.get(note := self._folder.name_of(note_of(self._folder, name)))
         if data is None:
@@ -338,44 +392,6 @@ class PublishedShards:
         self._unpacked.discard(name)
 
 
-def published_head(folder: DatasetFolder, store: Store) -> Manifest | None:
-    """Return the published manifest without its shards, with the digest of the published lock."""
-    place = f"{folder.display_name}/manifest.json"
-    start = store.get("manifest.json", _HEAD_BYTES)
-    if start is None:
-        return None
-    try:
-        head = decode_head(io.BytesIO(start), place)
-    except TrilightError:  # the head is longer, or malformed: read it all
-        head = decode_head(io.BytesIO(store.get("manifest.json") or b""), place)
-    if head.objects_lock_sha256:
-        return head
-    lock = store.get(folder.objects_lock.name)
-    return dataclasses.replace(head, objects_lock_sha256=sha256_hex(lock) if lock else "")
-
-
-def fetch(folder: DatasetFolder, store: Store, path: Path) -> None:
-    """Take over a published file that is not in the folder."""
-    if not path.exists() and (data := store.get(folder.name_of(path))) is not None:
-        write_atomically(path, data)
-
-
-def fetch_lock(folder: DatasetFolder, store: Store, sha256: str) -> None:
-    """Take over the published lock, of a digest, and its index, unless it is here."""
-    lock = folder.objects_lock
-    if not sha256 or (lock.exists() and sha256_of_file(lock) == sha256):
-        return
-    for path in (lock, folder.staged_index):
-        if (data := store.get(folder.name_of(path))) is not None:
-            write_atomically(path, data)
-
-
-def merge_failures(folder: DatasetFolder, store: Store) -> None:
-    """Add the published rejections to the folder's; call while holding the manifest's mutex."""
-    theirs = decode_failures(store.get(folder.failures.name) or b"")
-    write_failures(folder.failures, [*read_failures(folder.failures), *theirs])
-
-
 def hold_dataset_lock(folder: DatasetFolder) -> contextlib.AbstractContextManager[None]:
     """Hold the lock that a dataset's workers share; one that is alone updates the folder.
 
@@ -387,7 +403,7 @@ def hold_dataset_lock(folder: DatasetFolder) -> contextlib.AbstractContextManage
     """
     store = folder.store()
     return folder.hold_shared_lock(
-        partial(_forget_unused, folder) if store.is_here else partial(adopt, folder, store)
+        partial(_forget_unused, folder) if store.is_here else PublishedShards(folder, store).adopt
     )
 
 
@@ -403,32 +419,6 @@ def _forget_unused(folder: DatasetFolder) -> None:
         folder.objects_lock.unlink(missing_ok=True)  # a kill came before the manifest named it
         if not folder.shard_files() and not any(folder.staged_samples.rglob("*.tar")):
             folder.manifest.unlink()
-
-
-def adopt(folder: DatasetFolder, store: Store) -> None:
-    """Give the folder before a bucket the bucket's state; call while no other process uses it.
-
-    Staged scenes stay only if the bucket holds the same dataset.
-    """
-    theirs = published_head(folder, store)
-    own_head = None
-    with contextlib.suppress(TrilightError):
-        own_head = read_head(folder.manifest)
-    if not (theirs and own_head and own_head.identity == theirs.identity):
-        own_head = None
-        folder.clear()
-    shutil.rmtree(folder.staged_sent, ignore_errors=True)  # it is looked at again
-    if theirs is None:
-        return
-    publish_plan(store, theirs.num_scenes)
-    if own_head:  # as the shards here were packed
-        theirs = dataclasses.replace(
-            theirs, num_scenes=own_head.num_scenes, growing=own_head.growing
-        )
-    fetch_lock(folder, store, theirs.objects_lock_sha256)
-    if not theirs.objects_lock_sha256:
-        merge_failures(folder, store)
-    write_manifest(folder.manifest, theirs)
 
 
 def publish_plan(store: Store, num_scenes: int) -> None:
@@ -477,10 +467,8 @@ class UnfinishedShard:
     ) -> None:
         """Stage a finished or given-up scene as `stage_scene`, and log its cost.
 
-        Args:
-            sample: the finished scene; None if it was given up.
-            began: start of the work on it, by `time.monotonic`.
-            cores: number of cores that the work kept busy.
+        The sample is None if the scene was given up. The work began at `began` (`time.monotonic`)
+        and kept so many cores busy.
         """
         stage_scene(self._staged, scene_index, sample, failures, profile)
         seconds = time.monotonic() - began
@@ -493,11 +481,7 @@ class UnfinishedShard:
         log_scene(folder, self.name, scene_index, seconds=seconds, cores=cores, num_rejected=count)
 
     def pack(self) -> ShardEntry | None:
-        """Pack the shard if all its scenes are staged, unless another worker does.
-
-        Returns:
-            The shard if this call packed it, else None.
-        """
+        """Pack and return the shard if all its scenes are staged, unless another worker does."""
         scenes, grows = self._plan()
         if self._is_packed() or not all(is_staged(self._staged, index) for index in scenes):
             return None

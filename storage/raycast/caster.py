@@ -50,7 +50,7 @@ class Triangles:
     """Some triangles of many, as Embree's rays meet them: a `RayCaster`.
 
     Embree works in single precision, here in its robust mode, in which no ray slips between two
-    triangles of one edge. `pipeline.assets.outside_rays` calls Embree by itself: it has no scene.
+    triangles of one edge. `pipeline.assets.cleaning.orient` calls Embree itself, without a scene.
     """
 
     def __init__(self, corners_T33: NDArray[np.float32], rows: NDArray[np.intp]) -> None:

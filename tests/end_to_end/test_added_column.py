@@ -17,8 +17,6 @@ from infra.render.quality import FixedSamples
 from model.inference import NeuralRenderer
 from model.open import open_network, save_published
 from model.scene_tensors import SceneTensors, batch_scenes, scene_tensors
-from pipeline.exchange.convert import write_scene
-from pipeline.exchange.open_scene import scene_source
 from pipeline.generation.inspect_scene import _facts
 from pipeline.renders.mitsuba_variant import choose_variant
 from scene_templates.families import DEFAULT_FAMILIES
@@ -197,13 +195,11 @@ def test_the_path_tracer_says_what_it_does_not_read(monkeypatch: pytest.MonkeyPa
     assert tracer.load(scene, "floor").notes == ("the path tracer does not read coat",)
 
 
-def test_inspect_names_the_columns_in_use(tmp_path: Path) -> None:
+def test_inspect_names_the_columns_in_use() -> None:
     scene = tiny_scene()
     for coat, named in ((0.9, "coat"), (0.0, None)):
         scene.materials[FLOOR, -1] = coat
-        write_scene(tmp_path / "a.safetensors", scene)
-        facts = _facts(scene_source(str(tmp_path / "a.safetensors"))).facts
-        assert facts.get("added_columns") == named
+        assert _facts(scene).get("added_columns") == named
 
 
 def test_a_network_of_four_columns_trains_on_the_same_data(data: Dataset, tmp_path: Path) -> None:

@@ -29,7 +29,7 @@ from tests.pipeline.documents.dataset_by_hand import (
     sample,
     write_dataset,
 )
-from tests.pipeline.documents.rows_by_hand import row as mesh_row
+from tests.pipeline.documents.dataset_by_hand import row as mesh_row
 from tests.pipeline.documents.test_pages import failure
 from tests.scenes_by_hand import tiny_scene
 

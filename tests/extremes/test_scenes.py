@@ -32,8 +32,7 @@ from tests.pipeline.assets.meshes_by_hand import (
     write_obj,
     write_off,
 )
-from tests.pipeline.scenes.scene_facts import counts_of, digest, rows_of
-from tests.pipeline.scenes.small_pool import first_scene
+from tests.pipeline.scenes.small_pool import counts_of, digest, first_scene, rows_of
 
 SETTINGS = SceneSettings(families=DEFAULT_FAMILIES)
 

@@ -109,7 +109,7 @@ def safetensors_cases() -> Iterator[tuple[str, Make, str]]:
 
 
 def h5_cases() -> Iterator[tuple[str, Make, str]]:
-    """Yield name, what writes `s.h5`, and what has to come of it; test_safe_h5.py has more."""
+    """Yield name, what writes `s.h5`, and what comes of it; test_renderformer_h5.py has more."""
     yield "HDF5 is noise", _bytes("s.h5", bytes(range(256)) * 99), "refused"
     for seed in range(8):
 

@@ -19,8 +19,7 @@ from pipeline.assets.prepare import prepare_asset
 from pipeline.assets.settings import AssetSettings, OwnMaterialSettings
 from pipeline.exchange.open_scene import load_source, scene_source, source_keys
 from pipeline.exchange.renderformer_h5 import write_renderformer_h5
-from pipeline.foreign.load_mesh import load_mesh
-from pipeline.foreign.source_file import read_source
+from pipeline.foreign.source_file import load_mesh, read_source
 from pipeline.isolation import ChildFailed, ChildLimits, IsolatedChild
 from storage.errors import Rejected, TrilightError
 from tests.for_each import with_folders
@@ -53,9 +52,9 @@ class Outcome:
 def smaller_limits() -> None:
     """Prepare a child."""
     from pipeline.exchange import pictures
-    from pipeline.foreign.usd import composition, placed
+    from pipeline.foreign.usd import placed, stage
 
-    composition.MAX_PRIMS, composition.MAX_COMPOSITION_S = 2000, 0.3
+    stage.MAX_PRIMS, stage.MAX_COMPOSITION_S = 2000, 0.3
     placed.MAX_PLACED, pictures.MAX_PIXELS = 2000, 1 << 20
 
 

@@ -9,7 +9,7 @@ import pytest
 
 from infra.leaderboard import _bytes_of
 from model.weights import read_metadata, read_tensors
-from pipeline.objects.local.catalogue import _file_text
+from pipeline.objects.local.folder import _file_text
 from storage.dataset.manifest import index_shard, read_head, read_manifest
 from storage.errors import TrilightError
 from storage.records.objects import read_failures, read_objects_lock

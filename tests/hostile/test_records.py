@@ -18,7 +18,7 @@ from tests.conftest import ROOT
 from tests.for_each import case
 from tests.pipeline.assets.meshes_by_hand import WRITERS, cube, prepare, write_glb
 from tests.pipeline.assets.source_materials import textured_kit as kit
-from tests.pipeline.assets.source_materials.usd_kit import textured_usd
+from tests.pipeline.assets.source_materials.textured_kit import textured_usd
 from tests.pipeline.exchange.test_renderformer_json import changed
 
 WHOLE = kit.picture_bytes(kit.CORNERS)

@@ -25,9 +25,8 @@ from pipeline.assets.decimation.decimate import decimate
 from pipeline.assets.quality.measure import MeasuredSource
 from pipeline.assets.settings import AssetSettings
 from pipeline.foreign.limits import ReadLimits
-from pipeline.foreign.load_mesh import load_mesh
 from pipeline.foreign.mesh import TriangleMesh
-from pipeline.foreign.source_file import read_source
+from pipeline.foreign.source_file import load_mesh, read_source
 from pipeline.isolation import ChildFailed
 from pipeline.objects.sources import find_objects
 from pipeline.renders.renderer import SceneRenderer

@@ -1,8 +1,9 @@
-"""Measures of a level, all taken against the cleaned source.
+"""Measures of a level, all taken against the cleaned source, and its quality checks.
 
 Distances are two-way (Hausdorff), by evenly spread points and exact distances. The quality check
 uses the 99th percentile: one vertex decides the largest value, and a mean accepts almost anything.
-Components are measured apart: those with less than one percent of the area escape it.
+Components are measured apart: those with less than one percent of the area escape it. The checks
+are those of every decimation method; cheap ones come first.
 """
 
 from dataclasses import dataclass
@@ -11,8 +12,11 @@ import igl
 import numpy as np
 from numpy.typing import NDArray
 
-from pipeline.assets.outside_rays import first_faces, outside_rays
+from pipeline.assets.cleaning.clean import clean
+from pipeline.assets.cleaning.orient import first_faces, outside_rays
+from pipeline.assets.settings import GateSettings
 from pipeline.foreign.mesh import TriangleMesh
+from storage.errors import Rejected
 from storage.records.asset import Level, LevelQuality
 from storage.seeds import rng_for
 
@@ -132,9 +136,7 @@ class Deviation:
 def sample_surface(mesh: TriangleMesh, uniform: NDArray[np.float64]) -> SurfacePoints:
     """Return N points spread evenly by area: one from each of N equal fractions of it.
 
-    Args:
-        mesh: at least one face with area.
-        uniform: [N, 3] independent numbers in [0, 1).
+    The mesh has at least one face with area; `uniform` [N, 3] are independent numbers in [0, 1).
     """
     total = np.cumsum(np.linalg.norm(mesh.double_area_vectors, axis=1))
     target = (np.arange(len(uniform)) + uniform[:, 0]) / len(uniform) * total[-1]
@@ -199,10 +201,9 @@ class MeasuredSource:
     def _lost_area(self, distances: NDArray[np.float64]) -> float:
         """Return the fraction of the source's area in lost components.
 
-        Args:
-            distances: [N] from each sample point to the result, as a fraction of the diagonal.
-
-        A component without a sample point (below about 1/8000 of the area) never counts as lost.
+        `distances` [N] are those from each sample point to the result, as a fraction of the
+        diagonal. A component without a sample point (below about 1/8000 of the area) never counts
+        as lost.
         """
         count = self.num_components
         is_far = distances > self._lost_beyond
@@ -261,3 +262,90 @@ def intersection_over_union(a: NDArray[np.bool_], b: NDArray[np.bool_]) -> float
     """Return the number of rays that hit both over the number that hit either."""
     either = int((a | b).sum())
     return int((a & b).sum()) / either if either else 1.0
+
+
+def check_level(
+    result: TriangleMesh,
+    source: MeasuredSource,
+    budget: int,
+    gate: GateSettings,
+    max_error_p99: float,
+) -> tuple[TriangleMesh, LevelQuality]:
+    """Return the cleaned result of a decimation with its measures.
+
+    The error is at most `max_error_p99`, itself at most that of `gate`, and there are at most
+    `budget` faces.
+
+    Raises:
+        Rejected: budget_missed, nonfinite_result, bbox_escaped, area_changed, error_over_bound,
+            normals_changed, silhouette_changed, parts_lost.
+    """
+    _check_vertices(result, source.mesh, gate.max_outside)
+    mesh = clean(result)
+    if not 1 <= len(mesh.faces) <= budget:
+        raise Rejected("budget_missed", f"{len(mesh.faces)} faces; expected 1 to {budget}")
+    low, high = gate.area_ratio
+    if not low <= source.area_ratio(mesh) <= high:
+        raise Rejected(
+            "area_changed",
+            f"{source.area_ratio(mesh):.2f} times the source's area at {budget} faces; "
+            f"expected {low} to {high}",
+        )
+    deviation = source.surface.hausdorff_deviation(mesh)
+    error = deviation.two_way(99)
+    if error > max_error_p99:
+        raise Rejected(
+            "error_over_bound",
+            f"p99 distance {error:.2%} at {budget} faces; expected <= {max_error_p99:.2%}",
+        )
+    quality = source.quality(mesh, deviation)
+    _check_shape(quality, budget, gate)
+    return mesh, quality
+
+
+def _check_vertices(result: TriangleMesh, source: TriangleMesh, max_outside: float) -> None:
+    used = result.positions[np.unique(result.faces)]
+    if len(used) == 0:
+        raise Rejected("budget_missed", "no face is left")
+    if not np.isfinite(used).all():
+        raise Rejected("nonfinite_result", "a vertex of the result is not finite")
+    low = source.positions.min(axis=0)
+    high = source.positions.max(axis=0)
+    outside = float(np.maximum(low - used, used - high).max()) / source.diagonal
+    if outside > max_outside:
+        raise Rejected("bbox_escaped", f"a vertex is {outside:.2%} of the diagonal outside the box")
+
+
+def _check_shape(quality: LevelQuality, budget: int, gate: GateSettings) -> None:
+    if quality.normal_error_deg > gate.max_normal_error_deg:
+        raise Rejected(
+            "normals_changed",
+            f"normals are off by {quality.normal_error_deg:.0f} degrees on average at {budget} "
+            f"faces; expected <= {gate.max_normal_error_deg:.0f}",
+        )
+    if quality.silhouette_iou < gate.min_silhouette_iou:
+        raise Rejected(
+            "silhouette_changed",
+            f"outlines agree by {quality.silhouette_iou:.1%} at {budget} faces; "
+            f"expected >= {gate.min_silhouette_iou:.0%}",
+        )
+    if quality.lost_area > gate.max_lost_area:
+        raise Rejected(
+            "parts_lost",
+            f"parts with {quality.lost_area:.1%} of the area are gone at {budget} faces; "
+            f"expected <= {gate.max_lost_area:.1%}",
+        )
+
+
+def require_watertight(mesh: TriangleMesh) -> None:
+    """Raise Rejected `not_watertight` where a clean mesh is not closed, oriented and manifold."""
+    edges = half_edges(mesh)
+    num_open = len(open_half_edges(mesh))
+    num_shared = len(edges) - len(np.unique(edges, axis=0))
+    num_joints = int((~igl.is_vertex_manifold(mesh.faces)).sum()) if len(edges) else 0
+    if num_open or num_shared or num_joints:
+        raise Rejected(
+            "not_watertight",
+            f"{num_open} edges without a second triangle, {num_shared} with triangles of equal "
+            f"direction, {num_joints} vertices where surfaces touch; expected 0 of each",
+        )

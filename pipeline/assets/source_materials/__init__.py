@@ -1,8 +1,6 @@
 """Source materials of objects, baked onto each level of an asset.
 
-- `source_surface`: the cleaned source with its materials at every point.
-- `nearest`: the point of the source for each point of a level.
-- `texture_atlas`: an atlas with a tile for every triangle.
-- `bake`: the textures of a level.
+- `source_surface`: the cleaned source with its materials at the nearest point of any other.
+- `bake`: the textures of a level, an atlas with a tile for every triangle.
 - `skin`: the skins of all levels, with the errors of their textures.
 """

@@ -15,8 +15,12 @@ from pipeline.assets.quality.measure import (
 )
 from pipeline.assets.settings import AssetSettings, OwnMaterialSettings
 from pipeline.assets.source_materials.bake import DIFFUSE, BakedTextures, bake, level_emission
-from pipeline.assets.source_materials.nearest import FacePoints, barycentric
-from pipeline.assets.source_materials.source_surface import SourceSurface, match_source_surface
+from pipeline.assets.source_materials.source_surface import (
+    FacePoints,
+    SourceSurface,
+    barycentric,
+    match_source_surface,
+)
 from pipeline.foreign.gltf.materials import GltfMaterials
 from pipeline.foreign.gltf.primitives import gltf_textured_mesh
 from pipeline.foreign.material import TexturedMesh
@@ -54,11 +58,8 @@ def add_source_materials(
 ) -> tuple[tuple[Level, ...], dict[int, tuple[str, str]], OwnMaterials | None]:
     """Return levels with skins, reasons of missing levels, and the state of the materials.
 
-    Args:
-        levels: levels without skins.
-        missed: reason and message by budget.
-        source: the object's file; `mesh` is its clean, oriented mesh.
-        settings: `own_materials` keeps materials, and says what happens where they are lost.
+    Missing levels have reason and message by budget. `mesh` is the clean, oriented mesh of the
+    source.
 
     Raises:
         Rejected: as `read_source_surface`, where `if_lost` is `reject`; transmissive_material,

@@ -15,10 +15,10 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from pipeline.exchange.loaded_scene import LoadedScene
 from pipeline.exchange.part_materials import Part, PartConverter, drop_empty, unit_normals
 from pipeline.exchange.pictures import decode_values
 from pipeline.exchange.textured_triangles import (
+    LoadedScene,
     SceneParts,
     TexturedTriangles,
     build_lamp,

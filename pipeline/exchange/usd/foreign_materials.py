@@ -35,31 +35,6 @@ SMOOTH_ANGLE_DEG = 30.0
 """Maximum angle of a smooth edge where a subdivision surface states no normals."""
 
 
-@dataclass(frozen=True, kw_only=True, eq=False)
-class TriangleSoup:
-    """Triangles with three separate corners each."""
-
-    positions: NDArray[np.float32]  # [T, 3, 3] world
-    normals: NDArray[np.float32]  # [T, 3, 3] unit
-    cut: CutMesh  # corners of the mesh, for values at them
-
-
-def read_mesh(placed: PlacedPrim, time: Any, lost: list[str]) -> TriangleSoup:
-    """Return the triangles of a mesh that have an area.
-
-    Raises:
-        TrilightError: the arrays of the mesh contradict each other, or are not finite.
-    """
-    cut = cut_mesh(placed, time)
-    corners = cut.world_points[cut.indices[cut.corners]]
-    positions, flat, has_area = drop_empty(corners)
-    if not has_area.all():
-        lost.append(f"{cut.prim.GetPath()}: {int((~has_area).sum())} triangles without an area")
-    cut = cut.select(has_area)
-    normals = _normals(cut, time, positions, flat, lost)
-    return TriangleSoup(positions=positions, normals=normals, cut=cut)
-
-
 def _normals(
     cut: CutMesh,
     time: Any,
@@ -71,7 +46,7 @@ def _normals(
     where = cut.prim.GetPath()
     stated = None if placed.skin is not None else _stated_normals(cut.prim, time)
     if stated is None:
-        if not (cut.is_smooth or placed.skin is not None) or not len(positions):
+        if not (cut.is_smooth or placed.skin is not None):
             return unit_normals(None, flat)
         if placed.skin is not None:
             lost.append(f"{where}: posed by bones; its normals are those of its faces")
@@ -163,22 +138,49 @@ class StageSurfaces:
         )
         self._extras.append(_Extras(name="", added={}, exact=None))
 
-    def convert(self, number: int, soup: TriangleSoup) -> TexturedTriangles:
-        """Return the triangles of a mesh, by its index within the stage."""
-        rows, tints = self._looks.assign(number, soup.cut)
+    def convert(self, placed: PlacedPrim, number: int) -> TexturedTriangles | None:
+        """Return the triangles of a mesh that have an area, by its index within the stage.
+
+        None, with a note, without any.
+
+        Raises:
+            TrilightError: the arrays of the mesh contradict each other, or are not finite.
+        """
+        cut = cut_mesh(placed, self._time)
+        positions, flat, has_area = drop_empty(cut.world_points[cut.indices[cut.corners]])
+        where = cut.prim.GetPath()
+        if not has_area.all():
+            self._lost.append(f"{where}: {int((~has_area).sum())} triangles without an area")
+        if not len(positions):
+            self._lost.append(f"{where}: no triangle with an area")
+            return None
+        cut = cut.select(has_area)
+        normals = _normals(cut, self._time, positions, flat, self._lost)
+        rows, tints = self._looks.assign(number, cut)
+        masks = {int(row): rows == row for row in np.unique(rows)}
         return join_triangles(
-            [self._convert_row(int(row), rows == row, soup, tints) for row in np.unique(rows)],
-            [np.flatnonzero(rows == row) for row in np.unique(rows)],
+            [
+                self._convert_row(row, cut, mask, positions[mask], normals[mask], tints[mask])
+                for row, mask in masks.items()
+            ],
+            list(map(np.flatnonzero, masks.values())),
         )
 
     def _convert_row(
-        self, row: int, mask: NDArray[np.bool_], soup: TriangleSoup, tints: NDArray[np.float64]
+        self,
+        row: int,
+        cut: CutMesh,
+        mask: NDArray[np.bool_],
+        positions: NDArray[np.float32],
+        normals: NDArray[np.float32],
+        tints: NDArray[np.float64],
     ) -> TexturedTriangles:
-        where = str(soup.cut.prim.GetPath())
+        """Return the triangles of a material's row, which a mask [T] of the mesh selects."""
+        where = str(cut.prim.GetPath())
 
         def coordinates(number: int) -> NDArray[np.float64] | None:
             primvar = self._looks.primvars[number]
-            uv = soup.cut.read_coordinates(primvar, self._time)
+            uv = cut.read_coordinates(primvar, self._time)
             if uv is None or not np.isfinite(uv).all():
                 self._lost.append(f"{where}: no coordinates {primvar!r:.60}")
                 return None
@@ -188,10 +190,10 @@ class StageSurfaces:
         part = Part(
             where=f"{where}: ",
             material=self._looks.materials[row],
-            positions=soup.positions[mask],
-            normals=soup.normals[mask],
+            positions=positions,
+            normals=normals,
             coordinates=coordinates,
-            colors=None if (tints[mask] == 1).all() else tints[mask],
+            colors=None if (tints == 1).all() else tints,
         )
         source = MapSource(name=extra.name, licence=self._licence)
         triangles = self._converter.convert(part, source)

@@ -19,7 +19,7 @@ from pipeline.exchange.usd.foreign_lights import (
     light_triangles,
     read_foreign_dome,
 )
-from pipeline.exchange.usd.foreign_materials import StageSurfaces, read_mesh
+from pipeline.exchange.usd.foreign_materials import StageSurfaces
 from pipeline.exchange.usd.prim_names import FOV_DEG, INDEX, OBJECT_TEXTS, parse_camera_row
 from pipeline.foreign.numbers import read_number
 from pipeline.foreign.usd.object_source import UsdStage
@@ -120,15 +120,13 @@ def _read_environment(
 def _convert_mesh(
     placed: PlacedPrim, number: int, surfaces: StageSurfaces, time: Any, lost: list[str]
 ) -> TexturedTriangles | None:
-    prim = placed.prim
-    soup = read_mesh(placed, time, lost)
-    if not len(soup.positions):
-        lost.append(f"{prim.GetPath()}: no triangle with an area")
+    triangles = surfaces.convert(placed, number)
+    if triangles is None:
         return None
-    triangles = surfaces.convert(number, soup)
+    prim = placed.prim
     rows = triangles.rows
     if prim.HasAPI("MeshLightAPI"):
-        light = compute_radiance(placed, soup.positions, time, lost)
+        light = compute_radiance(placed, triangles.positions, time, lost)
         mode = prim.GetAttribute("light:materialSyncMode").Get(time)
         glows = rows[:, EMISSION].any()
         tints = mode == "materialGlowTintsLight" and glows

@@ -18,9 +18,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from pipeline.exchange.loaded_scene import LoadedScene
 from pipeline.exchange.pictures import MAX_BYTES
-from pipeline.exchange.textured_triangles import MAX_ROWS
+from pipeline.exchange.textured_triangles import MAX_ROWS, LoadedScene
 from pipeline.exchange.usd import prim_names as names
 from pipeline.exchange.usd.foreign_scene import build_stage_scene
 from pipeline.exchange.usd.write_materials import (
@@ -70,11 +69,8 @@ def usd_keys(path: Path, folder: Path | None = None) -> list[str]:
 def read_usd(path: Path, key: str | None, folder: Path | None, licence: str) -> LoadedScene:
     """Return one scene of a file.
 
-    Args:
-        path: the file.
-        key: key in a shard, or time code; the first scene by default.
-        folder: folder whose files may be read; that of `path` by default.
-        licence: licence of objects that state none.
+    `key` is one of a shard, or a time code, by default the first. `folder`, by default that of the
+    file, bounds what is read. Objects that state no licence get the given one.
 
     Raises:
         TrilightError: the file is unusable, lacks the scene, or a `Scene` cannot hold it.

@@ -1,7 +1,8 @@
 """Reader of glTF 2.0, `.glb` and `.gltf`, for objects and for scenes.
 
-- `container`, `document`: chunks, JSON and version; buffers, accessors and pictures.
-- `check`: refusals, counts within limits, and names of unread contents, before any buffer is read.
-- `nodes`, `primitives`: the placed meshes, and their triangles, alone or with materials.
+- `document`: chunks, JSON and version; buffers, accessors and pictures.
+- `nodes`: the placed meshes; before any buffer is read, refusals, counts within limits, and names
+  of unread contents.
+- `primitives`: their triangles, alone or with materials.
 - `materials`: those materials.
 """

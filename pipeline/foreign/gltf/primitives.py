@@ -7,10 +7,17 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from pipeline.foreign.gltf.check import FAN, POINTS_AND_LINES, STRIP, TRIANGLES
 from pipeline.foreign.gltf.document import GltfDocument, Rows, refuse_malformed
 from pipeline.foreign.gltf.materials import DEFAULT, GltfMaterials
-from pipeline.foreign.gltf.nodes import PlacedNode, entry, placed_meshes
+from pipeline.foreign.gltf.nodes import (
+    FAN,
+    POINTS_AND_LINES,
+    STRIP,
+    TRIANGLES,
+    PlacedNode,
+    entry,
+    placed_meshes,
+)
 from pipeline.foreign.material import MOST_UV_SETS, TexturedMesh
 from pipeline.foreign.mesh import TriangleMesh, join_meshes
 from pipeline.foreign.numbers import read_number

@@ -3,9 +3,9 @@
 Objects (pipeline.assets) and scenes use it; pipeline.exchange.usd reads and writes scenes.
 Native code parses the bytes, so only processes with limits import this (pipeline.isolation).
 
-- `stage`, `composition`: a file and the files that it names, bounded before it is composed.
-- `placed`: the visible prims with their transforms; names of unread contents.
-- `polygons`, `solids`, `skins`: a mesh as triangles, posed by its skeleton.
+- `stage`: a file and the files that it names, bounded before it is composed.
+- `placed`: the visible prims with their transforms and poses; names of unread contents.
+- `polygons`, `solids`: a mesh as triangles.
 - `shaders`, `texture_nodes`: the inputs of a material.
 - `object_source`: a stage as an object, and all of its materials; `materials`: those of a mesh's
   triangles.

@@ -20,10 +20,9 @@ from numpy.typing import NDArray
 from pipeline.foreign.limits import ReadLimits
 from pipeline.foreign.material_files import MaterialFiles
 from pipeline.foreign.mesh import TriangleMesh, join_meshes
-from pipeline.foreign.usd.placed import PlacedPrim, placed_prims
+from pipeline.foreign.usd.placed import PlacedPrim, UnposedMesh, placed_prims
 from pipeline.foreign.usd.polygons import CutMesh, cut_mesh
 from pipeline.foreign.usd.shaders import StatedMaterial, read_bindings, read_material
-from pipeline.foreign.usd.skins import UnposedMesh
 from pipeline.foreign.usd.solids import SOLIDS
 from pipeline.foreign.usd.stage import OpenedStage, OutsideFile, read_quietly
 from pipeline.foreign.usd.texture_nodes import TextureNode, asset_bytes
@@ -87,12 +86,9 @@ def read_stage_materials(
 ) -> StageMaterials:
     """Return the materials of the visible meshes of a stage.
 
-    Args:
-        stage: the open stage.
-        max_bytes: maximum bytes of all pictures together.
-        read: function that reads a UsdShade.Material, None leaving it out; by default one that
-            refuses a material without a shader that is understood.
-        normals: whether that function reads normal maps, too.
+    All pictures together have at most `max_bytes`. `read` reads a UsdShade.Material, None leaving
+    it out. By default a material without a shader that is understood is refused, and normal maps
+    are read on request.
 
     Raises:
         Rejected: texture_outside, materials_unreadable.

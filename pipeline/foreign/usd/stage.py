@@ -5,20 +5,27 @@ beforehand. So every file that any layer names for composition, used or not, is 
 that USD's own resolver gives, is refused outside of the folder, and is opened here first: the
 closure of all names holds every file that composition can ask for. The layers of the composed stage
 are compared with the folder once more, before anything of it is used.
-`pipeline.foreign.usd.composition` bounds the size of the stage. The bytes are still parsed by
-native code, so untrusted files are opened in a child process with limits (pipeline.isolation).
+The bytes are still parsed by native code, so untrusted files are opened in a child process with
+limits (pipeline.isolation).
+
+References, payloads, inherits and variants multiply prims without end, in more ways than a walk
+over the arcs of single prims sees: a reference to `</A/B>` also brings the arcs of `</A>`, and a
+class is inherited again wherever its heir is referenced. So no size is predicted here. USD's own
+composition engine makes the prims, in the order of the tree, and is stopped as soon as there are
+too many or they take too long. A composed prim holds at most 32,767 sites, which is USD's limit.
+
 `read_quietly` turns USD's own errors into one line that names the file, but no folder.
 """
 
 import re
+import time
 import zipfile
 from collections import Counter
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any, NoReturn, TypeVar
 
 from pipeline.foreign.numbers import Malformed
-from pipeline.foreign.usd.composition import composition_errors
 from storage.errors import TrilightError
 
 MAX_FILE_BYTES = 1 << 30
@@ -58,10 +65,8 @@ class OpenedStage:
     ) -> None:
         """Open the root layer alone.
 
-        Args:
-            path: the file.
-            folder: files below it may be read; the folder of `path` by default.
-            max_file_bytes: maximum size of every file.
+        Files below `folder` may be read, by default that of the file; each has at most
+        `max_file_bytes`.
 
         Raises:
             TrilightError: not a readable USD file, or larger than it may be.
@@ -307,3 +312,62 @@ def _find_line(error: Exception) -> str:
     except UnicodeDecodeError:  # the message cites bytes of the file
         line = None
     return f" from line {line[1]} on" if line else ""
+
+
+MAX_PRIMS = 500_000
+"""Maximum number of composed prims; instances of one prototype count once."""
+MAX_DEPTH = 150
+"""Maximum nesting of prims."""
+MAX_COMPOSITION_S = 20.0
+"""Maximum CPU seconds for all prims: 500,000 of few arcs each take 4 to 10; chains of thousands of
+references, or prims of thousands of sites, take hours."""
+
+
+def composition_errors(root: Any, context: Any, name: str) -> Sequence[Any]:
+    """Compose all prims below a root layer, payloads too, and return USD's errors.
+
+    Every file that the layer names must have been checked. `context` is the resolver context of the
+    stage that will be opened; messages call the file `name`.
+
+    Raises:
+        TrilightError: too many prims, nested too deep, or not composed in time.
+    """
+    from pxr import Pcp, Sdf
+
+    cache = Pcp.Cache(Pcp.LayerStackIdentifier(root, None, context), "usd", True)
+    _, errors = cache.ComputeLayerStack(cache.GetLayerStackIdentifier())
+    waiting = [Sdf.Path.absoluteRootPath]
+    prototypes = set()
+    num_prims = 0
+    start_s = time.process_time()
+    while waiting:
+        path = waiting.pop()
+        num_prims += 1
+        _require_bounds(name, path, num_prims, time.process_time() - start_s)
+        index, prim_errors = cache.ComputePrimIndex(path)
+        if index.hasAnyPayloads:
+            cache.RequestPayloads([path], [])
+            index, prim_errors = cache.ComputePrimIndex(path)
+        errors += prim_errors
+        if index.IsInstanceable():
+            prototype = Pcp.InstanceKey(index)
+            if prototype in prototypes:
+                continue
+            prototypes.add(prototype)
+        children, _ = index.ComputePrimChildNames()
+        waiting += [path.AppendChild(child) for child in children]
+    return errors
+
+
+def _require_bounds(name: str, path: Any, num_prims: int, elapsed_s: float) -> None:
+    if num_prims > MAX_PRIMS:
+        raise TrilightError(f"{name}: composes more than {MAX_PRIMS} prims, the most that is read.")
+    if path.pathElementCount > MAX_DEPTH:
+        raise TrilightError(
+            f"{name}: prims are nested more than {MAX_DEPTH} deep ({str(path)[:60]}...)."
+        )
+    if elapsed_s > MAX_COMPOSITION_S:
+        raise TrilightError(
+            f"{name}: {num_prims} prims took {elapsed_s:.0f} processor seconds to compose and more "
+            f"follow; expected all within {MAX_COMPOSITION_S:.0f}. Flatten the stage."
+        )

@@ -19,8 +19,13 @@ from pipeline.objects.licences import (
     stated_licence,
 )
 from pipeline.objects.listing import failure
-from pipeline.objects.local.catalogue import only_catalogue, read_catalogue
-from pipeline.objects.local.folder import file_record, is_below, walk_files
+from pipeline.objects.local.folder import (
+    file_record,
+    is_below,
+    only_catalogue,
+    read_catalogue,
+    walk_files,
+)
 from pipeline.objects.maps.texture_names import PICTURES, group_textures
 from storage.errors import TrilightError
 from storage.records.objects import SKY, TEXTURE, Failure, ObjectRecord
@@ -65,13 +70,9 @@ def find_maps(
 ) -> FoundMaps:
     """Return the usable textures or maps of a local folder.
 
-    Args:
-        kind: TEXTURE or SKY.
-        folder: with a catalogue `textures.jsonl` or `.csv` (`skies.jsonl` or `.csv`), whose rows
-            are as in a catalogue of objects and name base colors; otherwise all pictures below
-            it count, each under the user's licence.
-        licence: licence of files without a catalogue; by default user-provided.
-        allowed_licences: SPDX identifiers, `LicenseRef-...`, or compound expressions.
+    A catalogue is `textures.jsonl` or `.csv` (`skies.jsonl` or `.csv`); its rows are as in a
+    catalogue of objects and name base colors. Without one, all pictures below the folder count,
+    each under the user's licence, by default user-provided.
 
     Raises:
         TrilightError: the folder is missing or holds nothing, or its catalogue has a mistake.

@@ -21,10 +21,10 @@ import numpy as np
 from numpy.typing import NDArray
 from PIL import Image, UnidentifiedImageError
 from safetensors.numpy import save
+from scipy.sparse import csr_array
 
 from pipeline.foreign.linear_picture import clip_to_unit
 from pipeline.foreign.picture import UNREADABLE_PICTURE, read_linear_picture
-from pipeline.objects.maps.resample import area_means, flux, solid_angle_means
 from pipeline.objects.maps.texture_names import TEXTURE_PARTS, packed_channels
 from storage.conventions import linear_from_srgb
 from storage.digests import canonical_json, sha256_hex
@@ -34,6 +34,54 @@ from storage.records.environment import MAX_RADIANCE
 from storage.records.objects import SKY
 from storage.records.safe_read import read_safetensors
 from storage.records.texture import MAX_SIDE, content_digest
+
+
+def area_means(values: NDArray, height: int, width: int) -> NDArray[np.float64]:
+    """Return a flat picture [H, W, C] as [height, width, C] means."""
+    return _means(values, _overlaps(_even(len(values)), _even(height)), width)
+
+
+def solid_angle_means(radiance: NDArray, height: int) -> NDArray[np.float64]:
+    """Return a latitude-longitude map [H, 2H, C] as [height, 2 height, C] means by solid angle."""
+    rows = _overlaps(_latitudes(len(radiance)), _latitudes(height))
+    return _means(radiance, rows, 2 * height)
+
+
+def flux(radiance: NDArray) -> NDArray[np.float64]:
+    """Return the integral [C] over the sphere of a latitude-longitude map [H, W, C]."""
+    rows = np.diff(_latitudes(len(radiance))) * 2 * np.pi
+    return rows @ radiance.mean(axis=1, dtype=np.float64)
+
+
+def _means(values: NDArray, rows: csr_array, width: int) -> NDArray[np.float64]:
+    height = rows.shape[0]
+    channels = values.shape[2]
+    columns = _overlaps(_even(values.shape[1]), _even(width))
+    result = np.zeros((height, width, channels))
+    for channel in range(channels):  # one at a time: the largest maps take a gigabyte
+        result[..., channel] = (columns @ (rows @ values[..., channel].astype(np.float64)).T).T
+    return result
+
+
+def _even(count: int) -> NDArray[np.float64]:
+    return np.arange(count + 1) / count
+
+
+def _latitudes(count: int) -> NDArray[np.float64]:
+    """Return the borders of a map's rows as heights 1 - cos on the sphere."""
+    return 1 - np.cos(np.pi * np.arange(count + 1) / count)
+
+
+def _overlaps(source: NDArray[np.float64], target: NDArray[np.float64]) -> csr_array:
+    """Return the fraction [target, source] of each target interval that each source covers."""
+    ends = np.union1d(source, target)
+    ends = ends[np.concatenate([[True], np.diff(ends) > 1e-12])]  # rounding makes two of one
+    middle = (ends[:-1] + ends[1:]) / 2
+    into = np.clip(np.searchsorted(target, middle) - 1, 0, len(target) - 2)
+    out_of = np.clip(np.searchsorted(source, middle) - 1, 0, len(source) - 2)
+    fraction = np.diff(ends) / np.diff(target)[into]
+    return csr_array((fraction, (into, out_of)), shape=(len(target) - 1, len(source) - 1))
+
 
 MOST_BYTES = 1 << 30
 """Largest accepted size of one file, in bytes."""
@@ -90,10 +138,8 @@ def map_cache_key(kind: str, files: Mapping[str, Path], size: int) -> str:
 def prepare_map(kind: str, files: Mapping[str, Path], size: int) -> tuple[bytes, tuple[str, ...]]:
     """Return the file of a texture or map, and notes on unread parts; for child processes.
 
-    Args:
-        kind: TEXTURE or SKY.
-        files: picture files by component; a map has one, "map".
-        size: most texels along a side of a texture; most rows of a map.
+    Files are by component; a map has one, "map". `size` is the most texels along a side of a
+    texture, or rows of a map.
 
     Raises:
         Rejected: the reason and a remedy; see `usable_map`, `texture_set` and the readers.
@@ -131,10 +177,9 @@ def _prepare_sky(data: bytes, rows: int) -> tuple[bytes, tuple[str, ...]]:
 def texture_set(pictures: Mapping[str, NDArray[np.float32]], size: int) -> PreparedMap:
     """Return a texture.
 
-    Args:
-        pictures: encoded values [H, W, 1 or 3] of the component "base", and of "specular",
-            "roughness" and "metallic" where present. They may differ in size.
-        size: most texels along a side of the result.
+    Pictures are encoded values [H, W, 1 or 3] of the component "base", and of "specular",
+    "roughness" and "metallic" where present. They may differ in size. A side of the result has at
+    most `size` texels.
     """
     base = pictures["base"]
     height, width = _fitting_size(base.shape[:2], size)
@@ -281,9 +326,7 @@ def _plain_values(data: bytes) -> tuple[NDArray[np.float32], bool]:
 def usable_map(radiance: NDArray[np.float32], height: int) -> NDArray[np.float32]:
     """Return a map of at most `height` rows, by means over solid angle.
 
-    Args:
-        radiance: [H, W, 3] linear, the top row first.
-        height: most rows of the result; a smaller map stays unchanged.
+    The radiance [H, W, 3] is linear, the top row first; a smaller map stays unchanged.
 
     Raises:
         Rejected: not_two_to_one, not_a_number, infinite_radiance, negative_radiance,

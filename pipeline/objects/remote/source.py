@@ -1,22 +1,332 @@
-"""Objects of a remote folder: listed, then downloaded to the cache that all datasets share."""
+"""Objects of a remote folder: listed, then downloaded to the cache that all datasets share.
+
+A file lies below `files` under its own name, since the files of a glTF name each other. The
+server's version of it is stored below `versions`: while the server reports the same version, the
+file is not downloaded again. The files that a glTF names are downloaded with it, each once, whole
+or not at all. Nothing is written on the server.
+"""
 
 import dataclasses
+import errno
+import html
+import json
+import os
+import posixpath
+import threading
+from concurrent.futures import Future
 from functools import partial
 from pathlib import Path
+from typing import Any, BinaryIO, cast
+from urllib.parse import quote, unquote, urlsplit
 
 from pipeline.objects.licences import StatedLicence, require_unstated, stated_licence
 from pipeline.objects.listing import CountDone, Fetched, Listing, fetch_all
-from pipeline.objects.local.catalogue import CATALOGUE_NAMES, only_catalogue, read_catalogue
-from pipeline.objects.local.folder import list_files
-from pipeline.objects.remote.files import RemoteFiles
-from pipeline.objects.remote.folder import RemoteFolder
+from pipeline.objects.local.folder import (
+    CATALOGUE_NAMES,
+    list_files,
+    only_catalogue,
+    read_catalogue,
+)
+from storage.atomic import atomic_writer, remove_leftovers, write_atomically
 from storage.cache import cache_folder
 from storage.digests import sha256_hex
 from storage.errors import TrilightError
 from storage.records.objects import ObjectRecord
-from storage.remote.retries import TransferFailed
+from storage.remote.fetch import download, version_of
+from storage.remote.retries import TransferFailed, is_absent, with_tries
 from storage.remote.safe_url import printable, safe_url
-from storage.remote.url import RemoteUrl
+from storage.remote.url import RemoteUrl, shared_driver
+from storage.typed_json import read_json
+
+_MAX_NAME_BYTES = 220
+"""File systems allow 255; the rest is for the name of an unfinished file."""
+_MAX_PATH_BYTES = 2000
+_NAME_ERRORS = (errno.ENAMETOOLONG, errno.ENOTDIR, errno.EEXIST, errno.EISDIR, errno.EILSEQ)
+_MAX_BUFFERS = 100
+_MAX_JSON_BYTES = 64_000_000
+_STALE_S = 24 * 3600.0
+
+
+_MAX_FOLDERS = 10_000
+_MAX_DEPTH = 32
+"""Maximum depth of folders: a server may answer every address with the same page."""
+
+
+class RemoteFolder:
+    """Files of a remote folder by name: the unquoted path below it, with / between parts."""
+
+    def __init__(self, url: RemoteUrl) -> None:
+        """Open the driver; raises TrilightError where its package is missing."""
+        self.url = url
+        self.driver = shared_driver(url)
+        self.driver.invalidate_cache()  # one driver keeps listings although that is turned off
+        self._addresses: dict[str, str] = {}
+        self._facts: dict[str, dict[str, Any]] = {}
+
+    def address(self, name: str) -> str:
+        """Return the driver's address of a file."""
+        if name in self._addresses:
+            return self._addresses[name]
+        # Bytes that are not UTF-8 are lone surrogates in `name`.
+        inner = quote(name, errors="surrogateescape") if self.url.is_http else name
+        return f"{self.url.root}/{inner}"
+
+    def facts(self, name: str) -> dict[str, Any]:
+        """Return the server's metadata of a file; raises the driver's errors."""
+        if name in self._facts:
+            return self._facts[name]
+        return dict(self.driver.info(self.address(name)))
+
+    def has(self, name: str) -> bool:
+        """Return True where a file exists; False also where the server denies access.
+
+        Raises:
+            TrilightError: the server gives no answer.
+        """
+
+        def ask() -> bool:
+            try:
+                return self.driver.info(self.address(name))["type"] == "file"
+            except Exception as error:  # drivers raise exceptions of any type
+                if is_absent(error):
+                    return False
+                raise
+
+        try:
+            return with_tries(ask)
+        except TransferFailed as error:
+            raise TrilightError(
+                f"objects {self.url.display_url!r}: cannot be read ({error.message}); expected a "
+                "folder that can be reached. Check the URL and your access to it."
+            ) from error
+
+    def names(self) -> list[str]:
+        """Return the names of all files, at any depth.
+
+        Raises:
+            TrilightError: the folder cannot be listed, or has no end.
+        """
+        try:
+            return self._names_by_links() if self.url.is_http else self._names_by_find()
+        except TransferFailed as error:
+            hint = " Public buckets need FSSPEC_S3_ANON=true." if self.url.scheme == "s3" else ""
+            raise TrilightError(
+                f"objects {self.url.display_url!r}: cannot be listed ({error.message}); expected a "
+                "folder with a page that lists its files, or with objects.jsonl or objects.csv. "
+                f"Check the URL and your access to it.{hint}"
+            ) from error
+
+    def _names_by_find(self) -> list[str]:
+        start = f"{self.url.root}/"
+        listing = with_tries(lambda: self.driver.find(self.url.root, detail=True))
+        for address, facts in listing.items():
+            name = address.removeprefix(start)
+            if address.startswith(start) and name:
+                self._addresses[name] = address
+                self._facts[name] = facts
+        return sorted(self._addresses)
+
+    def _names_by_links(self) -> list[str]:
+        """Follow the links of the server's listings, only those below the folder."""
+        names: dict[str, str] = {}
+        folders = {f"{self.url.root}/"}
+        waiting = list(folders)
+        deepest = self.url.root.count("/") + _MAX_DEPTH
+        while waiting:
+            folder = waiting.pop()
+            for link in with_tries(partial(self.driver.ls, folder, detail=False)):
+                address = html.unescape(link).replace("/./", "/")
+                inner = _below(address, self.url.root)
+                if inner is None or address in folders:
+                    continue
+                if address.endswith("/"):
+                    folders.add(address)
+                    waiting.append(address)
+                else:
+                    names[inner] = address
+            if len(folders) > _MAX_FOLDERS or folder.count("/") > deepest:
+                raise TrilightError(
+                    f"objects {self.url.display_url!r}: the listing has no end; expected at most "
+                    f"{_MAX_FOLDERS} folders, {_MAX_DEPTH} deep. Give it objects.jsonl."
+                )
+        self._addresses = names
+        return sorted(names)
+
+
+def _below(address: str, root: str) -> str | None:
+    """Return the file name of a link, or None where it leads elsewhere or sorts the page."""
+    if not address.startswith(f"{root}/") or "?" in address or "#" in address:
+        return None
+    inner = unquote(address[len(root) + 1 :], errors="surrogateescape")
+    hidden_or_upward = any(part.startswith(".") for part in inner.split("/"))
+    return None if hidden_or_upward or not inner else inner
+
+
+class RemoteFiles:
+    """The local copies of a remote folder's files; safe for several threads."""
+
+    def __init__(self, folder: RemoteFolder, root: Path, max_bytes: int) -> None:
+        """Open the local copies and remove leftovers of earlier runs.
+
+        `root` is for this remote folder alone. An object has at most `max_bytes`, with the buffers
+        that it names.
+        """
+        self.files = Path(os.path.realpath(root)) / "files"
+        self.stop = threading.Event()
+        self._versions = self.files.parent / "versions"
+        self._folder = folder
+        self._max_bytes = max_bytes
+        self._lock = threading.Lock()
+        self._outcomes: dict[str, Future[Path]] = {}
+        # younger files may belong to a running process
+        remove_leftovers(self.files, older_than_s=_STALE_S)
+
+    def path(self, name: str) -> Path:
+        """Return the local path of a file; raises TransferFailed for unsafe names."""
+        parts = name.split("/")
+        encoded = [os.fsencode(part) for part in parts]
+        if (
+            any(part in ("", ".", "..") or "\x00" in part for part in parts)
+            or max(map(len, encoded)) > _MAX_NAME_BYTES
+            or sum(map(len, encoded)) > _MAX_PATH_BYTES
+        ):
+            message = f"the name {printable(name)[:100]!r} cannot be that of a file here"
+            raise TransferFailed("unsafe_name", message)
+        return self.files / name
+
+    def fetch_object(self, name: str) -> Path:
+        """Download a file, and the buffers of a `.gltf`; return its local path.
+
+        Raises:
+            TransferFailed: unsafe_name, too_large_bytes, too_many_buffers, download_failed.
+            TrilightError: the disk is full or cannot be written.
+        """
+        path = self.fetch(name)
+        if name.lower().endswith(".gltf"):
+            buffers = buffer_names(path, name)
+            if len(buffers) > _MAX_BUFFERS:
+                message = f"names {len(buffers)} buffers; expected at most {_MAX_BUFFERS}"
+                raise TransferFailed("too_many_buffers", message)
+            total = path.stat().st_size
+            for buffer in buffers:
+                try:
+                    total += self.fetch(buffer).stat().st_size
+                except TransferFailed as error:
+                    message = f"buffer {printable(buffer)[:100]}: {error.message}"
+                    raise TransferFailed(error.reason, message) from error
+                self._check_size(total)
+        return path
+
+    def fetch(self, name: str) -> Path:
+        """Download one file once per instance; raises as `fetch_object`."""
+        with self._lock:
+            is_first = name not in self._outcomes
+            outcome = self._outcomes.setdefault(name, Future())
+        if is_first:
+            try:
+                outcome.set_result(self._refresh(name))
+            except BaseException as error:
+                outcome.set_exception(error)
+        return outcome.result()
+
+    def _refresh(self, name: str) -> Path:
+        """Download a file unless the local copy has the server's version; return its path."""
+        path = self.path(name)
+        facts = with_tries(lambda: self._folder.facts(name))
+        if facts.get("type") == "directory":
+            raise TransferFailed("download_failed", "is a folder, not a file")
+        size = facts.get("size")
+        self._check_size(size or 0)
+        version = version_of(facts)
+        if size is not None:
+            version["size"] = str(size)
+        note = self._versions / f"{sha256_hex(os.fsencode(name))}.json"
+        if not version or not _is_here(path, note, version):
+            self._transfer(name, path, size)
+            write_atomically(note, json.dumps(version, sort_keys=True).encode())
+        return path
+
+    def _transfer(self, name: str, path: Path, size: int | None) -> None:
+        url = dataclasses.replace(self._folder.url, root=self._folder.address(name))
+        try:
+            with atomic_writer(path) as stream:
+                target = cast(BinaryIO, _StoppableStream(stream, self.stop))
+                download(url, target, num_bytes=size, max_bytes=self._max_bytes)
+        except TrilightError as error:
+            if isinstance(error.__cause__, OSError) and error.__cause__.errno in _NAME_ERRORS:
+                message = f"the name {printable(name)[:100]!r} clashes with another one here"
+                raise TransferFailed("unsafe_name", message) from error
+            raise
+
+    def _check_size(self, size: int) -> None:
+        if size > self._max_bytes:
+            message = f"{size} bytes; expected <= {self._max_bytes}"
+            raise TransferFailed("too_large_bytes", message)
+
+
+class _StoppableStream:
+    """An open file that takes no more bytes once the run has ended."""
+
+    def __init__(self, stream: Any, stop: threading.Event) -> None:
+        self._stream = stream
+        self._stop = stop
+
+    def write(self, data: bytes) -> None:
+        if self._stop.is_set():
+            raise TransferFailed("download_failed", "the run was ended")
+        self._stream.write(data)
+
+    def __getattr__(self, name: str) -> Any:
+        return getattr(self._stream, name)
+
+
+def _is_here(path: Path, note: Path, version: dict[str, str]) -> bool:
+    try:
+        known = read_json(note.read_bytes(), dict[str, str], str(note))
+        return known == version and str(path.stat().st_size) == known.get(
+            "size", str(path.stat().st_size)
+        )
+    except (OSError, ValueError):
+        return False
+
+
+def buffer_names(path: Path, name: str) -> list[str]:
+    """Return the files that the buffers of a `.gltf` name, each once, in order.
+
+    Other URIs than relative ones below the file's folder are left out, and a file that is not a
+    glTF has none: the mesh stage reads it again and reports the error. `name` is the path of the
+    file below the remote folder; the results are such paths too.
+    """
+    try:
+        if path.stat().st_size > _MAX_JSON_BYTES:
+            return []
+        tree = json.loads(path.read_bytes())
+    except (OSError, ValueError, RecursionError):
+        return []
+    buffers = tree.get("buffers") if isinstance(tree, dict) else None
+    folder = posixpath.dirname(name)
+    names: dict[str, None] = {}
+    for buffer in buffers if isinstance(buffers, list) else ():
+        uri = buffer.get("uri") if isinstance(buffer, dict) else None
+        inner = _inner(uri) if isinstance(uri, str) else None
+        if inner is not None:
+            names[posixpath.join(folder, inner)] = None
+    return list(names)
+
+
+def _inner(uri: str) -> str | None:
+    """Return the path that a relative URI names below its folder, or None."""
+    try:
+        parts = urlsplit(uri)
+    except ValueError:
+        return None
+    inner = posixpath.normpath(unquote(uri))
+    if parts.scheme or parts.netloc or not uri or "\x00" in inner or "\n" in inner:
+        return None
+    if inner.startswith("/") or inner in (".", "..") or inner.startswith("../"):
+        return None
+    return inner
+
 
 MAX_BYTES = 200_000_000
 """Largest downloaded object with its buffers, in bytes: the limit of the mesh stage."""

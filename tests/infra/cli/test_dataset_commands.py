@@ -48,7 +48,7 @@ from tests.pipeline.documents.dataset_by_hand import (
     sample,
     write_dataset,
 )
-from tests.pipeline.exchange.strangers_stage import write_stage
+from tests.pipeline.exchange.exchange_kit import write_stage
 from tests.pipeline.generation.test_dataset_writer import begin_tiny, make_tiny_shard
 from tests.pipeline.generation.test_derive_dataset import finished, scenes
 from tests.scenes_by_hand import tiny_sample, tiny_scene

@@ -48,7 +48,7 @@ from tests.for_each import case
 from tests.infra.child_here import use_processes
 from tests.infra.conftest import write_network
 from tests.model.test_inference import many_lights
-from tests.pipeline.exchange.strangers_stage import write_stage
+from tests.pipeline.exchange.exchange_kit import write_stage
 from tests.scenes_by_hand import tiny_sample, tiny_scene
 from train.evaluation.error_colors import error_picture
 

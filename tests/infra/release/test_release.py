@@ -30,10 +30,10 @@ from tests.pipeline.documents.dataset_by_hand import (
     edit_manifest,
     five_scenes,
     furnished,
+    read,
     sample,
     write_dataset,
 )
-from tests.pipeline.documents.pages_read import read
 
 
 def beside(key: str, network_db: float) -> SceneComparison:

@@ -36,8 +36,8 @@ from infra.viewer.server import (
     refusal,
 )
 from pipeline.exchange.convert import write_scene
+from pipeline.generation.derive_dataset import Selection, list_scenes
 from pipeline.renders.mitsuba_variant import Variant, choose_variant
-from pipeline.shards.derive import Selection, list_scenes
 from pipeline.shards.finished_dataset import FinishedDataset
 from storage.conventions import preview_srgb8
 from storage.dataset.dataset import Dataset

@@ -28,7 +28,7 @@ from tests.pipeline.assets.meshes_by_hand import (
     write_glb,
 )
 from tests.pipeline.assets.source_materials import textured_kit as kit
-from tests.pipeline.assets.source_materials.usd_kit import (
+from tests.pipeline.assets.source_materials.textured_kit import (
     MESH,
     SHADER,
     TEXTURE,

@@ -2,12 +2,15 @@
 
 Every scene has the floor (two triangles, smooth, one material) and the light of the tiny scene, and
 per object two flat triangles of two colours, seen by two cameras.
+
+And pages as a browser would read them, with text and rows of objects that mean harm.
 """
 
 import contextlib
 import dataclasses
 import json
 from collections.abc import Mapping, Sequence
+from html.parser import HTMLParser
 from pathlib import Path
 from typing import Any
 
@@ -18,9 +21,11 @@ from storage.dataset.layout import DatasetFolder
 from storage.dataset.manifest import Manifest, index_shard, read_manifest, write_manifest
 from storage.dataset.shard import write_shard
 from storage.errors import TrilightError
+from storage.records.asset import AssetRow
 from storage.records.objects import Failure, LockedObject, write_failures, write_objects_lock
 from storage.records.sample import Sample, encode_sample, sample_key
 from storage.records.scene import Scene, SceneObject
+from tests.pipeline.scenes.small_pool import QUALITY, SOURCE
 from tests.scenes_by_hand import tiny_sample, tiny_scene
 
 RED, GREEN = [0.6, 0, 0, 0.1, 0.1, 0.1, 0.3, 0, 0, 0], [0.2, 0.4, 0, 0.1, 0.1, 0.1, 0.3, 0, 0, 0]
@@ -137,3 +142,66 @@ def edit_manifest(dataset: Dataset, **changes: Any) -> Path:
         record |= {"dataset_digest": now.dataset_digest, "totals": totals}
         path.write_text(json.dumps(record))
     return dataset.folder.root
+
+
+HARM = """<script>alert(1)</script><img src=x onerror=alert(2)>"'&"""
+VOID = {"meta", "img", "br", "input"}
+
+
+class Tags(HTMLParser):
+    """Collects tags, attributes and text, and checks that tags close in order."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.tags: list[str] = []
+        self.links: list[str] = []
+        self.names: set[str] = set()
+        self.ids: set[str] = set()
+        self.styles: set[str] = set()
+        self.text: list[str] = []
+        self._open: list[str] = []
+
+    def handle_starttag(self, tag: str, attrs: list[tuple[str, str | None]]) -> None:
+        self.tags.append(tag)
+        self.names.update(name for name, _ in attrs)
+        self.styles.update(value or "" for name, value in attrs if name == "style")
+        self.ids.update(value or "" for name, value in attrs if name == "id")
+        self.links += [value or "" for name, value in attrs if name in ("src", "href")]
+        if tag not in VOID:
+            self._open.append(tag)
+
+    def handle_endtag(self, tag: str) -> None:
+        assert self._open.pop() == tag
+
+    def handle_data(self, data: str) -> None:
+        self.text.append(data)
+
+
+def text_of(tags: Tags) -> str:
+    """Return the text of a page with single spaces."""
+    return " ".join(" ".join(tags.text).split())
+
+
+def read(page: bytes) -> Tags:
+    tags = Tags()
+    tags.feed(page.decode())
+    tags.close()
+    assert tags._open == []
+    return tags
+
+
+def row(uid: str = "made/ball", **changes: Any) -> AssetRow:
+    plain = AssetRow(
+        uid=uid,
+        path="meshes/ball.ply",
+        title="Ball",
+        licence="CC0-1.0",
+        licence_source="tests",
+        attribution="its maker",
+        source_url="https://example.org/ball",
+        num_faces=1280,
+        method="source",
+        quality=QUALITY,
+        source=SOURCE,
+    )
+    return dataclasses.replace(plain, **changes)

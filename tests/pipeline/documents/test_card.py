@@ -14,8 +14,7 @@ import numpy as np
 import pytest
 import yaml
 
-from pipeline.documents.card import _size_category, encode_card
-from pipeline.documents.dataset_documents import write_documents
+from pipeline.documents.dataset_documents import _size_category, encode_card, write_documents
 from pipeline.documents.distributions import Distributions, dataset_distributions
 from pipeline.documents.rights import encode_licences, rights_of
 from storage.dataset.dataset import Dataset, open_dataset

@@ -21,8 +21,7 @@ from pipeline.documents.figures import (
     draw_panels,
     short_label,
 )
-from pipeline.documents.gallery import write_gallery
-from pipeline.documents.report import _rejections, write_report
+from pipeline.documents.report import _rejections, write_gallery, write_report
 from pipeline.documents.scene_page import Neighbours, encode_scene_page, shown_maps
 from storage.dataset.dataset import Dataset, open_dataset
 from storage.dataset.layout import DatasetFolder
@@ -31,14 +30,17 @@ from storage.records.objects import Failure
 from storage.records.scene import SceneObject
 from storage.records.texture import MapSource, Texture
 from tests.pipeline.documents.dataset_by_hand import (
+    HARM,
+    Tags,
     edit_manifest,
     five_scenes,
     furnished,
     locked,
+    read,
     sample,
+    text_of,
     write_dataset,
 )
-from tests.pipeline.documents.pages_read import HARM, Tags, read, text_of
 from tests.pipeline.documents.test_card import card_of
 from tests.scenes_by_hand import tiny_scene
 from tests.textured_by_hand import sky, textured_scene

@@ -19,23 +19,21 @@ from storage.records.scene import Scene, SceneObject
 from tests.for_each import for_each
 from tests.pipeline.exchange.exchange_kit import assert_json_keeps_light, json_and_back
 from tests.pipeline.scenes.example_scenes import (
-    EXAMPLES,
-    PlainObj,
-    corners_of,
-    example_scene,
-    plain_obj,
-)
-from tests.pipeline.scenes.one_box import (
     BOX,
     CAMERA,
+    EXAMPLES,
     MATERIAL,
     OBJECT,
     SCENE,
     TRANSFORM,
+    PlainObj,
     built,
     changed,
+    corners_of,
     described,
+    example_scene,
     loaded,
+    plain_obj,
 )
 from tests.scenes_by_hand import LIGHT, tiny_scene
 

@@ -16,8 +16,12 @@ from typing import Any
 import pytest
 
 from pipeline.generation.dataset_writer import begin_or_resume_dataset
-from pipeline.generation.derive_dataset import derive_dataset
-from pipeline.shards.derive import DeriveOptions, Selection, derive_shards
+from pipeline.generation.derive_dataset import (
+    DeriveOptions,
+    Selection,
+    derive_dataset,
+    derive_shards,
+)
 from pipeline.shards.finished_dataset import open_finished
 from pipeline.shards.pack_shards import pack_shard
 from storage.dataset import layout
@@ -503,7 +507,7 @@ KILLED = """
 import sys
 from pathlib import Path
 from pipeline.generation import derive_dataset as flow
-from pipeline.shards.derive import DeriveOptions
+from pipeline.generation.derive_dataset import DeriveOptions
 
 def stop(done, total):
     if done > 4:  # three are read, one is written

@@ -12,12 +12,12 @@ from infra.repair import repair
 from pipeline.exchange.reader import file_child
 from pipeline.executors.threads import ThreadRunner
 from pipeline.generation.dataset_writer import begin_or_resume_dataset
+from pipeline.generation.derive_dataset import _extensions
 from pipeline.generation.freeze_objects import ObjectLock
 from pipeline.generation.generate_options import GenerateOptions
 from pipeline.generation.pipeline import make_dataset, make_task, prepare_dataset
 from pipeline.isolation import call_with_retries
 from pipeline.presets.registry import DATASET_PRESETS, preset_settings, resolve_dataset_preset
-from pipeline.shards.derive import _extensions
 from pipeline.shards.pack_shards import hold_dataset_lock
 from scene_templates.families import FAMILIES
 from storage.dataset.dataset import open_dataset

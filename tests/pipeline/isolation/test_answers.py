@@ -1,10 +1,12 @@
-"""Whatever bytes a child sends, its owner gets what was declared, or a sentence.
+"""Whatever bytes a child sends, its owner gets what was declared, or a sentence."""
 
-Values cross without pickle: they come back as they were, and as nothing but what is declared.
-"""
-
+import ast
+import contextlib
 import dataclasses
+import importlib
+import inspect
 import json
+import operator
 import os
 import pickle  # noqa: TID251 - what an attacker would send
 import time
@@ -22,6 +24,9 @@ from hypothesis import strategies as st
 from hypothesis.extra import numpy as hnp
 from numpy.typing import NDArray
 
+from pipeline.exchange.convert import convert_sources
+from pipeline.exchange.formats import SceneSource
+from pipeline.exchange.open_scene import load_cameras, load_source, source_keys
 from pipeline.isolation import ChildFailed, ChildLimits, IsolatedChild, answers
 from pipeline.isolation.answers import (
     CLASS,
@@ -33,8 +38,12 @@ from pipeline.isolation.answers import (
 from pipeline.isolation.result_schema import DTYPES, result_reader
 from storage.array_hints import array_scalar
 from storage.errors import EnvironmentFailure, Rejected, TrilightError
+from storage.installation import module_name
+from tests.conftest import ROOT
 from tests.for_each import for_each
 from tests.pipeline.isolation import called
+from tests.scenes_by_hand import tiny_scene
+from trilight import write_scene
 
 LIMITS = ChildLimits(memory_bytes=1 << 30, wall_s=1.5, calls_per_child=100)
 
@@ -323,3 +332,60 @@ def test_values_come_whole_and_only_as_their_function_declares_them(child: Isola
     assert child.call(called.large) == called.large()
     with closing(child), pytest.raises(ChildFailed, match="status 3"):
         child.call(os._exit, 3)  # a builtin returns nothing
+
+
+CALLS = {"call_with_retries": 1, "_call": 1, "call": 0, "call_method": 0}
+"""Who calls in a child, and which of its arguments is the function."""
+
+
+def _called() -> Iterator[tuple[str, str]]:
+    """Yield module and source text of what is handed to such a call by its name."""
+    for path in sorted(
+        path for top in ("pipeline", "infra") for path in (ROOT / top).rglob("*.py")
+    ):
+        module = ".".join(path.relative_to(ROOT).with_suffix("").parts)
+        for node in ast.walk(ast.parse(path.read_text())):
+            if not isinstance(node, ast.Call):
+                continue
+            at = CALLS.get(getattr(node.func, "attr", getattr(node.func, "id", "")), 99)
+            for each in map(ast.walk, node.args[at : at + 1]):  # each of `a if b else c`
+                yield from (
+                    (module, ast.unparse(one))
+                    for one in each
+                    if isinstance(one, ast.Name | ast.Attribute)
+                )
+
+
+def test_what_is_called_in_children_declares_what_can_be_checked() -> None:
+    pytest.importorskip("torch", reason="some of it needs torch")
+    known: dict[tuple[str, str], Any] = {}
+    for module, name in _called():
+        with contextlib.suppress(AttributeError):  # a name within a function
+            held = importlib.import_module(module_name(module))
+            known[module, name] = operator.attrgetter(name)(held)
+    known = {key: one for key, one in known.items() if inspect.isfunction(one)}
+    assert len(known) > 35, "the walk finds them"
+    assert {name for _, name in known} >= {"attempt_in_child", "SceneWorker.attempt", "load_source"}
+    undeclared = {}
+    for each, function in known.items():
+        try:
+            assert "return" in function.__annotations__, "says nothing"
+            result_reader(function)
+        except (TypeError, AssertionError) as error:
+            undeclared[each] = str(error)
+    assert not undeclared
+
+
+def test_a_real_answer_is_as_declared(tmp_path: Path) -> None:
+    """Of meshes and renders too: tests/infra/child_here.py reads each answer as an owner does."""
+    write_scene(tiny_scene(), tmp_path / "scene.json")
+    source = SceneSource(path=tmp_path / "scene.json", key=None)
+    calls: list[tuple[Callable[..., Any], Any]] = [
+        (each, each(source)) for each in (load_source, load_cameras, source_keys)
+    ]
+    calls.append((convert_sources, convert_sources([source], tmp_path / "out.glb", None)))
+    for function, value in calls:
+        sent = encode_result(value)
+        answer = decode_answer([np.frombuffer(part, np.uint8).copy() for part in sent], function)
+        assert isinstance(answer, type(value) | tuple)
+        assert encode_result(answer) == sent

@@ -27,8 +27,14 @@ from scene_templates.sample_layout import sample_layout, scene_plan
 from storage.records.material import DIFFUSE, EMISSION, ROUGHNESS, SPECULAR
 from storage.records.scene import Scene, SceneObject
 from storage.seeds import rng_for
-from tests.pipeline.scenes.scene_facts import planes_of, points_of, rows_of, triangles_of
-from tests.pipeline.scenes.small_pool import LOOK, first_scene
+from tests.pipeline.scenes.small_pool import (
+    LOOK,
+    first_scene,
+    planes_of,
+    points_of,
+    rows_of,
+    triangles_of,
+)
 from tests.scene_templates.balls import STILL
 from tests.scene_templates.published import DEFAULT, STAGE_1
 from tests.scene_templates.statistics import (

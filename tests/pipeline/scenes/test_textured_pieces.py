@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
 from model.hits.textures import surface_textures
+from pipeline.scenes.compose import fill_triangles, subdivide
 from pipeline.scenes.pieces import (
     ScenePiece,
     Skin,
@@ -24,7 +25,6 @@ from pipeline.scenes.pieces import (
 from pipeline.scenes.redrawn import with_new_lights
 from pipeline.scenes.shading_normals import flat_shaded
 from pipeline.scenes.source_materials import source_skins, with_source_emission
-from pipeline.scenes.subdivision import fill_triangles, subdivide
 from pipeline.scenes.triangle_budget import PooledAsset
 from scene_templates.families import DEFAULT_FAMILIES
 from scene_templates.layout import Emitter, Layout, ObjectPlacement, Pose, ShellPart

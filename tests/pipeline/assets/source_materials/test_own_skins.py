@@ -15,9 +15,8 @@ from pipeline.assets.cleaning.clean import clean, normalize
 from pipeline.assets.cleaning.orient import orient_outward
 from pipeline.assets.settings import AssetSettings, OwnMaterialSettings
 from pipeline.assets.source_materials.skin import add_skin, read_source_surface
-from pipeline.foreign.load_mesh import load_mesh
 from pipeline.foreign.mesh import TriangleMesh
-from pipeline.foreign.source_file import read_source
+from pipeline.foreign.source_file import load_mesh, read_source
 from storage.conventions import linear_from_srgb8
 from storage.errors import Rejected
 from storage.records.asset import LevelSkin, decode_asset, encode_asset
@@ -39,20 +38,18 @@ from tests.pipeline.assets.source_materials.textured_kit import (
     OWN,
     SQUARE,
     STORED,
+    TEXTURE,
     UV_UP,
     F,
     assert_corners,
+    connect_texture,
     picture_bytes,
     seen_at,
+    set_inputs,
     textured_glb,
     textured_gltf,
     textured_obj,
     textured_tree,
-)
-from tests.pipeline.assets.source_materials.usd_kit import (
-    TEXTURE,
-    connect_texture,
-    set_inputs,
     textured_usd,
 )
 

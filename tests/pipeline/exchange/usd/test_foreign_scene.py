@@ -10,7 +10,7 @@ import pytest
 from PIL import Image
 from pxr import Gf, Sdf, Usd, UsdGeom, UsdLux, UsdShade, UsdUtils
 
-from pipeline.exchange.loaded_scene import LoadedScene
+from pipeline.exchange.textured_triangles import LoadedScene
 from pipeline.exchange.usd.read_usd import read_usd, usd_keys
 from pipeline.exchange.usd.write_usd import SUFFIXES, write_usd
 from pipeline.isolation import ChildFailed, ChildLimits, IsolatedChild
@@ -21,8 +21,7 @@ from storage.records.material import EMISSION
 from storage.records.scene import Scene
 from tests.for_each import for_each
 from tests.pipeline.assets.source_materials.textured_kit import F
-from tests.pipeline.exchange.exchange_kit import row_at
-from tests.pipeline.exchange.strangers_stage import L_SHAPE, mesh, write_stage
+from tests.pipeline.exchange.exchange_kit import L_SHAPE, mesh, row_at, write_stage
 from tests.scenes_by_hand import tiny_scene
 
 

@@ -14,7 +14,7 @@ from PIL import Image
 from pxr import Gf, Sdf, Usd, UsdGeom, UsdLux, UsdShade
 
 from pipeline.exchange.formats import FORMATS, drop_uncarried_maps, list_lost_members
-from pipeline.exchange.loaded_scene import LoadedScene
+from pipeline.exchange.textured_triangles import LoadedScene
 from pipeline.exchange.usd.read_usd import read_usd, usd_keys
 from pipeline.exchange.usd.write_usd import SUFFIXES, write_usd, write_usd_shard
 from scene_templates.rotations import uniform_rotation

@@ -13,12 +13,11 @@ from numpy.typing import NDArray
 
 from pipeline.assets.source_materials.skin import _parts
 from pipeline.exchange.gltf.read_gltf import read_gltf
-from pipeline.exchange.loaded_scene import LoadedScene
+from pipeline.exchange.textured_triangles import LoadedScene
 from pipeline.foreign.limits import ReadLimits
-from pipeline.foreign.load_mesh import load_mesh
 from pipeline.foreign.material import SourceMaterial, source_columns
 from pipeline.foreign.picture import Decoder
-from pipeline.foreign.source_file import read_source
+from pipeline.foreign.source_file import load_mesh, read_source
 from storage.errors import Rejected, TrilightError
 from storage.records.lookup import textured_rows
 from tests.for_each import case, for_each

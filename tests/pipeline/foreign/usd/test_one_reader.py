@@ -10,7 +10,7 @@ from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 from pxr import Gf, Sdf, Usd, UsdGeom, UsdLux, UsdShade, UsdSkel, Vt
 
-from pipeline.exchange.loaded_scene import LoadedScene
+from pipeline.exchange.textured_triangles import LoadedScene
 from pipeline.exchange.usd.read_usd import read_usd
 from pipeline.foreign.material import source_columns
 from pipeline.foreign.source_file import read_source
@@ -18,8 +18,7 @@ from pipeline.foreign.usd.materials import usd_textured_mesh
 from storage.errors import Rejected, TrilightError
 from storage.records.material import DIFFUSE, EMISSION, ROUGHNESS
 from tests.for_each import for_each
-from tests.pipeline.assets.source_materials.textured_kit import KEEP, F
-from tests.pipeline.assets.source_materials.usd_kit import new_stage
+from tests.pipeline.assets.source_materials.textured_kit import KEEP, F, new_stage
 
 POINTS = ((0, 0, 0), (1, 0, 0), (0, 2, 0), (0, 0, 3))
 SIDES = ((0, 2, 1), (0, 1, 3), (0, 3, 2), (1, 2, 3))

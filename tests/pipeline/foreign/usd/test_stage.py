@@ -8,7 +8,7 @@ import pytest
 from pxr import Usd, UsdGeom
 
 from pipeline.exchange.usd.write_usd import write_usd
-from pipeline.foreign.usd import composition, placed
+from pipeline.foreign.usd import placed
 from pipeline.foreign.usd import stage as opening
 from pipeline.foreign.usd.stage import OpenedStage, read_quietly
 from pipeline.foreign.usd.texture_nodes import asset_bytes
@@ -153,7 +153,7 @@ TENFOLD = "".join(
     + "}\n"
     for i in range(12)
 )
-DEEP = composition.MAX_DEPTH + 1
+DEEP = opening.MAX_DEPTH + 1
 
 
 @for_each(
@@ -169,8 +169,8 @@ def test_what_arcs_multiply_is_left(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, text: str, most_s: float, message: str
 ) -> None:
     """10^12 prims by a class that its heir brings; more bombs are in `tests/hostile`."""
-    monkeypatch.setattr(composition, "MAX_PRIMS", 1000)
-    monkeypatch.setattr(composition, "MAX_COMPOSITION_S", most_s)
+    monkeypatch.setattr(opening, "MAX_PRIMS", 1000)
+    monkeypatch.setattr(opening, "MAX_COMPOSITION_S", most_s)
     (tmp_path / "lib.usda").write_text(f'{HEAD}class "_c" {{}}\ndef "A" (inherits = </_c>) {{}}')
     (tmp_path / "bomb.usda").write_text(text)
     with pytest.raises(TrilightError, match=message):
@@ -185,9 +185,9 @@ def test_exactly_what_composition_makes_is_counted(
         'def "Q" (references = </P>) {\ndef "c" (references = </P>) {}\n}\n'
         'def "R" (inherits = </Q>) {\nover "c" {\ndef "d" {}\n}\n}\n'
     )
-    monkeypatch.setattr(composition, "MAX_PRIMS", 17)  # with the root of all
+    monkeypatch.setattr(opening, "MAX_PRIMS", 17)  # with the root of all
     assert len(prims_of(tmp_path / "b.usda")) == 16
-    monkeypatch.setattr(composition, "MAX_PRIMS", 16)
+    monkeypatch.setattr(opening, "MAX_PRIMS", 16)
     with pytest.raises(TrilightError, match="more than 16 prims"):
         prims_of(tmp_path / "b.usda")
 
@@ -200,7 +200,7 @@ def test_instances_of_one_prototype_count_once(
         f'def "I{i}" (instanceable = true\nreferences = </P>) {{}}\n' for i in range(50)
     )
     (tmp_path / "i.usda").write_text(f'{HEAD}def "P" {{\n{inner}}}\n{heirs}')
-    monkeypatch.setattr(composition, "MAX_PRIMS", 1 + 51 + 50 + 50)
+    monkeypatch.setattr(opening, "MAX_PRIMS", 1 + 51 + 50 + 50)
     prims_of(tmp_path / "i.usda")
 
 

@@ -10,12 +10,14 @@ from PIL import Image
 from pipeline.objects.licences import DEFAULT_ALLOWED
 from pipeline.objects.maps.listing import FoundMaps, find_maps
 from pipeline.objects.maps.prepared import (
+    area_means,
     decode_prepared,
+    flux,
     prepare_map,
+    solid_angle_means,
     texture_set,
     usable_map,
 )
-from pipeline.objects.maps.resample import area_means, flux, solid_angle_means
 from pipeline.objects.maps.texture_names import _parse_name, group_textures
 from storage.conventions import linear_from_srgb8
 from storage.errors import Rejected, TrilightError

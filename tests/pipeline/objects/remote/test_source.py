@@ -131,7 +131,7 @@ class _Bucket:
 def bucket(monkeypatch: pytest.MonkeyPatch) -> _Bucket:
     """The bucket that any address leads to."""
     made = _Bucket({f"bucket/{name}.obj": name.encode() for name in "abc"})
-    for user in ("pipeline.objects.remote.folder", "storage.remote.fetch"):
+    for user in ("pipeline.objects.remote.source", "storage.remote.fetch"):
         monkeypatch.setattr(f"{user}.shared_driver", lambda url: made)
     return made
 
