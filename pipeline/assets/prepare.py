@@ -31,9 +31,11 @@ def prepare_asset(
 ) -> AssetAttempt:
     """Return the clean, outward oriented object at every budget that passes the quality checks.
 
-    No other file than `path` is opened, but the buffers that a glTF names, and pictures below
-    `root` (`read_source`). `method` is a name of `recipe.methods_of`, for levels other than the
-    unchanged source.
+    Args:
+        path: the only file that is opened, with the buffers that a glTF names below its folder.
+        settings: profile, budgets and limits.
+        method: a name of `recipe.methods_of`, for levels other than the unchanged source.
+        root: folder of its pictures, as in `read_source`.
 
     Raises:
         Rejected: the object is unusable by any method; each step has its reason codes.

@@ -69,8 +69,11 @@ def prepare_assets(
 ) -> tuple[list[PreparedObject], list[Failure]]:
     """Prepare every object in isolated children; returns both lists in the order of `records`.
 
-    Outcomes of earlier runs come from `store`. `borrow_child` lends a child with the limits of this
-    stage. `done` is called after each object, from any thread.
+    Args:
+        records: the objects; outcomes of earlier runs come from `store`.
+        borrow_child: lends a child with the limits of this stage.
+        workers: objects that are prepared at a time.
+        done: called after each object, from any thread.
 
     Raises:
         TrilightError: the store cannot be written, or a needed library is not installed.

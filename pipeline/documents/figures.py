@@ -105,7 +105,10 @@ def draw_panels(panels: Sequence[Panel], *, columns: int = 2) -> bytes:
 def draw_bars(bars: Sequence[str], parts: Mapping[str, ArrayLike], *, label: str) -> bytes:
     """Return a PNG file of horizontal stacked bars, the first on top.
 
-    `parts` has the lengths [bars] of each segment by its name, and `label` is that of the lengths.
+    Args:
+        bars: the name of each bar.
+        parts: the lengths [bars] of each segment, by its name.
+        label: label of the lengths.
     """
     names = [short_label(name) for name in bars]
     width = 2 * _PANEL_INCHES[0]

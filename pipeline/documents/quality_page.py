@@ -40,8 +40,12 @@ def encode_quality_page(
 ) -> bytes:
     """Return the page.
 
-    Pictures are by the name of their group, unread parts by uid. `target` is that of the mesh
-    stage, in words.
+    Args:
+        rows: the accepted objects; `failures` are the rejected ones.
+        pairs: pictures by the name of their group.
+        unread: unread parts of accepted objects, by uid.
+        budget: most triangles of an object.
+        target: target of the mesh stage, in words.
     """
     requests = [row.materials for row in rows if row.materials is not None]
     return render_page(

@@ -158,8 +158,9 @@ def write_report(
 ) -> Path:
     """Write `report.html` and the pages of its gallery, and return the path of the former.
 
-    The gallery has at most `max_scenes` scenes, up to 1000, spread over splits and shards. `out` is
-    by default the dataset's folder.
+    Args:
+        max_scenes: most scenes in the gallery, up to 1000; they are spread over splits and shards.
+        out: folder to write into; None for the dataset's folder.
 
     Raises:
         TrilightError: a shard is missing, a sample unreadable, or the folder cannot be written.

@@ -77,8 +77,9 @@ def rights_of(objects: Iterable[LockedObject]) -> Rights:
 def hub_licence(rights: Rights, *, link: str) -> dict[str, str]:
     """Return the licence fields of the front matter of a Hugging Face card.
 
-    Without objects they are empty. `link` names a file with details, unless there is only one
-    licence and Hugging Face knows it.
+    Args:
+        rights: rights to the objects; without objects the result is empty.
+        link: file with details, unless there is only one licence and Hugging Face knows it.
     """
     if not rights.licences:
         return {}

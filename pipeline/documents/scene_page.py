@@ -121,8 +121,9 @@ PASS_VIEWS = (
 def passes_command(*, scene: str | None = None, for_page: bool = False) -> str:
     """Return the command that writes passes beside a dataset; it is run in the dataset's folder.
 
-    It writes those of all scenes or of the one with a key; `for_page` chooses the passes of a
-    scene's page.
+    Args:
+        scene: key of the only scene; None for all.
+        for_page: True for the passes of a scene's page; False for those that the command chooses.
     """
     one = "" if scene is None else f" --scene {scene}"
     words = ",".join(pass_view.word for pass_view in PASS_VIEWS)

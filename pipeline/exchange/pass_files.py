@@ -33,11 +33,16 @@ def write_passes(
     """Write `SCENE.VIEW.passes.exr` into a folder for each chosen view; return notes.
 
     With the resolution and the single ray of a dataset that stores the same passes, the files equal
-    the stored ones byte for byte. The source is a dataset (folder or URL), or a scene in any form
-    that `trilight convert` reads. A key, with or without zeros, and a view choose one; None stands
-    for all. The resolution, width and height in pixels, is by default that of the dataset's
-    pictures, or 256. `rays_a_side` are rays along each side of a pixel, and `done` is called with
-    each written file.
+    the stored ones byte for byte.
+
+    Args:
+        source: a dataset (folder or URL), or a scene in any form that `trilight convert` reads.
+        out: the folder, which is created.
+        names: of the passes.
+        scene, view: key of the only scene, with or without zeros, and the only view; None for all.
+        resolution: width and height in pixels; None for that of the dataset's pictures, or 256.
+        rays_a_side: rays along each side of a pixel.
+        done: called with each written file.
 
     Raises:
         TrilightError: the source is unusable, there is no such scene, view or pass, or the folder

@@ -35,7 +35,8 @@ class SceneReader(contextlib.AbstractContextManager["SceneReader"]):
     def __init__(self, albedo_over_one: AlbedoOverOne = "scale") -> None:
         """Create the reader; the child starts with the first call.
 
-        Albedos over 1 in RenderFormer's JSON are treated so.
+        Args:
+            albedo_over_one: treatment of albedos over 1 in RenderFormer's JSON.
         """
         self._child = file_child()
         self._over_one = albedo_over_one
@@ -120,7 +121,8 @@ def file_child(confined_to: Reach = NO_FILES) -> IsolatedChild:
 def unconfined_child(address_space: Callable[[int], int]) -> IsolatedChild:
     """Return an unconfined child with limits, for scenes that are already read; close it.
 
-    `address_space` returns the memory limit for what the child renders with, of the usual one.
+    Args:
+        address_space: returns the memory limit for what the child renders with, of the usual one.
     """
     memory_bytes = address_space(_LIMITS.memory_bytes)
     return IsolatedChild(limits=dataclasses.replace(_LIMITS, memory_bytes=memory_bytes))

@@ -107,7 +107,9 @@ def write_renderformer_h5(
     """Write a scene, and its pictures [V, R, R, 3] if given; equal scenes give equal bytes.
 
     The file appears whole or not at all; memory is its compressed size and one block of textures.
-    Sentences about members in CARRIED that lose something are returned.
+
+    Returns:
+        Sentences about members in CARRIED that lose something.
 
     Raises:
         TrilightError: a picture exceeds half floats, or the file cannot be written.

@@ -82,8 +82,10 @@ def array_job(
 ) -> ArrayJob:
     """Return the array that makes the missing shards of a dataset, which need not exist yet.
 
-    A task has `per_task` shards, by default as few as MAX_TASKS tasks allow; at most `at_once`
-    tasks run together. `on` is the scheduler's name, for messages.
+    Args:
+        per_task: shards of a task; by default as few as MAX_TASKS tasks allow.
+        at_once: most tasks that run at the same time.
+        on: name of the scheduler, for messages.
 
     Raises:
         TrilightError: the options name scene files, a range of shards or a password, the dataset

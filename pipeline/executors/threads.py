@@ -86,7 +86,10 @@ def shards_of_task(environment: Mapping[str, str], num_shards: Callable[[], int]
 
     With SHARDS_PER_TASK it depends on SLURM_ARRAY_TASK_ID alone, so that single tasks can be
     submitted again. Without it, all tasks get equal ranges; if there are more tasks than shards,
-    several tasks get the same range. Only then is `num_shards` called.
+    several tasks get the same range.
+
+    Args:
+        num_shards: returns the number of shards of the dataset; called only if it is needed.
 
     Raises:
         TrilightError: a variable is missing or not a number, or the array has gaps.

@@ -32,7 +32,8 @@ Returned = TypeVar("Returned")
 def parameters_of(settings: type, **annotations: Any) -> Callable[[Any], Any]:
     """Return a decorator that gives a flow's function the signature of a settings class.
 
-    `annotations` are types that replace those of some fields.
+    Args:
+        annotations: types that replace those of some fields.
     """
 
     def with_signature(function: Callable[..., Returned]) -> Callable[..., Returned]:
@@ -57,7 +58,9 @@ def parameters_of(settings: type, **annotations: Any) -> Callable[[Any], Any]:
 def overrides_form(settings: type, example: Any) -> type[BaseModel]:
     """Return a form of all fields of a settings class, in which every field may stay empty.
 
-    Fields may be groups, or tuples of groups, which `example` has.
+    Args:
+        settings: the class, whose fields may be groups, or tuples of groups.
+        example: an instance, which says what the groups within tuples are.
     """
     fields: dict[str, Any] = {}
     for field in describe_fields(settings):

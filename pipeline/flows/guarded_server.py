@@ -52,7 +52,8 @@ class RequestGuard:
     def __init__(self, inner: Application, names: Collection[str]) -> None:
         """Guard an application.
 
-        `names` are host names of this server, beside localhost and addresses.
+        Args:
+            names: host names of this server, beside localhost and addresses.
         """
         self._inner = inner
         self._names = {"localhost", *(name.lower() for name in names)}

@@ -107,8 +107,9 @@ class PrefectRunner(Runner[PrefectFuture[TaskResult]]):
     def __init__(self, *, window: int | None = None, num_at_once: int | None = None) -> None:
         """Set how many tasks run at the same time.
 
-        `window` bounds the submitted and unfinished task runs, by default as many as run at once
-        here. `num_at_once` are parallel tasks of one process, by default the options' number.
+        Args:
+            window: most submitted and unfinished task runs; by default as many as run at once here.
+            num_at_once: parallel tasks of one process; by default the options' number.
         """
         self.window = window
         self.num_at_once = num_at_once

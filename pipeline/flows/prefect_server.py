@@ -233,7 +233,8 @@ def wait_until_healthy(
 ) -> None:
     """Wait until a server answers; raises TrilightError if it ends or takes too long.
 
-    `say` gets a sign of life every _SIGN_OF_LIFE_S seconds.
+    Args:
+        say: gets a sign of life every _SIGN_OF_LIFE_S seconds.
     """
     began = time.monotonic()
     deadline = began + _START_UP_S
@@ -270,8 +271,10 @@ def run_to_end(command: Sequence[str], say: Callable[[str], None]) -> tuple[int,
     If this call ends early (a canceled flow gets SIGTERM, which Prefect raises as an exception),
     the program gets one SIGTERM, and the call waits for it. It has a session of its own, so that no
     signal to the group of this process reaches it too: training ends at once after a second signal.
-    If this process is killed, the program is too. `say` gets each line of the output, without
-    secrets.
+    If this process is killed, the program is too.
+
+    Args:
+        say: called with each line of the output, without secrets.
 
     Returns:
         The exit status of the program, and its last line.

@@ -96,7 +96,8 @@ def submit(
 ) -> SubmittedRun:
     """Create a flow run; return as soon as the server has accepted it.
 
-    The deployment is by default the only one, or the one that make serve makes.
+    Args:
+        deployment: name of its deployment; None: the only one, or the one that make serve makes.
 
     Raises:
         TrilightError: the flow is not served there, or not by such a deployment.

@@ -76,8 +76,10 @@ class SourceFolder:
     def __init__(self, folder: Path, root: Path, read: ReadFile) -> None:
         """Resolve both folders.
 
-        Relative names start at `folder`, and no file outside of `root` is read. Where `folder` lies
-        elsewhere, it is the root itself.
+        Args:
+            folder: relative names start here.
+            root: no file outside of it is read; `folder` itself where that lies elsewhere.
+            read: function that reads a regular file of at most so many bytes.
         """
         self.folder = folder.resolve()
         root = root.resolve()

@@ -46,8 +46,12 @@ def read_linear_picture(
 ) -> LinearPicture | None:
     """Return the floats of an OpenEXR or Radiance picture in linear Rec.709, or None for others.
 
-    The first bytes decide on the format. Pixels are counted before memory is allocated. Primaries
-    apply to colors alone (`is_color`).
+    The first bytes decide on the format.
+
+    Args:
+        data: the file.
+        max_pixels: maximum number of pixels, checked before memory is allocated.
+        is_color: whether its numbers are colors, which its primaries apply to.
 
     Raises:
         Rejected: not_hdr, load_error or too_many_pixels.

@@ -63,8 +63,10 @@ def triangulate(
 ) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
     """Return the triangles of polygons.
 
-    Of points [P, 3], the corners of each polygon [F] are `counts`, and `indices` [sum of counts]
-    are rows.
+    Args:
+        points: [P, 3].
+        counts: [F] corners of each polygon.
+        indices: [sum of counts] rows of `points`.
 
     Returns:
         Corners [T, 3], as positions within `indices`, and the polygon [T] of each. Polygons of
@@ -99,10 +101,12 @@ def sort_by_size(
 ) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
     """Sort triangles by group, then as scenes hold them since the first release.
 
-    Corners [T, 3] and the polygon `owner` [T] of each triangle are as `triangulate` returns them;
-    `counts` [F] and `group` [F] are of polygons. Within a group, triangles come first, then the
-    halves of four corners, each half together, then the others. A negative group keeps the order of
-    its polygons.
+    Args:
+        corners: [T, 3], as `triangulate` returns them.
+        owner: [T] polygon of each triangle.
+        counts: [F] corners of each polygon.
+        group: [F]; within one, triangles come first, then the halves of four corners, each half
+            together, then the others. A negative group keeps the order of its polygons.
     """
     piece = np.arange(len(owner)) - np.searchsorted(owner, owner)
     size = counts[owner]

@@ -109,8 +109,12 @@ def needs_child(path: Path) -> bool:
 def read_source(path: Path, limits: ReadLimits, root: Path | None = None) -> SourceFile:
     """Return a source after the checks that need no mesh library.
 
-    Call it in a child process where `needs_child` says so. Pictures and materials may lie below
-    `root`, by default the folder of the file.
+    Call it in a child process where `needs_child` says so.
+
+    Args:
+        path: the file.
+        limits: bounds beyond which the source is refused.
+        root: folder below which pictures and materials may lie; that of the file by default.
 
     Raises:
         Rejected: missing_file, unsupported_format, too_large_bytes, archive_refused,

@@ -100,7 +100,8 @@ def accept_maps(
 ) -> AcceptedMaps:
     """Prepare the textures and maps of folders.
 
-    `workers` files are decoded at the same time.
+    Args:
+        workers: number of files that are decoded at the same time.
 
     Raises:
         TrilightError: a folder is missing or empty, none of its files can be used, or the cache

@@ -98,8 +98,9 @@ def select_scenes(
 ) -> list[SelectedScene]:
     """Return the selected scenes, in the order of the sources and of their shards.
 
-    `offsets` are added to the keys of each source. Beside the values of the condition, those of
-    `value_names` are read.
+    Args:
+        offsets: what is added to the keys of each source.
+        value_names: names of values to read for each scene beside those of the condition.
 
     Raises:
         TrilightError: two sources hold the same scene, or a source is damaged.
@@ -240,7 +241,8 @@ def list_scenes(
 ) -> list[dict[str, object]]:
     """Return a row for each scene that a selection takes, in the order of the shards.
 
-    `progress` is called with the number of shards read so far, and the total.
+    Args:
+        progress: called with the number of shards read so far, and the total.
 
     Raises:
         TrilightError: a shard is damaged.
@@ -305,8 +307,10 @@ def derive_shards(
 ) -> None:
     """Write shards, lock, failures and manifest of the new dataset; the manifest comes last.
 
-    `select` and `reshard` take one source, and `out` is an empty folder. `progress` is called with
-    the number of shards read or written so far, and the total.
+    Args:
+        sources: finished datasets; `select` and `reshard` take one.
+        out: an empty folder.
+        progress: called with the number of shards read or written so far, and the total.
 
     Raises:
         TrilightError: the sources do not fit together, one is damaged, nothing is selected, an
@@ -458,12 +462,17 @@ def derive_dataset(
     *,
     progress: Callable[[int, int], None] = lambda done, total: None,
 ) -> tuple[str, Statistics]:
-    """Make a dataset of finished ones; return its digest and its statistics.
+    """Make a dataset of finished ones by merging, selecting or resharding.
 
-    `out` must not exist or be empty; `progress` is as in `derive_shards`.
+    Args:
+        out: folder of the new dataset, which must not exist or be empty.
+        progress: called with the number of shards read or written so far, and the total.
+
+    Returns:
+        The dataset digest, and the statistics of the dataset.
 
     Raises:
-        TrilightError: as `derive_shards`, or `out` is not empty.
+        TrilightError: as `pipeline.shards.derive.derive_shards`, or `out` is not empty.
     """
     out = Path(os.path.realpath(out))
     if out.exists() and (not out.is_dir() or any(out.iterdir())):

@@ -111,7 +111,8 @@ class ObjectLock:
     def prepare(self) -> ListedObjects | None:
         """Prepare objects cooperatively, without holding the objects mutex, unless they are frozen.
 
-        The listed source is returned, for `freeze`; None if they are frozen already.
+        Returns:
+            The listed source, for `freeze`; None if the objects are frozen already.
 
         Raises:
             TrilightError: as `list_objects` and `prepare_in_batches`.
@@ -134,8 +135,10 @@ class ObjectLock:
     def freeze(self, listed: ListedObjects | None = None) -> AcceptedObjects:
         """Prepare the meshes of the source and freeze them; later, load those that were frozen.
 
-        The user's textures and maps are frozen with them. Call while holding the mutex `objects`. A
-        known listing of the source is not made again.
+        The user's textures and maps are frozen with them. Call while holding the mutex `objects`.
+
+        Args:
+            listed: the listed source, if it is known.
 
         Raises:
             TrilightError, EnvironmentFailure: as `list_objects` and `freeze_prepared`.
@@ -178,7 +181,9 @@ class ObjectLock:
     ) -> AcceptedObjects:
         """Freeze the objects in the first run; in later runs require that they are the same.
 
-        `prepared` are objects that the mesh stage accepted, in later runs the frozen ones of them.
+        Args:
+            prepared: objects that the mesh stage accepted; in later runs the frozen ones of them.
+            rejected: rejections by the source and by the mesh stage.
 
         Raises:
             TrilightError: no object is accepted, a split has none, or the objects are not those

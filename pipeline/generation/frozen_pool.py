@@ -122,7 +122,9 @@ class SplitPool(Sequence[PooledAsset]):
 def user_maps(rows: Iterable[tuple[LockedObject, Path]], split: str) -> OwnMaps:
     """Return the maps that scenes of a split may use, sorted by uid; no file is read yet.
 
-    Objects among the rows are left out.
+    Args:
+        rows: rows of a lock with the prepared files; objects among them are left out.
+        split: train, validation or test.
     """
     of_split = sorted(
         ((locked, path) for locked, path in rows if locked.split == split),

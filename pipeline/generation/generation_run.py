@@ -156,7 +156,9 @@ class Run:
 def children_of_gpu(resolution: int, memory_bytes: int) -> int:
     """Return how many render children keep a GPU busy and fit into its memory.
 
-    The resolution of their pictures is in pixels.
+    Args:
+        resolution: of their pictures, in pixels.
+        memory_bytes: of the GPU.
     """
     child_bytes = _CHILD_BYTES + _PIXEL_BYTES * resolution**2
     return min(_MOST_CHILDREN, max(1, int(_USED * memory_bytes) // child_bytes))

@@ -104,11 +104,16 @@ def make_assets(
 ) -> AssetReport:
     """Prepare the objects of a source and write the folder; a repeated call uses the asset store.
 
-    The folder is empty, or one of an earlier call, which is replaced; it gets one mesh per object,
-    since the settings have one budget. Objects under other licences are rejected, and files that
-    state none get `licence`. `on_download` is called with the number of finished downloads and
-    their total, `on_plan` with the number of objects, and `on_object` after each of them, from any
-    thread.
+    Args:
+        source: source of objects, as `find_objects` takes it.
+        folder: an empty folder, or one of an earlier call, which is replaced.
+        settings: settings of the mesh stage with one budget: the folder has one mesh per object.
+        allowed_licences: objects under other licences are rejected.
+        licence: licence of files that state none.
+        workers: number of objects that are prepared at the same time.
+        on_download: called with the number of finished downloads and their total.
+        on_plan: called with the number of objects, once it is known.
+        on_object: called after each object, from any thread.
 
     Raises:
         TrilightError: the source is unusable, or the folder holds other files or cannot be

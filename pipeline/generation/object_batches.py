@@ -126,7 +126,8 @@ class ObjectBatch:
     def make(self, meshes: MeshWork, done: Callable[[int], None]) -> bool:
         """Prepare the objects unless another worker does or has done so; return True if done here.
 
-        `done` is called with the number of objects that were just prepared or rejected.
+        Args:
+            done: called with the number of objects that were just prepared or rejected.
         """
         writer = self._work.writer
         with writer.claim(self._file) as ours:
@@ -207,12 +208,17 @@ def prepare_in_batches(
     should_stop: Callable[[], bool] = lambda: False,
     retry_transient: bool = True,
 ) -> PrepareResult:
-    """Prepare objects with all other workers; return accepted and rejected ones when all are done.
+    """Prepare objects together with all other workers; return when all are done.
 
-    Objects are sorted by uid, and `workers` of them are prepared here at the same time. `done` is
-    called with a number of objects that are done, here or elsewhere, from any thread. `should_stop`
-    returns True if the remaining objects are no longer needed. With `retry_transient`, objects that
-    failed for a transient reason before are tried again.
+    Args:
+        records: objects, sorted by uid.
+        workers: number of objects that are prepared here at the same time.
+        done: called with a number of objects that are done, here or elsewhere; from any thread.
+        should_stop: returns True if the remaining objects are no longer needed.
+        retry_transient: try objects again that failed for a transient reason before.
+
+    Returns:
+        The accepted objects and the rejected ones, both in the order of `records`.
 
     Raises:
         TrilightError: as `prepare_assets`, or the dataset cannot be written.

@@ -84,7 +84,10 @@ def make_dataset(
 ) -> Outcome:
     """Make a dataset: all its missing shards, or those of a range.
 
-    `watch` is called after each task.
+    Args:
+        options: the dataset, and the range of shards to make.
+        runner: runs the tasks.
+        watch: called after each task.
 
     Raises:
         TrilightError: an error that the user can fix; finished scenes stay on disk.
@@ -232,9 +235,11 @@ def make_piece(
 ) -> tuple[int, ShardEntry | None]:
     """Make the missing scenes of a piece, and pack its shard if that is complete then.
 
-    The number of scenes made or given up here is returned, and the shard if this call packed it.
     Scenes claimed by other workers are skipped; the worker that stages the last scene packs. A
     scene that cannot be made is no error: the shard omits it, and failures.jsonl has the reason.
+
+    Returns:
+        Number of scenes made or given up here, and the shard if this call packed it.
     """
     splits = job.settings.splits
     profile = job.settings.storage.profile

@@ -51,7 +51,8 @@ class MeshWork:
     def __init__(self, settings: AssetSettings, workers: int) -> None:
         """Configure the children; each starts when an object needs it.
 
-        `workers` objects are prepared at the same time.
+        Args:
+            workers: number of objects that are prepared at the same time.
         """
         self._settings = settings
         self._workers = workers

@@ -99,7 +99,8 @@ def render_sample(
 ) -> Sample:
     """Render every view of a scene.
 
-    `failures` receives a row for each camera that was rejected and replaced.
+    Args:
+        failures: receives a row for each camera that was rejected and replaced.
 
     Raises:
         Rejected: the scene cannot be rendered, or a view has no camera left.

@@ -162,7 +162,8 @@ def require_environment(expected: Mapping[str, Any], actual: Mapping[str, Any]) 
 def restore_object(job: ShardJob, uid: str, asset_name: str) -> None:
     """Make the prepared file of an object again; its digest must be the one in the lock.
 
-    `asset_name` is the name of its file in the dataset's index.
+    Args:
+        asset_name: name of its file in the dataset's index.
 
     Raises:
         TrilightError: the source has lost or changed the object.

@@ -40,7 +40,8 @@ class RevisitedScenes:
     def scene(self, index: int, attempt: int, settings: DatasetSettings) -> RenderInput:
         """Return the scene of an index, which counts the scenes of the source shard by shard.
 
-        `attempt` counts earlier rejections of this scene, and seeds what is drawn again.
+        Args:
+            attempt: number of earlier rejections of this scene; seeds what is drawn again.
 
         Raises:
             Rejected: the changed scene is invalid, or no camera is found.

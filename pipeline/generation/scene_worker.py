@@ -78,7 +78,8 @@ class SceneWorker:
     ) -> SceneAttempt:
         """Make one attempt at a scene; equal arguments give equal results in every child.
 
-        A scene of a file has been read by a confined child.
+        Args:
+            from_file: the scene if it comes from a file, which a confined child has read.
         """
         key = sample_key(scene_index)
         settings = self._recipe.settings
@@ -105,7 +106,8 @@ class SceneWorker:
     ) -> Scene | None:
         """Compose the first accepted attempt at a scene without the user's maps; None if none is.
 
-        The ranges to draw from may differ from the dataset's.
+        Args:
+            settings: the ranges to draw from, which may differ from the dataset's.
         """
         for attempt in range(MAX_ATTEMPTS):
             with contextlib.suppress(Rejected):

@@ -77,7 +77,8 @@ def encode_error(kind: str, *words: str) -> list[bytes | memoryview]:
 def decode_answer(parts: list[NDArray[np.uint8]], function: Callable[..., Any]) -> Any:
     """Return the result of a call.
 
-    The parts are untrusted bytes; the result's arrays share their memory.
+    Args:
+        parts: untrusted bytes; the result's arrays share their memory.
 
     Raises:
         Rejected, TrilightError: as the function raised them.
@@ -203,7 +204,8 @@ def send(file: int, parts: Sequence[bytes | memoryview], wait: Wait) -> None:
 def receive(file: int, wait: Wait, most: int) -> list[NDArray[np.uint8]]:
     """Return the parts of one message, each in memory of its own.
 
-    All parts together have at most `most` bytes.
+    Args:
+        most: most bytes of all parts together.
 
     Raises:
         EOFError: the other side has ended.

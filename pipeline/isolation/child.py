@@ -75,10 +75,12 @@ class IsolatedChild:
     ) -> None:
         """Configure the child; the first call starts it.
 
-        `factory`, an importable class or function with picklable `args`, makes the object that a
-        new child holds for `call_method`; it may also load a library. A confined child may use
-        libraries and the files of `confined_to`, to which `allow_files` adds, if the machine can
-        confine children. None is an unconfined child.
+        Args:
+            factory: an importable class or function that makes the object which a new child
+                holds, for `call_method`; it may also load a library.
+            args: picklable arguments of `factory`.
+            confined_to: files that the child may use beside libraries, if the machine can confine
+                children; `may` adds to them. None for an unconfined child.
 
         Raises:
             TrilightError: TRILIGHT_CONFINE has an unknown value, or requires a missing feature.
@@ -338,7 +340,9 @@ class ChildPool:
     def __init__(self, make_child: Callable[[int], IsolatedChild], size: int) -> None:
         """Make the children; each starts its process when it is first called.
 
-        `make_child` is called with the number of each child, from 0.
+        Args:
+            make_child: called with the number of each child, from 0.
+            size: number of children.
         """
         self._children = [make_child(number) for number in range(size)]
         self._free: queue.SimpleQueue[IsolatedChild] = queue.SimpleQueue()

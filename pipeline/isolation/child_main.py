@@ -49,7 +49,9 @@ CallKind = Literal["factory", "function", "method"]
 def serve(connection: Connection, output: Connection, memory_bytes: int, cpu_s: int | None) -> None:
     """Answer calls until the owner closes the connection; ignores Ctrl-C: the owner decides.
 
-    `output` receives standard output and standard error. A call has at most `cpu_s` CPU seconds.
+    Args:
+        output: receives standard output and standard error.
+        cpu_s: most CPU seconds of one call, or None for no limit.
     """
     _leave_owner(connection, output)
     signal.signal(signal.SIGINT, signal.SIG_IGN)

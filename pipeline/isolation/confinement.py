@@ -72,8 +72,10 @@ NO_FILES = Reach()
 def reach(*, files: Iterable[Path] = (), writes: Iterable[Path] = ()) -> Reach:
     """Return the reach of a child that reads some files with their folders, and writes others.
 
-    A file's folder is included: meshes and scenes refer to their textures, and never to files above
-    or beside their folder. Folders to write exist.
+    Args:
+        files: files or folders to read. A file's folder is included: meshes and scenes refer to
+            their textures, and never to files above or beside their folder.
+        writes: existing folders to write.
     """
     folders: set[Path] = set()
     for path in files:
@@ -141,7 +143,9 @@ def code_of(*functions: Callable[..., object]) -> frozenset[Path]:
 def confine(allowed: Reach, code: frozenset[Path]) -> None:
     """Confine this process by all features that the kernel supports; it must have one thread.
 
-    Accessible are the user files that are allowed, and the Python files and packages of `code`.
+    Args:
+        allowed: user files that stay accessible.
+        code: Python files and packages that the process has to load.
 
     Raises:
         EnvironmentFailure: the kernel refuses a feature that it reports.

@@ -67,8 +67,11 @@ def restrict_files(
     """Restrict this thread, and those that it starts, to some paths and everything below them.
 
     Missing paths are left out. The restriction is permanent. If the kernel supports it, TCP, and
-    signals and abstract sockets to processes outside, are blocked too. No device can be made in
-    `writes`; folders of `lists` may be listed, without read access to their files.
+    signals and abstract sockets to processes outside, are blocked too.
+
+    Args:
+        writes: files and folders to read and write; no device can be made there.
+        lists: folders that may be listed, without read access to their files.
 
     Raises:
         OSError: the kernel refuses, or `landlock_version` is 0.

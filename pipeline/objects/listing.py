@@ -89,9 +89,13 @@ def fetch_all(
 ) -> Fetched:
     """Fetch every object; a TransferFailed of `fetch` is a failure of that object alone.
 
-    `fetch` returns the record with its path. It is called in threads, at least 1, and may give up
-    once `stop` is set. `downloaded` is called in this thread with the number of finished objects,
-    failed ones included, and the total.
+    Args:
+        records: what to fetch.
+        fetch: returns the record with its path; called in threads, at most `threads` at a time.
+        downloaded: called in this thread with the number of finished objects, failed ones
+            included, and the total.
+        threads: number of threads, at least 1.
+        stop: set where the run ends early, so that `fetch` may give up.
 
     Raises:
         Exception: any other error of `fetch`; fetches that have not begun are cancelled.

@@ -145,9 +145,13 @@ class ListedObjects:
     ) -> FoundObjects:
         """Download the selected objects and return them with the failures.
 
-        Downloads stay in the user's cache (`storage.cache`; Objaverse in the folder of its package)
-        and are not repeated. `downloaded` is called with the number of finished downloads, failed
-        ones included, and the total, from the calling thread.
+        Downloads stay in the user's cache (`storage.cache`; Objaverse in the folder of its
+        package) and are not repeated.
+
+        Args:
+            is_selected: returns True for the uid of a selected object.
+            downloaded: called with the number of finished downloads, failed ones included, and the
+                total; from the calling thread.
 
         Raises:
             TrilightError: none of the selected objects could be downloaded.
@@ -194,13 +198,15 @@ def list_objects(
 ) -> ListedObjects:
     """List a source; the licence check of an object comes before its download.
 
-    A source is a folder; `http(s)://`, `s3://`, `gs://`, `hf://` or `file://` and a folder;
-    `procedural:` or `procedural:N`; `objaverse:` and uids, a file of uids, or categories. A folder
-    lists the rows of its `objects.jsonl` or `objects.csv`, or else its object files. `env:NAME` is
-    the content of the environment variable NAME, which no message quotes; NAME begins with
-    VARIABLES. Built-in objects are written into `work_dir`. Allowed are SPDX identifiers,
-    `LicenseRef-...`, or whole compound expressions. Files without a statement get the user's
-    licence.
+    Args:
+        source: a folder; `http(s)://`, `s3://`, `gs://`, `hf://` or `file://` and a folder;
+            `procedural:` or `procedural:N`; `objaverse:` and uids, a file of uids, or categories. A
+            folder lists the rows of its `objects.jsonl` or `objects.csv`, or else its object
+            files. `env:NAME` is the content of the environment variable NAME, which no message
+            quotes; NAME begins with VARIABLES.
+        work_dir: folder for built-in objects; untouched for other sources.
+        allowed_licences: SPDX identifiers, `LicenseRef-...`, or whole compound expressions.
+        licence: the user's licence for files without a statement.
 
     Raises:
         TrilightError: the source is malformed, missing or empty; its catalogue has a mistake; a

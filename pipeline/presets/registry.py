@@ -65,9 +65,12 @@ def preset_settings(
 ) -> DatasetSettings:
     """Return the settings of a dataset preset with the caller's changes.
 
-    Seed and resolution replace the preset's value unless None; if one of the noise targets is set,
-    they replace all of its targets. Licences are allowed in addition to the preset's. `changes` are
-    any other settings by dotted name, such as `scenes.lights.coloured_share`.
+    Args:
+        name: one of DATASET_PRESETS.
+        seed, resolution: replace the preset's value unless None.
+        noise_targets: if one is set, they replace all of the preset's targets.
+        allow_licences: licences that are allowed in addition to the preset's.
+        changes: any other settings by dotted name, such as `scenes.lights.coloured_share`.
 
     Raises:
         TrilightError: the name is unknown, or values contradict each other.

@@ -114,7 +114,10 @@ class CalibratedStatement:
     ) -> tuple[MeasuredFloor, MeasuredFloor]:
         """Return what a picture's errors are calibrated to keep, and what they are expected to be.
 
-        The measures of the picture are by metric; its width is in pixels.
+        Args:
+            measures: of the picture by metric.
+            resolution: width of the picture in pixels.
+            spp: samples per pixel.
         """
         group = group_of(resolution)
         bound = dict[str, float]()
@@ -215,8 +218,10 @@ def _statement_of(settings: RenderSettings) -> CalibratedStatement | None:
 def is_far(bound: MeasuredFloor, settings: RenderSettings, spp: int) -> bool:
     """Return whether halves alone show that sampling goes on, so that no picture is needed.
 
-    The halves state `bound`. Targets and how near to them a picture is asked for are settings; at
-    the cap of samples there is always a picture.
+    Args:
+        bound: stated by the halves.
+        settings: targets, and how near to them a picture is asked for.
+        spp: samples per pixel so far; at the cap there is always a picture.
     """
     within_db = settings.picture_within_db
     if within_db is None or spp >= settings.max_spp:

@@ -389,7 +389,9 @@ def denoise_arrays(
 ) -> list[Any]:
     """Return what the filter makes of pictures in Dr.Jit's memory, where it runs on that.
 
-    Pictures are [3 R^2] mi.Float, pixel by pixel; guides are albedo and normal of each.
+    Args:
+        pictures: [3 R^2] mi.Float, pixel by pixel.
+        guides: albedo and normal of each.
     """
     opened = open_filter(resolution, quality)
     if (dr.backend_v(pictures[0]) == dr.JitBackend.CUDA) != opened.is_on_gpu:

@@ -49,9 +49,11 @@ class EmitterTable:
     ) -> None:
         """Build the table.
 
-        `order` are rows of its emitting triangles, and `lit` those switched on, by default all. The
-        others stay black bodies. Where something else lights the scene (`may_be_dark`), a table of
-        no light will do; it gives points of no density and no radiance.
+        Args:
+            order: rows of its emitting triangles.
+            lit: which of `order` are switched on; all by default. The others stay black bodies.
+            may_be_dark: whether something else lights the scene, so that a table of no light will
+                do; it gives points of no density and no radiance.
 
         Raises:
             Rejected: "unlit_scene" where no emitter that is on has both area and radiance.
@@ -109,8 +111,12 @@ class EmitterTable:
 def sample_alias(table: Any, first: Any, count: Any, u: Any, active: Any) -> tuple[Any, Any]:
     """Return an index below `count` drawn from an alias table, and a fresh uniform (Float).
 
-    Rows of the table say what each column keeps, and the column that the rest goes to (Float).
-    `first` (UInt32) is the row of its first column, and `u` (Float) is uniform.
+    Args:
+        table: rows of what each column keeps, and the column that the rest goes to (Float).
+        first: UInt32, the row of the table's first column.
+        count: UInt32, its columns.
+        u: Float, uniform.
+        active: Bool.
     """
     scaled = u * mi.Float(count)
     column = dr.minimum(mi.UInt32(scaled), count - 1)

@@ -120,9 +120,14 @@ def reverse_pdf(lobes: KernelLobes, wi: Any, wo: Any, geometric: Any) -> Any:
     """Return the density with which `sample`, for a path that comes from wo, draws wi (Float).
 
     Such a path sees the surface from the side of wo. Where that is the triangle's other side, the
-    shading normal is turned over, wo is then below it, and only the cosine is left. Directions wi
-    to the viewer and wo to the light are Vector3f; `evaluate_bsdf` is 0 where wo lies below the
-    shading normal, and this means nothing there. `lobes` and `geometric` are as in `evaluate_bsdf`.
+    shading normal is turned over, wo is then below it, and only the cosine is left.
+
+    Args:
+        lobes: from `seen_from` wi.
+        wi: Vector3f to the viewer.
+        wo: Vector3f to the light, above the shading normal: `evaluate_bsdf` is 0 elsewhere, and
+            this means nothing there.
+        geometric: as in `evaluate_bsdf`.
     """
     distribution = _distribution(dr.normalize(wi + wo), lobes.alpha)
     facets = distribution / (2 * (wo.z + _stretch(wo.z, lobes.alpha)))

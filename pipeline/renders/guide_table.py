@@ -110,8 +110,10 @@ class GuideTable:
     ) -> None:
         """Build the table.
 
-        `row_of_cell` [C] is 0 where a cell has learnt nothing. The rows 1 to N of `counts` [N,
-        BINS] are entries of each bin; each adds up to ENTRIES.
+        Args:
+            cells: of the surfaces.
+            row_of_cell: [C] row of each cell; 0 where it has learnt nothing.
+            counts: [N, BINS] entries of each bin in the rows 1 to N; each adds up to ENTRIES.
         """
         bins = np.repeat(np.tile(np.arange(BINS), len(counts)), counts.ravel())
         on_square = np.concatenate([np.zeros(BINS), counts.ravel() * (BINS / 4 / ENTRIES)])

@@ -58,7 +58,9 @@ class Half:
 def estimate_error(a: Half, b: Half, hits: NDArray[np.bool_]) -> MeasuredFloor:
     """Return the floor of the picture made from both halves.
 
-    The halves share no sample and are denoised apart; `hits` [R, R] are pixels that show geometry.
+    Args:
+        a, b: halves that share no sample, denoised apart.
+        hits: [R, R] pixels that show geometry.
     """
     everywhere = np.ones_like(hits)
     return MeasuredFloor(
@@ -101,9 +103,12 @@ def measure_errors(
 ) -> ErrorMeasures:  # fmt: skip
     """Return what the halves say of the error of the picture of both.
 
-    The halves share no sample and are denoised apart; `picture_rgb` [R, R, 3] is one denoise of
-    their mean. Errors are taken in the tone curve. `hits` [R, R] are pixels that show geometry;
-    `objects` counts these alone.
+    Args:
+        a, b: halves that share no sample, denoised apart.
+        picture_rgb: [R, R, 3] one denoise of the mean of both.
+        curve: tone curve in which errors are taken.
+        hits: [R, R] pixels that show geometry.
+        objects: count these pixels alone.
     """
     pixels = hits if objects else np.ones_like(hits)
     count = max(int(pixels.sum()), 1)
@@ -196,9 +201,11 @@ def converged_mask(
 ) -> NDArray[np.bool_]:
     """Return which pixels [R, R] of the raw picture are right rather than the denoised ones.
 
-    Both pictures are [P, R, R, 3] linear radiance of parts, whose sum is the picture, denoised and
-    the mean of the samples. `standard_error` [R, R] is that of the mean over the channels of the
-    sum of `raw_rgb`, from the spread between at least LEAST_PASSES passes.
+    Args:
+        denoised_rgb: [P, R, R, 3] linear radiance of the parts of a picture, which is their sum.
+        raw_rgb: [P, R, R, 3] the mean of the samples.
+        standard_error: [R, R] of the mean over the channels of the sum of `raw_rgb`, from the
+            spread between at least LEAST_PASSES passes.
     """
     raw, denoised = (
         parts.sum(axis=0).mean(axis=-1, dtype=np.float64) for parts in (raw_rgb, denoised_rgb)
@@ -216,7 +223,9 @@ def with_mean_of(
 ) -> NDArray[np.float32]:
     """Return the denoised picture with the mean brightness of the raw one.
 
-    Both are linear radiance [..., 3] of one view.
+    Args:
+        denoised_rgb: [..., 3] linear radiance.
+        raw_rgb: the same view before the denoiser.
     """
     glints = denoised_rgb.mean(axis=-1) > GLINT
     factors = [_factor(denoised_rgb[part], raw_rgb[part]) for part in (glints, ~glints)]

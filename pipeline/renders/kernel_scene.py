@@ -41,8 +41,9 @@ class KernelScene:
     def __init__(self, scene: Scene, *, max_depth: int, rr_depth: int) -> None:
         """Load a scene.
 
-        A path has at most `max_depth` edges; after `rr_depth` of them it goes on by Russian
-        roulette.
+        Args:
+            max_depth: longest path in edges.
+            rr_depth: edges after which a path goes on by Russian roulette.
 
         Raises:
             Rejected: "unlit_scene" where nothing lights it.
@@ -77,9 +78,11 @@ def build_mitsuba_mesh(
 ) -> Any:
     """Return a Mitsuba mesh; nothing else knows its constructor, which Mitsuba 3.10 changes.
 
-    Counts are of vertices and faces. A mi.Properties holds BSDF and emitter, if any. Fields are
-    flat arrays `faces`, `vertex_positions`, `vertex_normals`, `vertex_texcoords`, the last two
-    where they are given.
+    Args:
+        counts: vertices and faces.
+        properties: a mi.Properties with BSDF and emitter, if any.
+        fields: flat arrays `faces`, `vertex_positions`, `vertex_normals`, `vertex_texcoords`; the
+            mesh has the last two where they are given.
     """
     mesh = mi.Mesh(
         name,
@@ -273,8 +276,11 @@ class KernelParts:
     def share(self, vertex: Vertex, local: Any) -> Any:
         """Return the share (Color3f) of the diffuse lobe in the light that a vertex reflects.
 
-        It is None where lobes are not apart. The direction `local` (Vector3f) from which the light
-        comes is in the frame.
+        It is None where lobes are not apart.
+
+        Args:
+            vertex: as the camera path sees it.
+            local: Vector3f, the direction from which the light comes, in the frame.
         """
         if not self._lobes:
             return None

@@ -76,10 +76,14 @@ def trace_light(
 ) -> None:
     """Add the light that lands to `splats`: radiance times the samples of a pixel.
 
-    Each path, a lane of the mi.Sampler, is joined to all films; all light that lands is indirect.
-    `light_paths` (Float) for each sample of a pixel are as in `trace`. Paths begin at `emitter` and
-    leave by `u_direction` (Point2f, uniform). For each camera, `splats` has the sum of each lobe,
-    or of both.
+    Args:
+        films: the cameras that each path is joined to.
+        parts: what is kept apart; all light that lands is indirect.
+        light_paths: Float, light paths for each sample of a pixel, the same as of `trace`.
+        emitter: where the path of each lane begins.
+        u_direction: Point2f, uniform, for the directions in which they leave.
+        sampler: mi.Sampler with a lane for each path.
+        splats: for each camera, the sum of each lobe, or of both.
     """
     start, direction, leaving, inverse_pdf = _leave_emitter(scene, emitter, u_direction)
     active = mi.Bool((leaving > 0) & (dr.max(emitter.radiance) > 0))
@@ -167,7 +171,9 @@ def _connect_to_camera(
     """Return the light of a vertex in the picture: value, diffuse share, pixel and visibility.
 
     The value and the share of the diffuse lobe are Color3f, the pixel UInt32, visibility Bool.
-    `mis_ratio` (Float) is the square root of (hit^2 + pick^2) / land^2, without P and c_1.
+
+    Args:
+        mis_ratio: Float, the square root of (hit^2 + pick^2) / land^2, without P and c_1.
     """
     to_camera = film.origin - vertex.point.position
     distance_sq = dr.squared_norm(to_camera)

@@ -93,8 +93,11 @@ def named_device() -> Device | None:
 def choose_variant(default: Device = "cpu", *, device: Device | None = None) -> Variant:
     """Return the variant of a device, on a CPU with the newest LLVM library that works.
 
-    Later calls read the remembered probes. The device of an option or a dataset precedes
-    TRILIGHT_VARIANT, which precedes the default.
+    Later calls read the remembered probes.
+
+    Args:
+        default: device where neither `device` nor TRILIGHT_VARIANT names one.
+        device: device of an option or a dataset, before which TRILIGHT_VARIANT does not count.
 
     Raises:
         TrilightError: no LLVM library works here; TRILIGHT_VARIANT names no variant; a GPU is named
@@ -178,8 +181,9 @@ def activate(variant: Variant) -> None:
 def _remembered_probe(variant: Variant, identity: str, *, retry_failed: bool) -> "_ProbeResult":
     """Return the result of a probe of what has this identity, remembered or new.
 
-    The identity changes whenever the answer may. A remembered problem is probed again with
-    `retry_failed`, since its cause may be fixed.
+    Args:
+        identity: a name that changes whenever its answer may.
+        retry_failed: whether a remembered problem is probed again: its cause may be fixed.
     """
     memory = cache_folder("probes.json")
     known: dict[str, tuple[str, str]] = {}

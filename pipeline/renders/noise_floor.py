@@ -117,9 +117,12 @@ def estimate_noise_floor_db(
 ) -> float:
     """Return the floor of a picture in dB.
 
-    `mean_error` is that of the estimates of all pixels, and `surprise` the largest of the
-    picture's. `error_sums` [T] are of the estimates over its blocks, which have `counts` [T]
-    pixels; without any the floor is the highest. So many standard errors are added to the mean.
+    Args:
+        mean_error: of the estimates of all pixels.
+        surprise: the largest of the picture's.
+        error_sums: [T] of the estimates over the blocks of the picture.
+        counts: [T] pixels of each block; where there are none at all, the floor is the highest.
+        standard_errors: so many are added to the mean.
     """
     count = counts.sum()
     if not count:

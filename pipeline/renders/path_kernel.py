@@ -43,9 +43,13 @@ def trace(
 ) -> list[Any]:
     """Return the radiance (Color3f) of each part along camera rays; emitters are not seen.
 
-    What the light paths may find, so many (Float) for each sample of a pixel, is left out in
-    proportion. The mi.Sampler has a lane for each ray (Ray3f) of the film, and `parts` are the sums
-    that are kept apart.
+    Args:
+        film: the camera.
+        parts: the sums that are kept apart.
+        light_paths: Float, light paths for each sample of a pixel. What they may find is left out
+            in proportion.
+        sampler: mi.Sampler with a lane for each ray.
+        ray: Ray3f from `film`.
     """
     first = Hit(scene.surfaces.ray_intersect_preliminary(ray, coherent=True))
     active = mi.Bool(first.is_valid)

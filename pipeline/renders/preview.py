@@ -164,8 +164,10 @@ def timed_parts(
 ) -> dict[str, float]:
     """Return the seconds of every part for the scene's first view; `activate` has been called.
 
-    The scene passes `Scene.check` and has a camera; pictures have `resolution` pixels each way.
-    `clock` returns seconds; `time.process_time` counts those of all threads.
+    Args:
+        scene: that passes `Scene.check`, with a camera.
+        resolution: pixels each way.
+        clock: returns seconds; `time.process_time` counts those of all threads.
     """
     depths = {"max_depth": RenderSettings.max_depth, "rr_depth": RenderSettings.rr_depth}
     load_tracer(scene, **depths)  # the first one loads libraries as well
@@ -236,7 +238,10 @@ class ProgressiveRenderer:
     ) -> Iterator[Sampling | RenderedView]:
         """Yield looks, the progress of sampling between them, and last the finished picture.
 
-        The pose [4, 4] is camera to world, and the angle the full field of view in degrees.
+        Args:
+            c2w: [4, 4] camera to world.
+            fov_deg: full field of view in degrees.
+            seed: of the samples.
 
         Raises:
             Rejected: as of `SceneRenderer.render_view`.

@@ -74,10 +74,11 @@ class SceneRenderer:
     ) -> None:
         """Load a scene that passes `Scene.check`; `activate` must have been called.
 
-        With `shows_looks`, `view_steps` yields a `GrowingPicture` after each measurement by which a
-        target is missed; pictures stay the same, each look costs one denoise. `light_seed` is that
-        of the light paths of all views, where the settings let them share these; with None each
-        view has its own.
+        Args:
+            shows_looks: whether `view_steps` yields a `GrowingPicture` after each measurement by
+                which a target is missed; pictures stay the same, each look costs one denoise.
+            light_seed: of the light paths of all views, where the settings let them share these;
+                None: each view has its own.
 
         Raises:
             Rejected: "unlit_scene" where no emitter has an area (with `per_light`: where one has
@@ -117,8 +118,10 @@ class SceneRenderer:
     def render_view(self, c2w: ArrayLike, fov_deg: float, seed: int) -> RenderedView:
         """Return the picture of one camera; equal arguments give equal bits.
 
-        The pose [4, 4] is camera to world, and the angle the full field of view in degrees. The
-        seed, from 0, belongs to this view alone.
+        Args:
+            c2w: [4, 4] camera to world.
+            fov_deg: full field of view in degrees.
+            seed: any integer from 0; belongs to this view alone.
 
         Raises:
             Rejected: "black_view" (mean radiance of the first pass of both halves below the

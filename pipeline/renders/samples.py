@@ -53,9 +53,11 @@ class DualBuffer:
     ) -> None:
         """Begin a view without any sample.
 
-        The first measurement has `first_spp` samples per pixel, both halves together, and at most
-        `max_spp` will be asked for. The seed is of this view alone. Other views may have the light
-        paths of `light_seed` too; None is `seed`.
+        Args:
+            seed: of this view alone.
+            first_spp: samples per pixel of the first measurement, both halves together.
+            max_spp: the most that will be asked for.
+            light_seed: of the light paths, which other views may have too; None: `seed`.
         """
         self._seed = seed
         self._light_seed = light_seed
@@ -115,7 +117,8 @@ class DualBuffer:
     def passes_over(self, more: Sequence[NDArray[np.int64]]) -> Iterator[None]:
         """Add the best passes to some pixels, yielding after each.
 
-        For each half, each pixel [R, R] gets so many more of them.
+        Args:
+            more: for each half, how many more of them each pixel gets, [R, R].
         """
         for number in range(max(int(passes.max()) for passes in more)):
             for half, passes in enumerate(more):
@@ -165,7 +168,8 @@ class TileChoice:
     def __init__(self, visible: NDArray[np.bool_]) -> None:
         """Begin with nothing seen.
 
-        `visible` [R, R] are pixels that may have light at all.
+        Args:
+            visible: [R, R] pixels that may have light at all.
         """
         self._weight = tile_means(visible.astype(np.float64))
         self._seen: list[NDArray[np.int64]] = []
@@ -177,9 +181,11 @@ class TileChoice:
     ) -> None:
         """Look at both halves as they are now, denoised by a filter of this quality.
 
-        `changes` of each half, [T, T], are the mean squared change of its log radiance since the
-        look before; anything at the first. What changes with the quality of the filter says nothing
-        of the samples: after that nothing new is known.
+        Args:
+            changes: of each half, [T, T] mean squared change of its log radiance since the look
+                before; anything at the first.
+            quality: of the filter. What changes with it says nothing of the samples: after that
+                nothing new is known.
         """
         tiles = slice(None, None, TILE_PX)
         seen = [samples.spp_of(half)[tiles, tiles].copy() for half in range(len(changes))]
@@ -194,8 +200,9 @@ class TileChoice:
     def passes(self, samples: DualBuffer, mean_spp: int) -> list[NDArray[np.int64]] | None:
         """Return how many more passes each pixel of each half gets, [R, R]; None: all alike.
 
-        The samples are as they were when `learn` was called last. Wanted are `mean_spp` samples per
-        pixel, both halves together.
+        Args:
+            samples: what is there, as it was when `learn` was called last.
+            mean_spp: samples per pixel that are wanted, both halves together.
         """
         more = mean_spp - samples.spp
         started = self._variance and self._seen[0].min() >= _PASS
@@ -228,9 +235,11 @@ def passes_of_tiles(
 ) -> NDArray[np.int64]:
     """Return how many more passes each tile gets, [T, T]: the fewest that make the mean grow so.
 
-    Of each tile [T, T] are given the variance of one sample, of the other half, the samples per
-    pixel that are there, and the weight in the mean. Tiles without weight get nothing. The mean
-    shall grow by `more` samples per pixel, _PASS at least.
+    Args:
+        variance: [T, T] of one sample, of the other half.
+        spp: [T, T] samples per pixel that are there.
+        weight: [T, T] of each tile in the mean. Tiles without weight get nothing.
+        more: by how many samples per pixel the mean shall grow, _PASS at least.
     """
     weight = weight / weight.sum()
     target_spp = (weight * spp).sum() + more
@@ -314,8 +323,10 @@ def gaps_db(targets_db: Floors, floors_db: Floors) -> dict[str, float]:
 def next_spp(measured: Measured, goal: Goal) -> int:
     """Return the number of samples at which the floors are measured next.
 
-    The last floors of this view miss a target of the goal, and their samples are a multiple of its
-    step below its cap.
+    Args:
+        measured: of this view so far; the last floors miss a target of the goal, and their samples
+            are a multiple of its step below its cap.
+        goal: when sampling ends.
     """
     spp = measured[-1][0]
     step = goal.step
@@ -336,7 +347,9 @@ def expected_spp(measured: Measured, goal: Goal) -> int:
 def slope_db(measured: Measured, metric: str) -> float:
     """Return what a doubling of the samples buys in this view, in dB, from its last two floors.
 
-    One measurement is enough; the floors of one metric are compared.
+    Args:
+        measured: of this view so far; one measurement is enough.
+        metric: whose floors are compared.
     """
     if len(measured) < 2:
         return _DB_PER_DOUBLING

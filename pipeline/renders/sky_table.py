@@ -41,8 +41,9 @@ class SkyTable:
     def __init__(self, sky: Environment, share: float) -> None:
         """Build the table.
 
-        The map is not all black. A fraction of the picks, above 0 and at most 1, goes to it, the
-        others to lamps.
+        Args:
+            sky: a map that is not all black.
+            share: of the picks that go to it, the others going to lamps; above 0, at most 1.
         """
         height, width = sky.radiance_rgb.shape[:2]
         angles = row_solid_angles(height)

@@ -160,8 +160,11 @@ class KernelTextures:
     def mapped_normal(self, normal: Any, triangle: Any, barycentric: Any, active: Any) -> Any:
         """Return the unit normal (Vector3f) of storage.records.lookup; None without any map.
 
-        The unmapped normal (Vector3f) is unit, and `barycentric` (Point2f) has the weights of the
-        2nd and 3rd corner.
+        Args:
+            normal: Vector3f, unit, unmapped.
+            triangle: UInt32.
+            barycentric: Point2f, the weights of the 2nd and 3rd corner.
+            active: Bool.
         """
         if self._u_directions is None:
             return None
@@ -195,8 +198,12 @@ class KernelTextures:
         """Return the material of a place.
 
         The shares of the lobes and their multiple scattering follow the values of the textures.
-        Where no texture stands for it, the material is `constant`. `barycentric` (Point2f) has the
-        weights of the 2nd and 3rd corner.
+
+        Args:
+            triangle: UInt32.
+            barycentric: Point2f, the weights of the 2nd and 3rd corner.
+            constant: what the material is where no texture stands for it.
+            active: Bool.
         """
         u, v, material = self._place(triangle, barycentric, active)
         columns = constant.diffuse, constant.specular, dr.sqrt(constant.alpha)

@@ -94,14 +94,16 @@ class Tracer(Protocol):
     def split_lights(self, *, bounces: bool, lobes: bool) -> "Tracer":
         """Return the same loaded scene, whose sums of passes are by part.
 
-        `bounces` keeps direct and indirect light apart, `lobes` the diffuse and the specular lobe
-        of the visible surface.
+        Args:
+            bounces: keep direct and indirect light apart.
+            lobes: keep the diffuse and the specular lobe of the visible surface apart.
         """
 
     def for_views(self, cameras: Sequence[PixelCamera]) -> "Tracer":
         """Return the same loaded scene, which traces light paths of one seed once for all views.
 
-        The cameras are in the order in which they will be asked for.
+        Args:
+            cameras: of the views, in the order in which they will be asked for.
         """
 
     def radiance(
@@ -109,10 +111,14 @@ class Tracer(Protocol):
     ) -> NDArray[np.float32]:
         """Return the mean of one pass of samples, linear radiance [R, R, 3]; 0 if not chosen.
 
-        Equal arguments give equal bits, whatever the number of threads. With other pixels chosen, a
-        pixel's samples may be others. The seed has 31 bits; passes with different seeds are
-        independent. `spp` is a square of a power of two. A tracer may trace pixels that are not
-        chosen too.
+        Equal arguments give equal bits, whatever the number of threads. With other pixels chosen,
+        a pixel's samples may be others.
+
+        Args:
+            camera: the view.
+            seed: 31 bits; passes with different seeds are independent.
+            spp: samples per pixel, a square of a power of two.
+            chosen: the pixels that are wanted. A tracer may trace the others too.
         """
 
     def pass_sum(self, camera: PixelCamera) -> PassSum: ...

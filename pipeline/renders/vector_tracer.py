@@ -66,8 +66,9 @@ class LandedLight:
     ) -> Any:
         """Return the picture of a view, once.
 
-        `paths` tells these light paths from others, and `land` returns the picture of each of some
-        cameras.
+        Args:
+            paths: what tells these light paths from others.
+            land: returns the picture of each of some cameras.
         """
         picture = self._kept.pop((_view_name(camera), paths), None)
         if picture is not None:

@@ -150,10 +150,13 @@ def put_together(
     Lights apart are shares of one denoised picture, pixel by pixel and channel by channel: of all
     light together, in proportion to what each is when it is denoised alone. The sum of pictures
     that were denoised alone carries the bias of each: in four scenes it was 1.7 to 5.2 dB worse
-    than this one, and claimed a floor up to 5.9 dB better than the truth (study S8). For each
-    picture, `to_filter` yields one that is filtered. `with_means_of` gives pairs, denoised and raw,
-    the mean brightness of the raw ones; `shares_of` returns what share of their sum each of some
-    pictures is.
+    than this one, and claimed a floor up to 5.9 dB better than the truth (study S8).
+
+    Args:
+        pictures: as they were traced.
+        filtered: one for each that `to_filter` yields.
+        with_means_of: gives pairs, denoised and raw, the mean brightness of the raw ones.
+        shares_of: returns what share of their sum each of some pictures is.
     """
     count = max(1, len(names))
     num_lights = len(pictures) // count

@@ -98,9 +98,10 @@ def normalize_to_unit_sphere(
 ) -> NDArray[np.float64]:
     """Return the vertices [V, 3] of a level scaled so that the farthest lies on the unit sphere.
 
-    The positions [V, 3] are in the unit box of the asset. The new center is its middle, that of its
-    source and the same for all levels. Or as published it is the mean of the vertices, which moves
-    with the tessellation.
+    Args:
+        positions: [V, 3] in the unit box of the asset, whose middle is that of its source.
+        centring: the new center: that middle, which is the same for all levels of an asset, or as
+            published the mean of the vertices, which moves with the tessellation.
 
     Returns:
         float64; not finite if a position is not, or if all positions are the same point.
@@ -126,7 +127,9 @@ def compose_scene(
 ) -> Scene:
     """Compose one scene.
 
-    Objects, sorted by uid, and the user's textures and maps are those of the scene's split.
+    Args:
+        pool: the objects of the scene's split, sorted by uid.
+        user_maps: the user's textures and maps of the scene's split.
 
     Returns:
         A checked scene with `settings.num_views` cameras. Its provenance holds template, family,

@@ -229,7 +229,10 @@ def with_drawn_columns(materials: NDArray[np.float32], scene_key: SceneKey) -> N
     """Return the material rows of a scene with values for the columns that have a draw.
 
     Each column has a random stream of its own, so that it changes no other draw of the scene. Rows
-    that emit keep the default. The given rows have all declared columns and stay unchanged.
+    that emit keep the default.
+
+    Args:
+        materials: rows with all declared columns, which stay unchanged.
 
     Raises:
         TrilightError: a draw returns another shape, or a value outside of its column's range.
@@ -267,7 +270,10 @@ def with_drawn_textures(
     """Return the pieces, some with drawn textures; emitters have none.
 
     Each piece has a random stream of its own, so that textures change no other draw of the scene.
-    Pieces are floor and walls, objects and emitters, in the order of `layout`.
+
+    Args:
+        pieces: floor and walls, objects and emitters, in the order of `layout`.
+        settings: fraction of textured pieces, and ranges.
     """
     if settings.share == 0:
         return list(pieces)

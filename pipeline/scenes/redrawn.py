@@ -67,8 +67,11 @@ def with_new_lights(
 ) -> Scene:
     """Return the scene with its lamps replaced by new ones, drawn by its layout.
 
-    Emitting components of objects keep their radiance. The count of the settings is not used: there
-    are `num_lights` new lamps, or as many as before.
+    Emitting components of objects keep their radiance.
+
+    Args:
+        settings: the ranges to draw from; its count is not used.
+        num_lights: number of new lamps; None for as many as there are.
 
     Raises:
         Rejected: "no_layout" if the template of the scene is no known layout.

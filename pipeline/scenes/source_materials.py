@@ -36,6 +36,9 @@ def source_skins(
     Each object has a random stream of its own, so that skins change no other draw of the scene, and
     another `own_share` changes none of the skins that stay.
 
+    Args:
+        settings: source of the materials, and the fraction of objects that keep theirs.
+
     Raises:
         Rejected: law_broken, which names the object.
     """
@@ -84,9 +87,11 @@ def with_source_emission(
 ) -> tuple[list[ScenePiece], list[ScenePiece]]:
     """Return objects without their emitting triangles, and these as emitters.
 
-    An object whose triangles all emit becomes an emitter in its place. Some objects have skins that
-    state the emission of their triangles. All emitting triangles get a fraction of the lamps'
-    power, 0 without lamps.
+    An object whose triangles all emit becomes an emitter in its place.
+
+    Args:
+        objects: pieces, some with skins that state the emission of their triangles.
+        share: fraction of the lamps' power for all emitting triangles; 0 without lamps.
     """
     scale = _scale(objects, lamps, share)
     plain = [

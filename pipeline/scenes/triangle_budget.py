@@ -34,9 +34,11 @@ class FitTable:
     ) -> None:
         """Make a table of columns, arrays in memory or in a file that are read by slices.
 
-        `least` are triangles of the coarsest level of each row, and `camp` its number among the
-        names of camps; "" is for objects without a camp. `sizes` has the number and sizes of the
-        objects of each camp that occurs.
+        Args:
+            least: triangles of the coarsest level of each row.
+            camp: number of each row's camp.
+            camps: name of each camp by number; "" is for objects without a camp.
+            sizes: number and sizes of the objects of each camp that occurs.
         """
         self._least = least
         self._camp = camp
@@ -60,7 +62,8 @@ class FitTable:
     def draw_row(self, rng: np.random.Generator, rooms: Mapping[str, int]) -> int | None:
         """Draw a row uniformly among those that fit; None if none does.
 
-        Of each camp, at most so many triangles fit; rows of other camps do not.
+        Args:
+            rooms: most triangles by camp; rows of other camps do not fit.
         """
         if rooms.keys() == self.sizes.keys() and all(
             self.sizes[camp].most <= room for camp, room in rooms.items()
@@ -118,8 +121,11 @@ def draw_rows(
 
     If all fit, this is a uniform draw. Otherwise simple objects are drawn more often beside
     demanding ones, as they would be if whole scenes were drawn until one fits. Objects of two
-    different camps never fit beside each other. The table has at least one row, and all drawn ones
-    together have at most `num_triangles`.
+    different camps never fit beside each other.
+
+    Args:
+        table: table to draw from, with at least one row.
+        num_triangles: most triangles of all rows together.
 
     Raises:
         Rejected: "over_budget" if not even the simplest objects fit.
@@ -157,8 +163,11 @@ def levels_within(
 ) -> tuple[Level, ...]:
     """Choose one level per asset, together at most `num_triangles`.
 
-    The coarsest levels of the assets fit together (`draw_rows`). An asset within `enough_error`, a
-    two-way distance to the source (99th percentile, fraction of the diagonal), is not refined.
+    Args:
+        assets: assets whose coarsest levels fit together (`draw_rows`).
+        num_triangles: most triangles of all assets together.
+        enough_error: two-way distance to the source (99th percentile, fraction of the diagonal)
+            below which an asset is not refined.
 
     Raises:
         Rejected: "over_budget" if the coarsest levels do not fit.

@@ -30,7 +30,8 @@ from storage.seeds import rng_for
 def require_valid(scene: Scene, settings: SceneSettings, *, in_budget: bool = True) -> None:
     """Raise Rejected if a scene is invalid, over its budget, or has a light within an object.
 
-    The number of triangles is limited with `in_budget`.
+    Args:
+        in_budget: True to limit the number of triangles too.
 
     Raises:
         Rejected: "law_broken" with the message of `Scene.check`, "over_budget", or
@@ -214,7 +215,8 @@ def cameras_of_view(
 ) -> Iterator[ViewCamera]:
     """Yield the camera of a view, and then each following proposal that sees enough.
 
-    `view` is the row of `scene.c2w`.
+    Args:
+        view: row of `scene.c2w`.
 
     Raises:
         Rejected: "no_camera" when the sixteen proposals of the view are used up.

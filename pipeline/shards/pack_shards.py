@@ -88,9 +88,11 @@ def pack_shard(
     the staged scenes are deleted after it: a kill in between loses nothing and repeats little.
 
     An existing shard stays: the first writer wins. A growing one is replaced. Where a file system
-    carries no locks, who comes second returns what the first has packed. All scenes of
-    `scene_indices` are staged. If the manifest lists the shard as growing, pass `grows` and hold
-    its mutex.
+    carries no locks, who comes second returns what the first has packed.
+
+    Args:
+        scene_indices: indices of its scenes, all of which are staged.
+        grows: True if the manifest lists the shard as growing; then call while holding its mutex.
 
     Raises:
         TrilightError: the disk is full, the folder cannot be written, or a staged file vanished.
@@ -155,7 +157,8 @@ def unpack_here(folder: DatasetFolder, name: str, scenes: range, manifest: Manif
 def unpack_shard(folder: DatasetFolder, note: ShardNote, scenes: range, stream: BinaryIO) -> None:
     """Stage the scenes of a shard again, byte for byte, so that it can be packed with more.
 
-    A scene that the file lacks was given up.
+    Args:
+        scenes: indices of its scenes; one that the file lacks was given up.
     """
     name = note.shard.name
     samples = dict(ShardReader(stream, name))
@@ -179,7 +182,8 @@ class PublishedShards:
     def names_in_part(self, part: int, ends: Mapping[str, range]) -> Iterator[str]:
         """Yield the names of the published shards of a part of the dataset, growing ones too.
 
-        `ends` are shards of a bucket with fewer scenes than planned; their scenes are staged here.
+        Args:
+            ends: shards of a bucket with fewer scenes than planned; their scenes are staged here.
         """
         if self._store.is_here:
             return shard_names_in_part(self._folder.root, part)
@@ -242,7 +246,8 @@ class PublishedShards:
     def publish(self, note: ShardNote) -> ShardNote | None:
         """Publish a packed shard with its log and note; the cache keeps the bytes of a sent one.
 
-        None is returned if another worker publishes or published it, or it grows.
+        Returns:
+            The published note; None if another worker publishes or published it, or it grows.
         """
         name = note.shard.name
         if self._folder.shard(name).exists():  # else another machine, or process, has sent it
@@ -467,8 +472,10 @@ class UnfinishedShard:
     ) -> None:
         """Stage a finished or given-up scene as `stage_scene`, and log its cost.
 
-        The sample is None if the scene was given up. The work began at `began` (`time.monotonic`)
-        and kept so many cores busy.
+        Args:
+            sample: the finished scene; None if it was given up.
+            began: start of the work on it, by `time.monotonic`.
+            cores: number of cores that the work kept busy.
         """
         stage_scene(self._staged, scene_index, sample, failures, profile)
         seconds = time.monotonic() - began
@@ -481,7 +488,11 @@ class UnfinishedShard:
         log_scene(folder, self.name, scene_index, seconds=seconds, cores=cores, num_rejected=count)
 
     def pack(self) -> ShardEntry | None:
-        """Pack and return the shard if all its scenes are staged, unless another worker does."""
+        """Pack the shard if all its scenes are staged, unless another worker does.
+
+        Returns:
+            The shard if this call packed it, else None.
+        """
         scenes, grows = self._plan()
         if self._is_packed() or not all(is_staged(self._staged, index) for index in scenes):
             return None

@@ -120,8 +120,10 @@ far vertices have shrunk the object to a dot."""
 def check_raw(mesh: TriangleMesh, settings: AssetSettings, *, is_single: bool) -> None:
     """Raise Rejected where a loaded mesh is too large, not finite, or out of range.
 
-    The mesh is as loaded, in the units of its file. `is_single` is True where the file stores
-    positions in single precision.
+    Args:
+        mesh: as loaded, in the units of the file.
+        settings: the limits.
+        is_single: True where the file stores positions in single precision.
     """
     if len(mesh.faces) > settings.max_source_faces:
         raise Rejected(

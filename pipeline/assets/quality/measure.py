@@ -136,7 +136,9 @@ class Deviation:
 def sample_surface(mesh: TriangleMesh, uniform: NDArray[np.float64]) -> SurfacePoints:
     """Return N points spread evenly by area: one from each of N equal fractions of it.
 
-    The mesh has at least one face with area; `uniform` [N, 3] are independent numbers in [0, 1).
+    Args:
+        mesh: at least one face with area.
+        uniform: [N, 3] independent numbers in [0, 1).
     """
     total = np.cumsum(np.linalg.norm(mesh.double_area_vectors, axis=1))
     target = (np.arange(len(uniform)) + uniform[:, 0]) / len(uniform) * total[-1]
@@ -201,9 +203,10 @@ class MeasuredSource:
     def _lost_area(self, distances: NDArray[np.float64]) -> float:
         """Return the fraction of the source's area in lost components.
 
-        `distances` [N] are those from each sample point to the result, as a fraction of the
-        diagonal. A component without a sample point (below about 1/8000 of the area) never counts
-        as lost.
+        Args:
+            distances: [N] from each sample point to the result, as a fraction of the diagonal.
+
+        A component without a sample point (below about 1/8000 of the area) never counts as lost.
         """
         count = self.num_components
         is_far = distances > self._lost_beyond
@@ -273,8 +276,11 @@ def check_level(
 ) -> tuple[TriangleMesh, LevelQuality]:
     """Return the cleaned result of a decimation with its measures.
 
-    The error is at most `max_error_p99`, itself at most that of `gate`, and there are at most
-    `budget` faces.
+    Args:
+        result: the unchecked result.
+        source: the cleaned source.
+        budget: most faces; `gate` has the other limits.
+        max_error_p99: limit on the error, at most that of `gate`.
 
     Raises:
         Rejected: budget_missed, nonfinite_result, bbox_escaped, area_changed, error_over_bound,

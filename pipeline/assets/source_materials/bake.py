@@ -34,8 +34,9 @@ FLAT = 2
 def cells_per_side(corners: NDArray[np.float64], density: float) -> NDArray[np.int64]:
     """Return the cells a side [F] of triangles with corners [F, 3, 3], the longest edge last.
 
-    The first corner of each lies opposite the longest edge (`longest_edge_order`). `density` is in
-    cells per unit of length.
+    Args:
+        corners: the first corner of each lies opposite the longest edge (`longest_edge_order`).
+        density: cells per unit of length.
     """
     legs = np.linalg.norm(corners[:, 1:] - corners[:, :1], axis=2).max(axis=1)
     cells = np.ceil(legs * density - 1e-9).astype(np.int64)
@@ -198,7 +199,11 @@ def bake(
 ) -> BakedTextures:
     """Return the baked textures of a level.
 
-    The level and `reach`, the largest distance to the source, are in the unit box.
+    Args:
+        level: mesh in the unit box.
+        source: surface whose materials it shows.
+        settings: texels and greatest size.
+        reach: largest distance to the source, in the unit box.
     """
     order = longest_edge_order(level.corners)
     corners = np.take_along_axis(level.corners, order[..., None], axis=1)

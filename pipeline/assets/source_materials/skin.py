@@ -58,8 +58,11 @@ def add_source_materials(
 ) -> tuple[tuple[Level, ...], dict[int, tuple[str, str]], OwnMaterials | None]:
     """Return levels with skins, reasons of missing levels, and the state of the materials.
 
-    Missing levels have reason and message by budget. `mesh` is the clean, oriented mesh of the
-    source.
+    Args:
+        levels: levels without skins.
+        missed: reason and message by budget.
+        source: the object's file; `mesh` is its clean, oriented mesh.
+        settings: `own_materials` keeps materials, and says what happens where they are lost.
 
     Raises:
         Rejected: as `read_source_surface`, where `if_lost` is `reject`; transmissive_material,

@@ -52,8 +52,12 @@ class SurfaceLookup:
     ) -> tuple[FacePoints, NDArray[np.bool_]]:
         """Return the source points that points [N, 3] with unit normals [N, 3] show.
 
-        The second result is True [N] where no surface nearby faced the same way. The points are on
-        or near the source, and `reach` is the largest distance to a surface in the unit box.
+        The second result is True [N] where no surface nearby faced the same way.
+
+        Args:
+            points: points on or near the source.
+            normals: the level's normals there.
+            reach: largest distance to a surface, in the unit box.
         """
         locations, is_missed = self._closest(points, normals, reach)
         best = np.full(len(points), np.inf)
@@ -172,8 +176,12 @@ class SourceSurface:
         """Return the normals [N, 3] of the maps at points on faces, in the frames of a level.
 
         They are relative to the shading normal of the source, so that they hold whatever shading
-        normals a level gets. A frame is unit normal and x axis of the level at each point, [N, 3]
-        each; `cell` is as in `columns`.
+        normals a level gets.
+
+        Args:
+            at: points of clean faces.
+            cell: width in the unit box over which pictures are averaged.
+            frame: unit normal and x axis of the level at each point, [N, 3] each.
         """
         result = np.tile([0.0, 0.0, 1.0], (len(at.faces), 1))
         for material, chosen, points in self._by_material(at):

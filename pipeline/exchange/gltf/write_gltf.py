@@ -54,7 +54,9 @@ _USED = ["KHR_materials_specular", "KHR_materials_emissive_strength"]
 def write_gltf(path: Path, scene: Scene) -> tuple[str, ...]:
     """Write a scene, and return sentences about members in CARRIED that lose something.
 
-    The path ends in `.glb`, and the scene passes `Scene.check`.
+    Args:
+        path: ends in `.glb`.
+        scene: passes `Scene.check`.
 
     Raises:
         TrilightError: the file cannot be written.

@@ -69,8 +69,11 @@ def usd_keys(path: Path, folder: Path | None = None) -> list[str]:
 def read_usd(path: Path, key: str | None, folder: Path | None, licence: str) -> LoadedScene:
     """Return one scene of a file.
 
-    `key` is one of a shard, or a time code, by default the first. `folder`, by default that of the
-    file, bounds what is read. Objects that state no licence get the given one.
+    Args:
+        path: the file.
+        key: key in a shard, or time code; the first scene by default.
+        folder: folder whose files may be read; that of `path` by default.
+        licence: licence of objects that state none.
 
     Raises:
         TrilightError: the file is unusable, lacks the scene, or a `Scene` cannot hold it.

@@ -79,8 +79,11 @@ class GltfDocument:
     ) -> NDArray[np.float64]:
         """Return rows [N, K] of an accessor; integers as fractions where they are normalized.
 
-        `widths` are the allowed numbers of components K. `is_unit` tells whether integers are
-        fractions, by default as the accessor states.
+        Args:
+            index: index of the accessor.
+            widths: allowed numbers of components K.
+            rows: rows to return.
+            is_unit: whether integers are fractions; as the accessor states by default.
 
         Raises:
             Rejected: cut_off, unsupported_accessor, load_error.
@@ -213,7 +216,11 @@ class GltfDocument:
 def open_gltf(data: bytes, suffix: str, files: SourceFolder, limits: ReadLimits) -> GltfDocument:
     """Return a glTF with its buffers, and with its pictures where the limits include materials.
 
-    The suffix is `.glb` or `.gltf`; no buffer outside of the file's folder is read.
+    Args:
+        data: the file.
+        suffix: suffix of its name, `.glb` or `.gltf`.
+        files: the folder of the file; no buffer outside of it is read.
+        limits: bounds of what is read.
 
     Raises:
         Rejected: as `read_container`, `check_tree`, and of a buffer external_uri or missing_file.

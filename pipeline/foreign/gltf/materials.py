@@ -40,9 +40,12 @@ class GltfMaterials:
     ) -> None:
         """Store the arguments; materials are read on demand.
 
-        `decode` returns the values of a picture's bytes. Emission and normal maps are read on
-        request. `notes` receives sentences on parts that are left out; None refuses the file for
-        these.
+        Args:
+            document: the file.
+            decode: returns the values of a picture's bytes.
+            emission: whether emission is read, too.
+            normals: whether normal maps are read, too.
+            notes: receives sentences on parts that are left out; None refuses the file for these.
         """
         self._document = document
         self._tree = document.tree

@@ -81,8 +81,12 @@ class MeshMaterials:
     ) -> None:
         """Convert all materials, decoding each picture once.
 
-        `decode` returns the values of a picture's bytes. `notes` receives sentences on pictures
-        that are left out; None refuses the file.
+        Args:
+            stage_materials: the materials as the stage states them.
+            decode: returns the values of a picture's bytes.
+            time: time of the values.
+            emission: whether emission is read, too.
+            notes: receives sentences on pictures that are left out; None refuses the file.
 
         Raises:
             Rejected: materials_unreadable, or as reading a picture.
@@ -110,7 +114,9 @@ class MeshMaterials:
     def assign(self, number: int, cut: CutMesh) -> tuple[NDArray[np.int64], NDArray[np.float64]]:
         """Return the material rows [T] and corner tints [T, 3, 3] of a mesh's triangles.
 
-        `number` is the index of the mesh within the stage.
+        Args:
+            number: index of the mesh within the stage.
+            cut: its triangles.
         """
         rows = np.full(len(cut.corners), self.plain)
         for row, polygons in self._bindings[number]:

@@ -86,9 +86,12 @@ def read_stage_materials(
 ) -> StageMaterials:
     """Return the materials of the visible meshes of a stage.
 
-    All pictures together have at most `max_bytes`. `read` reads a UsdShade.Material, None leaving
-    it out. By default a material without a shader that is understood is refused, and normal maps
-    are read on request.
+    Args:
+        stage: the open stage.
+        max_bytes: maximum bytes of all pictures together.
+        read: function that reads a UsdShade.Material, None leaving it out; by default one that
+            refuses a material without a shader that is understood.
+        normals: whether that function reads normal maps, too.
 
     Raises:
         Rejected: texture_outside, materials_unreadable.

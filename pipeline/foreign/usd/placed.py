@@ -38,7 +38,10 @@ class BoundSkin:
     def pose(self, prim: Any, stated: Any, time: Any) -> NDArray[np.float64]:
         """Return the posed points [P, 3] of a mesh in its own space.
 
-        `stated` are the unposed points as a USD array.
+        Args:
+            prim: the mesh.
+            stated: unposed points as a USD array.
+            time: time of the pose.
 
         Raises:
             UnposedMesh: joints, weights and points contradict each other.

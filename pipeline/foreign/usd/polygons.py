@@ -54,8 +54,9 @@ class CutMesh:
     def per_corner(self, values: NDArray, interpolation: str) -> NDArray | None:
         """Return values [N, ...] at corners [T, 3, ...]; None where their number does not fit.
 
-        There is one value for each element of an interpolation: constant, uniform, vertex, varying
-        or faceVarying.
+        Args:
+            values: one for each element.
+            interpolation: constant, uniform, vertex, varying or faceVarying.
         """
         where = {
             "constant": np.zeros_like(self.corners),

@@ -212,8 +212,12 @@ def read_material(
 ) -> StatedMaterial | None:
     """Return the inputs of a material, or None where it has no supported shader.
 
-    `opened` receives notes, but none on the inputs of `known`, which the caller reads itself. With
-    `normals`, the normal map of a UsdPreviewSurface is read as the texture `normal`.
+    Args:
+        material: the UsdShade.Material.
+        time: time of the values.
+        opened: the file, which receives notes.
+        known: unsupported inputs that the caller reads itself.
+        normals: whether the normal map of a UsdPreviewSurface is read, as the texture `normal`.
 
     Raises:
         TrilightError: a picture is outside of the folder, or on the network.

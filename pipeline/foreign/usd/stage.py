@@ -65,8 +65,10 @@ class OpenedStage:
     ) -> None:
         """Open the root layer alone.
 
-        Files below `folder` may be read, by default that of the file; each has at most
-        `max_file_bytes`.
+        Args:
+            path: the file.
+            folder: files below it may be read; the folder of `path` by default.
+            max_file_bytes: maximum size of every file.
 
         Raises:
             TrilightError: not a readable USD file, or larger than it may be.
@@ -326,8 +328,10 @@ references, or prims of thousands of sites, take hours."""
 def composition_errors(root: Any, context: Any, name: str) -> Sequence[Any]:
     """Compose all prims below a root layer, payloads too, and return USD's errors.
 
-    Every file that the layer names must have been checked. `context` is the resolver context of the
-    stage that will be opened; messages call the file `name`.
+    Args:
+        root: the layer; every file it names must have been checked (pipeline.foreign.usd.stage).
+        context: resolver context of the stage that will be opened.
+        name: name of the file, for messages.
 
     Raises:
         TrilightError: too many prims, nested too deep, or not composed in time.

@@ -63,7 +63,11 @@ class TextureNode:
 def read_texture_node(shader: Any, output: str, time: Any, opened: OpenedStage) -> TextureNode:
     """Return the inputs of a UsdUVTexture shader.
 
-    `output` is the name of the connected output; `opened` resolves paths and receives notes.
+    Args:
+        shader: the node.
+        output: name of the connected output.
+        time: time of the values.
+        opened: the file, which resolves paths and receives notes.
 
     Raises:
         TrilightError: its picture is outside of the folder, or on the network, or Malformed.

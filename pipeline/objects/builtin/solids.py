@@ -82,8 +82,11 @@ def taper_and_twist(
 ) -> None:
     """Widen points [V, 3] and turn them about z, in place.
 
-    `level` [V] is the height of each point, from -1 to 1. From the middle to the top, the width
-    grows by `taper` in (-1, 1), and the turn is `twist_rad`.
+    Args:
+        points: to be changed.
+        level: [V] height of each point, from -1 to 1.
+        taper: relative growth of width from the middle to the top, in (-1, 1).
+        twist_rad: turn from the middle to the top.
     """
     x, y = (points[:, :2] * (1 + taper * level[:, None])).T
     angle = twist_rad * level
@@ -94,8 +97,10 @@ def taper_and_twist(
 def lathe(outline: Sequence[tuple[float, float]], columns: int) -> Mesh:
     """Return a solid of revolution about z, of 2 len(outline) columns triangles.
 
-    `outline` has radius (positive) and height of each ring; flat disks close the ends. The outline
-    of a body around the axis runs from the bottom to the top. A ring has `columns` vertices.
+    Args:
+        outline: radius (positive) and height of each ring; flat disks close the ends. The outline
+            of a body around the axis runs from the bottom to the top.
+        columns: vertices of a ring.
     """
     rings = np.array(outline)
     azimuth = 2 * np.pi * np.arange(columns) / columns
@@ -146,9 +151,12 @@ def beam(
 ) -> Mesh:
     """Return a beveled bar of 44 triangles between two points that are not above each other in y.
 
-    Start and end are the middles of its ends. The half widths `sizes` are across (level or along x)
-    and at right angles to that. `chamfer` is as in `box`, and `taper` is the width at the end over
-    that at the start.
+    Args:
+        start: middle of one end.
+        end: middle of the other end.
+        sizes: half widths, across (level or along x) and at right angles to that.
+        chamfer: as in `box`.
+        taper: width at the end over the width at the start.
     """
     first = np.asarray(start, np.float64)
     last = np.asarray(end, np.float64)

@@ -22,10 +22,15 @@ def superquadric(
 ) -> Mesh:
     """Return the closed surface of 2 rings columns triangles.
 
-    Exponents are the roundness of the upright outline and as seen from above: 0.1 a box, 1 an
-    ellipse, 2 a rhomb, above 2 a star. `half_sizes` are half extents along x, y and z, before taper
-    and twist (`taper_and_twist`). `rings` lie between the poles. A ring has `columns` vertices; a
-    multiple of 8 puts some on the edges of a box.
+    Args:
+        exponent_profile: roundness of the upright outline: 0.1 a box, 1 an ellipse, 2 a rhomb,
+            above 2 a star.
+        exponent_plan: roundness seen from above, likewise.
+        half_sizes: half extents along x, y and z, before taper and twist.
+        rings: rings between the poles.
+        columns: vertices of a ring; a multiple of 8 puts some on the edges of a box.
+        taper: as in `taper_and_twist`.
+        twist_rad: as in `taper_and_twist`.
     """
     latitude = np.pi * (np.arange(1, rings + 1) / (rings + 1) - 0.5)
     longitude = 2 * np.pi * np.arange(columns) / columns

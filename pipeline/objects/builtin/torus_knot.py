@@ -26,12 +26,16 @@ def torus_knot(
 ) -> Mesh:
     """Return the closed surface of 2 segments sides triangles.
 
-    The strand winds around the axis and through the hole, coprime, on a torus of major radius 1.
-    `fill` is its thickness as a share of the thickest tube that neither meets itself nor folds. It
-    has `segments` vertices along it and `sides` around it; a multiple of the ribs makes them all
-    alike. Ribs are ridges of the cross section, 0 is round. Their depth is a share of the tube's
-    radius, in [0, 1), and they wind `rib_turns` times around the strand. `flatten` is the width of
-    the cross section across the torus, over its height, at most 1.
+    Args:
+        windings: windings of the strand around the axis and through the hole; coprime.
+        minor_radius: of the torus that the strand lies on, whose major radius is 1; in (0, 1).
+        fill: thickness as a share of the thickest tube that neither meets itself nor folds.
+        segments: vertices along the strand.
+        sides: vertices around it; a multiple of the ribs makes them all alike.
+        ribs: ridges of the cross section; 0 is round.
+        rib_depth: depth of the ridges as a share of the tube's radius, in [0, 1).
+        rib_turns: how often the ridges wind around the strand.
+        flatten: width of the cross section across the torus, over its height; at most 1.
     """
     along = 2 * np.pi * np.arange(segments) / segments
     centre, outward = _strand(along, windings, minor_radius)

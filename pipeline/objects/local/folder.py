@@ -35,8 +35,9 @@ CATALOGUE_NAMES = ("objects.jsonl", "objects.csv")
 def only_catalogue(exists: Callable[[str], bool], kind: str = "objects") -> str | None:
     """Return the name of a folder's catalogue, or None where it has none.
 
-    `exists` returns True where the folder has a file of this name. `kind` is objects, textures or
-    skies.
+    Args:
+        exists: returns True where the folder has a file of this name.
+        kind: name of the catalogue: objects, textures or skies.
 
     Raises:
         TrilightError: the folder has both.
@@ -207,7 +208,9 @@ def _file_text(path: Path) -> str:
 def list_folder(folder: Path, licence: str | None) -> Listing:
     """Return the objects of a folder; nothing is loaded.
 
-    Files without a statement get the user's licence.
+    Args:
+        folder: with a catalogue or object files.
+        licence: the user's licence for files without a statement.
 
     Raises:
         TrilightError: the folder is missing or not a folder, its catalogue is wrong, it has two
@@ -258,9 +261,12 @@ def list_files(
 ) -> Listing:
     """Return a record for every object file of a folder; copies and outputs are left out.
 
-    Names have / between the parts of their paths. `locate` returns the fields of a file's record
-    that say where it is. Its Rejected or TransferFailed becomes a failure of that object.
-    `drop_more` returns the object files without others that are none.
+    Args:
+        names: all files of the folder, with / between the parts of their paths.
+        licence: licence of every file.
+        locate: returns the fields of a file's record that say where it is; raises Rejected or
+            TransferFailed, which becomes a failure of that object.
+        drop_more: returns the object files without others that are none.
     """
     names = drop_outputs(names)
     files = [name for name in names if is_object_file(name)]

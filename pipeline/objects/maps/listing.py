@@ -70,9 +70,13 @@ def find_maps(
 ) -> FoundMaps:
     """Return the usable textures or maps of a local folder.
 
-    A catalogue is `textures.jsonl` or `.csv` (`skies.jsonl` or `.csv`); its rows are as in a
-    catalogue of objects and name base colors. Without one, all pictures below the folder count,
-    each under the user's licence, by default user-provided.
+    Args:
+        kind: TEXTURE or SKY.
+        folder: with a catalogue `textures.jsonl` or `.csv` (`skies.jsonl` or `.csv`), whose rows
+            are as in a catalogue of objects and name base colors; otherwise all pictures below
+            it count, each under the user's licence.
+        licence: licence of files without a catalogue; by default user-provided.
+        allowed_licences: SPDX identifiers, `LicenseRef-...`, or compound expressions.
 
     Raises:
         TrilightError: the folder is missing or holds nothing, or its catalogue has a mistake.

@@ -138,8 +138,10 @@ def map_cache_key(kind: str, files: Mapping[str, Path], size: int) -> str:
 def prepare_map(kind: str, files: Mapping[str, Path], size: int) -> tuple[bytes, tuple[str, ...]]:
     """Return the file of a texture or map, and notes on unread parts; for child processes.
 
-    Files are by component; a map has one, "map". `size` is the most texels along a side of a
-    texture, or rows of a map.
+    Args:
+        kind: TEXTURE or SKY.
+        files: picture files by component; a map has one, "map".
+        size: most texels along a side of a texture; most rows of a map.
 
     Raises:
         Rejected: the reason and a remedy; see `usable_map`, `texture_set` and the readers.
@@ -177,9 +179,10 @@ def _prepare_sky(data: bytes, rows: int) -> tuple[bytes, tuple[str, ...]]:
 def texture_set(pictures: Mapping[str, NDArray[np.float32]], size: int) -> PreparedMap:
     """Return a texture.
 
-    Pictures are encoded values [H, W, 1 or 3] of the component "base", and of "specular",
-    "roughness" and "metallic" where present. They may differ in size. A side of the result has at
-    most `size` texels.
+    Args:
+        pictures: encoded values [H, W, 1 or 3] of the component "base", and of "specular",
+            "roughness" and "metallic" where present. They may differ in size.
+        size: most texels along a side of the result.
     """
     base = pictures["base"]
     height, width = _fitting_size(base.shape[:2], size)
@@ -326,7 +329,9 @@ def _plain_values(data: bytes) -> tuple[NDArray[np.float32], bool]:
 def usable_map(radiance: NDArray[np.float32], height: int) -> NDArray[np.float32]:
     """Return a map of at most `height` rows, by means over solid angle.
 
-    The radiance [H, W, 3] is linear, the top row first; a smaller map stays unchanged.
+    Args:
+        radiance: [H, W, 3] linear, the top row first.
+        height: most rows of the result; a smaller map stays unchanged.
 
     Raises:
         Rejected: not_two_to_one, not_a_number, infinite_radiance, negative_radiance,

@@ -146,7 +146,8 @@ def group_textures(
 ) -> tuple[dict[str, dict[str, str]], dict[str, tuple[str, str]]]:
     """Group picture files by texture and component; return reasons for the unused files too.
 
-    Names are paths with / between their parts.
+    Args:
+        names: paths of pictures, with / between their parts.
 
     Returns:
         File names by component of each texture, each with a component "base", in order of the

@@ -168,8 +168,10 @@ class RemoteFiles:
     def __init__(self, folder: RemoteFolder, root: Path, max_bytes: int) -> None:
         """Open the local copies and remove leftovers of earlier runs.
 
-        `root` is for this remote folder alone. An object has at most `max_bytes`, with the buffers
-        that it names.
+        Args:
+            folder: the remote folder.
+            root: local folder for this remote folder alone.
+            max_bytes: largest accepted object in bytes, with the buffers that it names.
         """
         self.files = Path(os.path.realpath(root)) / "files"
         self.stop = threading.Event()
@@ -294,8 +296,11 @@ def buffer_names(path: Path, name: str) -> list[str]:
     """Return the files that the buffers of a `.gltf` name, each once, in order.
 
     Other URIs than relative ones below the file's folder are left out, and a file that is not a
-    glTF has none: the mesh stage reads it again and reports the error. `name` is the path of the
-    file below the remote folder; the results are such paths too.
+    glTF has none: the mesh stage reads it again and reports the error.
+
+    Args:
+        path: the file on this machine.
+        name: its path below the remote folder; the results are such paths too.
     """
     try:
         if path.stat().st_size > _MAX_JSON_BYTES:
