@@ -40,8 +40,8 @@ from pipeline.renders.noise_floor import ErrorMeasures
 from storage.atomic import write_atomically
 from storage.digests import sha256_hex
 from storage.errors import TrilightError
-from storage.intervals import mean_interval
 from storage.markdown import table
+from storage.metrics import mean_interval
 
 Values = NDArray[np.float64]
 

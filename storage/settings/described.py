@@ -23,8 +23,7 @@ from typing import Any, TypeVar, dataclass_transform
 import pydantic
 from pydantic.dataclasses import dataclass
 
-from storage.errors import TrilightError, expected_one_of
-from storage.removed import removal_message
+from storage.errors import TrilightError, expected_one_of, removal_message
 from storage.settings.fields import (
     FieldDescription,
     describe_fields,

@@ -12,8 +12,7 @@ import pytest
 
 from model.config import SIZES, large
 from storage.digests import canonical_json, sha256_hex
-from storage.errors import TrilightError
-from storage.removed import LAST_COMMIT
+from storage.errors import LAST_COMMIT, TrilightError
 from storage.settings.described import settings_record
 from tests.for_each import for_each
 from tests.train.kit import TINY_MODEL, tiny_run

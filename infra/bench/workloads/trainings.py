@@ -23,7 +23,6 @@ from train.loop.step import Stepper
 from train.loop.train_state import new_state
 from train.loop.trainer import scene_flops
 from train.loss.training_loss import TrainingLoss
-from train.run_training import loader_settings
 from train.settings import TrainSettings, learning_rate
 
 
@@ -91,7 +90,7 @@ def _trained_network(
     cost = partial(scene_flops, settings)
     stream = load_batches(
         shards,
-        loader_settings(settings),
+        settings,
         0,
         rank_slice=crew,
         workers=1,
