@@ -110,14 +110,13 @@ def init_or_resume_state(
         TrilightError: `data_weights` has another length than the list of datasets.
     """
     precision = choose_muon_precision(dist_context)
-    data_digest = data.digest
     header = None if plan.checkpoint is None else plan.checkpoint.header
     mixture = plan_mixture(data, plan.settings, header)
     if mixture is not None:
         progress.note(f"the stream mixes {mixture}")
     if plan.checkpoint is None:
         state = new_state(plan.settings, dist_context.device, plan.network, precision)
-        state.mixture = mixture
+        state.mixture, state.data_digest = mixture, data.digest
         digest = None
         if plan.network is not None:
             digest = sha256_hex(encode_weights(plan.network))
@@ -125,11 +124,10 @@ def init_or_resume_state(
             header = {**(read_header(source) if source else {}), "sha256": digest}
             state.history = (_origin(0, "weights", header),)
         if dist_context.is_first:
-            more = {"begun_with_sha256": digest}
-            _write_settings(folder, plan.settings, state, data_digest, dist_context, more)
+            _write_settings(folder, state, dist_context, {"begun_with_sha256": digest})
         return state
     state = restore_state(plan.checkpoint, plan, dist_context.device, precision)
-    state.mixture = mixture
+    state.mixture, state.data_digest = mixture, data.digest
     if plan.branch is not None:
         state.history += (_origin(state.step, "checkpoint", plan.checkpoint.header),)
     for note in plan.notes:
@@ -139,15 +137,9 @@ def init_or_resume_state(
         if plan.branch is not None:
             root = plan.branch if plan.branch.is_dir() else plan.branch.parent.parent
             copy_rows(RunFolder(root).metrics, folder.metrics, state.step)
-        _write_settings(folder, plan.settings, state, data_digest, dist_context)
+        _write_settings(folder, state, dist_context)
         if plan.branch is not None or plan.changes_meaning:
-            save_checkpoint(
-                folder.checkpoints,
-                state,
-                plan.settings,
-                data_digest=data_digest,
-                world_size=dist_context.world_size,
-            )
+            save_checkpoint(folder.checkpoints, state, world_size=dist_context.world_size)
     return state
 
 
@@ -164,9 +156,7 @@ def _origin(step: int, name: str, header: Mapping[str, Any]) -> Event:
 
 def _write_settings(
     folder: RunFolder,
-    settings: TrainSettings,
     state: TrainState,
-    data_digest: str,
     dist_context: DistributedContext,
     more: Mapping[str, Any] | None = None,
 ) -> None:
@@ -181,8 +171,8 @@ def _write_settings(
         **(more or {}),
     }
     now = {
-        "settings": stored_settings(settings),
-        "data_digest": data_digest,
+        "settings": stored_settings(state.settings),
+        "data_digest": state.data_digest,
         **({RECORD: state.mixture.record()} if state.mixture else {}),
         "history": event_records(state.history),
     }

@@ -77,13 +77,13 @@ class TrainResult:
 
 def finish_run(
     state: TrainState,
-    settings: TrainSettings,
     folder: RunFolder,
     data: TrainingData,
     judge: Judge | None,
     seconds: float,
 ) -> TrainResult:
     """Evaluate the finished network, and write its weights, sheet and summary."""
+    settings = state.settings
     trained = TrainedRange(max_triangles=data.max_triangles, resolution=settings.resolution)
     write_atomically(folder.weights, encode_weights(state.eval_model, trained))
     losses = [row["loss"] for row in read_rows(folder.metrics) if row.get("loss") is not None]
@@ -204,7 +204,7 @@ def _train(
     judge = recorder = None
     if dist_context.is_first:
         judge = _make_judge(dataset, settings, state.bad_samples)
-        recorder = Recorder(folder, settings, judge, progress, state, wandb=watched.wandb)
+        recorder = Recorder(folder, judge, progress, state, wandb=watched.wandb)
         how = "went on" if start.resume else "began"
         many = "process" if dist_context.world_size == 1 else "processes"
         where = f"{how} on {dist_context.device}, {dist_context.world_size} {many}"
@@ -212,11 +212,9 @@ def _train(
             add_note(folder.notes, state.step, text)
     trainer = Trainer(
         state=state,
-        settings=settings,
         objective=objective,
         dist_context=dist_context,
         folder=folder,
-        data_digest=dataset.digest,
         recorder=recorder,
         watched=watched,
     )
@@ -237,7 +235,7 @@ def _train(
     if recorder is None:
         return None
     recorder.close()
-    return finish_run(state, settings, folder, dataset, judge, time.monotonic() - began)
+    return finish_run(state, folder, dataset, judge, time.monotonic() - began)
 
 
 class _NoteBuffer(TrainProgress):

@@ -148,8 +148,8 @@ def bare_scene(tensors: SceneTensors) -> TrainingScene:
     )
 
 
-def stepper(state: TrainState, settings: TrainSettings) -> Stepper:
-    return Stepper(state, settings, TrainingLoss(settings.loss, None), ALONE)
+def stepper(state: TrainState) -> Stepper:
+    return Stepper(state, TrainingLoss(state.settings.loss, None), ALONE)
 
 
 def take(

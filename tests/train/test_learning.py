@@ -81,7 +81,7 @@ def memorised(scenes: list[TrainingScene], model: ModelConfig, steps: int) -> Tr
         augmentation=AugmentationSettings(),
     )
     state = new_state(settings)
-    memorising = stepper(state, settings)
+    memorising = stepper(state)
     batches = [collate_batch([scene]) for scene in scenes]
     for step in range(steps):
         memorising.step(batches, learning_rate(step, settings))

@@ -88,7 +88,6 @@ class Recorder:
     def __init__(
         self,
         folder: RunFolder,
-        settings: TrainSettings,
         judge: Judge | None,
         progress: TrainProgress,
         state: TrainState,
@@ -98,18 +97,18 @@ class Recorder:
         """Report the start of the run at `state`, whose step is the last one of the log."""
         progress.begin(
             step=state.step,
-            num_steps=settings.num_steps,
+            num_steps=state.settings.num_steps,
             num_parameters=count_parameters(state.model),
             median_scores=judge.median_scores if judge else None,
         )
         self.progress = progress
         self._folder = folder
-        self._settings = settings
+        self._settings = state.settings
         self._judge = judge
         copy_rows(folder.metrics, folder.metrics, state.step)  # later ones will be written again
         self._wandb_run = None
         if wandb is not None:  # before the writer, whose files it follows
-            self._wandb_run = _begin_wandb_run(wandb, folder.root, settings)
+            self._wandb_run = _begin_wandb_run(wandb, folder.root, state.settings)
         from torch.utils.tensorboard import SummaryWriter  # half a second to import
 
         # a resumed run writes its rows after this step again

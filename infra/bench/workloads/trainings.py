@@ -86,7 +86,7 @@ def _trained_network(
 ) -> RenderFormer:
     crew = DistributedContext(device=device)
     state = new_state(settings, device, muon_precision=choose_muon_precision(crew))
-    stepper = Stepper(state, settings, TrainingLoss(settings.loss, None), crew)
+    stepper = Stepper(state, TrainingLoss(settings.loss, None), crew)
     cost = partial(scene_flops, settings)
     stream = load_batches(
         shards,
