@@ -92,16 +92,9 @@ def leaves_out(*names: str) -> Any:
     return record
 
 
-def settings_record(group: Any, *, stated: bool = False) -> dict[str, Any]:
-    """Return settings as JSON values, as manifests and checkpoints hold them.
-
-    Args:
-        group: an instance.
-        stated: leave out what is at its default; such a record stays what it is when a field is
-            added whose default is what was done before.
-    """
-    adapter = _adapter(typing.cast(Any, type(group)))
-    record: dict[str, Any] = adapter.dump_python(group, mode="json", exclude_defaults=stated)
+def settings_record(group: Any) -> dict[str, Any]:
+    """Return settings as JSON values, as manifests and checkpoints hold them."""
+    record: dict[str, Any] = _adapter(typing.cast(Any, type(group))).dump_python(group, mode="json")
     return record
 
 
