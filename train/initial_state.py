@@ -116,7 +116,8 @@ def init_or_resume_state(
         progress.note(f"the stream mixes {mixture}")
     if plan.checkpoint is None:
         state = new_state(plan.settings, dist_context.device, plan.network, precision)
-        state.mixture, state.data_digest = mixture, data.digest
+        state.mixture = mixture
+        state.data_digest = data.digest
         digest = None
         if plan.network is not None:
             digest = sha256_hex(encode_weights(plan.network))
@@ -127,7 +128,8 @@ def init_or_resume_state(
             _write_settings(folder, state, dist_context, {"begun_with_sha256": digest})
         return state
     state = restore_state(plan.checkpoint, plan, dist_context.device, precision)
-    state.mixture, state.data_digest = mixture, data.digest
+    state.mixture = mixture
+    state.data_digest = data.digest
     if plan.branch is not None:
         state.history += (_origin(state.step, "checkpoint", plan.checkpoint.header),)
     for note in plan.notes:

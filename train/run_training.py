@@ -210,14 +210,7 @@ def _train(
         where = f"{how} on {dist_context.device}, {dist_context.world_size} {many}"
         for text in (where, *early_notes.texts):
             add_note(folder.notes, state.step, text)
-    trainer = Trainer(
-        state=state,
-        objective=objective,
-        dist_context=dist_context,
-        folder=folder,
-        recorder=recorder,
-        watched=watched,
-    )
+    trainer = Trainer(state, objective, dist_context, folder, recorder, watched)
     stream = load_batches(
         dataset.split("train"),
         settings,

@@ -331,9 +331,8 @@ def read_status(url: str) -> DatasetStatus:
     last = looked.last
     finished = _is_finished(dataset)
     listed = [entry.name for entry in manifest.shards]
-    left = counts.scenes_planned - counts.scenes_done - counts.scenes_given_up
-    scenes_left = 0 if finished else left
-    views_per_hour, remaining_s = _rate(last, share, manifest, scenes_left)
+    scenes_left = counts.scenes_planned - counts.scenes_done - counts.scenes_given_up
+    views_per_hour, remaining_s = _rate(last, share, manifest, 0 if finished else scenes_left)
     return DatasetStatus(
         **vars(counts),
         display_name=dataset.display_name,

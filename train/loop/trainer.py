@@ -185,13 +185,12 @@ class Trainer:
 
     def __init__(
         self,
-        *,
         state: TrainState,
         objective: TrainingLoss,
         dist_context: DistributedContext,
         folder: RunFolder,
         recorder: Recorder | None,
-        watched: WatchSettings | None = None,
+        watched: WatchSettings,
     ) -> None:
         """Create the trainer; `recorder` is None in all processes but the first."""
         self.state = state
@@ -212,7 +211,7 @@ class Trainer:
         self.progress = progress
         self.watch = ProcessMonitor(
             settings,
-            watched or WatchSettings(),
+            watched,
             self.stepper,
             dist_context,
             folder,
