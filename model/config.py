@@ -259,7 +259,8 @@ def hits_base() -> ModelConfig:
 
 def tiny() -> ModelConfig:
     """Return 5 M parameters with every part of the large ones: hours on a CPU, minutes on a GPU."""
-    return ModelConfig(
+    return dataclasses.replace(
+        base(),
         width=192,
         num_heads=3,
         encoder_layers=4,
@@ -267,8 +268,6 @@ def tiny() -> ModelConfig:
         hidden_width=576,
         num_registers=8,
         rope_num_freqs=3,
-        rope_max_freq=5.0,
-        head="dpt",
         dpt_features=32,
         dpt_channels=(24, 48, 96, 192),
         dpt_taps=(0, 1, 2, 3),

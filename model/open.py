@@ -180,8 +180,7 @@ def save_published(model: RenderFormer, folder: Path) -> None:
         TrilightError: the network is of neither published family, or the folder cannot be written.
     """
     texture_patch = 1 if model.config.window_bundles else 32
-    config = PublishedConfig(model=model.config, texture_patch=texture_patch)
-    text = json.dumps(encode_published_config(config), indent=2)
+    text = json.dumps(encode_published_config((model.config, texture_patch)), indent=2)
     tensors = {
         name: x.contiguous() for name, x in export_published_weights(model, texture_patch).items()
     }

@@ -11,7 +11,6 @@ thousandth of the input and 10 million fewer weights (P = 32).
 """
 
 from collections.abc import Mapping
-from dataclasses import dataclass
 from typing import Any
 
 import torch
@@ -97,14 +96,8 @@ _SAME = {
 """Fields whose value is that of one field of ModelConfig."""
 
 
-@dataclass(frozen=True, kw_only=True)
-class PublishedConfig:
-    """Content of a published configuration."""
-
-    model: ModelConfig
-    """Configuration of the network, in this project's terms."""
-    texture_patch: int
-    """Width P of its texture input in cells."""
+PublishedConfig = tuple[ModelConfig, int]
+"""Published configuration in our terms, and the width P of its texture input in cells."""
 
 
 def decode_published_config(fields: Mapping[str, Any]) -> PublishedConfig:
@@ -128,7 +121,7 @@ def decode_published_config(fields: Mapping[str, Any]) -> PublishedConfig:
         dpt_channels=tuple(got["dpt_out_channels"]),
         dpt_taps=tuple(taps),
     )
-    return PublishedConfig(model=model, texture_patch=got["texture_encode_patch_size"])
+    return model, got["texture_encode_patch_size"]
 
 
 def encode_published_config(config: PublishedConfig) -> dict[str, Any]:
@@ -138,7 +131,7 @@ def encode_published_config(config: PublishedConfig) -> dict[str, Any]:
         TrilightError: the network is of neither family: a linear head, other material columns,
             windows of another width, or rotary frequencies that the published code cannot build.
     """
-    model = config.model
+    model, texture_patch = config
     doubled = model.rope_max_freq == _max_freq(model.rope_num_freqs, doubled=True)
     if model.head != "dpt":
         _raise_unpublished("head linear", "dpt")
@@ -159,7 +152,7 @@ def encode_published_config(config: PublishedConfig) -> dict[str, Any]:
         **{theirs: same[other] for theirs, other in _EQUAL},
         "rope_double_max_freq": doubled,
         "vertex_pe_num_freqs": 2 * model.rope_num_freqs,
-        "texture_encode_patch_size": config.texture_patch,
+        "texture_encode_patch_size": texture_patch,
         "view_transformer_use_swin_attn": bool(model.window_bundles),
         "dpt_out_channels": list(model.dpt_channels),
         "dpt_out_layers": list(model.dpt_taps),
@@ -217,16 +210,17 @@ def load_published_weights(tensors: Mapping[str, Tensor], config: PublishedConfi
         TrilightError: names or shapes do not match the configuration (all are listed), or the
             rotary frequencies do not.
     """
+    model_config, texture_patch = config
     with torch.device("meta"):
-        ours = RenderFormer(config.model)
-        require_tensors(tensors, export_published_weights(ours, config.texture_patch))
+        ours = RenderFormer(model_config)
+        require_tensors(tensors, export_published_weights(ours, texture_patch))
     single = {name: tensor.float() for name, tensor in tensors.items()}
-    folded = fold(single[f"{TEXTURE}.weight"], single[f"{TEXTURE}.bias"], config.texture_patch)
+    folded = fold(single[f"{TEXTURE}.weight"], single[f"{TEXTURE}.bias"], texture_patch)
     state = dict(zip(MATERIAL, folded, strict=True))
     for name, like in ours.state_dict().items():
         if name not in MATERIAL:
             state[name] = single[_published_name(name)].reshape(like.shape)
-    model = network_of(config.model, state)
+    model = network_of(model_config, state)
     for name in FREQUENCIES:
         _require_frequencies(name, single[name], model.encoder.rotary.freqs_F)
     return model

@@ -11,14 +11,14 @@ from typing import Any
 
 import torch
 from safetensors import SafetensorError, safe_open
-from safetensors.torch import load, save
+from safetensors.torch import save
 from torch import Tensor
 
 from model.config import REMOVED, ModelConfig
 from model.renderformer import RenderFormer
-from storage.errors import TrilightError
-from storage.records.safe_read import MAX_HEADER_BYTES, open_plain, safetensors_header
-from storage.removed import without_removed
+from storage.errors import TrilightError, without_removed
+from storage.records.safe_read import MAX_HEADER_BYTES, open_plain, read_safetensors
+from storage.typed_json import read_json
 
 RANGE_KEY = "trilight_trained_range"
 """Metadata entry of a weights file with its trained range as JSON."""
@@ -56,14 +56,7 @@ def trained_range(metadata: Mapping[str, str]) -> TrainedRange | None:
     """
     if RANGE_KEY not in metadata:
         return None
-    try:
-        fields = json.loads(metadata[RANGE_KEY])
-        known = {name: fields.get(name) for name in ("max_triangles", "resolution")}
-        return TrainedRange(
-            **{name: None if value is None else int(value) for name, value in known.items()}
-        )
-    except (ArithmeticError, AttributeError, TypeError, ValueError, RecursionError) as error:
-        raise TrilightError(f"{RANGE_KEY}: not readable ({error}).") from error
+    return read_json(metadata[RANGE_KEY], TrainedRange, RANGE_KEY)
 
 
 CONFIG_KEY = "trilight_model"
@@ -109,12 +102,8 @@ def decode_weights(data: bytes) -> RenderFormer:
         TrilightError: not such a file, or its tensors do not match its configuration; the message
             lists them. `model.open` reads published checkpoints too.
     """
-    header = safetensors_header(data)
-    try:
-        tensors = load(data)
-    except (SafetensorError, ValueError, KeyError) as error:
-        raise TrilightError(f"weights: unreadable ({error}).") from error
-    return from_tensors(tensors, header.get("__metadata__", {}))
+    arrays, metadata = read_safetensors(data, name="weights")
+    return from_tensors({k: torch.from_numpy(array) for k, array in arrays.items()}, metadata)
 
 
 def from_tensors(

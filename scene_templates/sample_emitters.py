@@ -75,7 +75,10 @@ def sample_emitters(
     for _ in range(count):
         directions.append(_spaced_direction(rng, sector, directions, settings.spacing))
     inside = list(object_centres)[: settings.num_inside]
-    outside = [_sample_center(rng, settings, towards) for towards in directions[len(inside) :]]
+    outside = []
+    for towards in directions[len(inside) :]:
+        target = rng.uniform(-settings.target_jitter, settings.target_jitter, size=3)
+        outside.append(target + rng.uniform(*settings.distance) * towards)
     return tuple(_sample_emitter(rng, settings, centre, count) for centre in [*inside, *outside])
 
 
@@ -99,13 +102,6 @@ def _spaced_direction(
         if gap > spacing:
             break
     return best
-
-
-def _sample_center(
-    rng: np.random.Generator, settings: LightSettings, towards: NDArray[np.float64]
-) -> NDArray[np.float64]:
-    target = rng.uniform(-settings.target_jitter, settings.target_jitter, size=3)
-    return target + rng.uniform(*settings.distance) * towards
 
 
 def _sample_emitter(

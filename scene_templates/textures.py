@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 from scene_templates.checks import Range
 from scene_templates.surfaces.maps import SurfaceMaps
 from scene_templates.surfaces.procedural_textures import SurfaceMapSettings, draw_surface
-from scene_templates.user_maps import UserMap, UserTexture, draw_user_map
+from scene_templates.user_maps import UserMap, UserTexture, draw_user_map, user_surface
 from storage.settings.described import checked
 from storage.settings.ranges import Share, Within
 
@@ -87,7 +87,7 @@ def draw_look(
     if chosen is None:
         maps = draw_surface(rng, settings.surfaces)
     else:
-        maps = chosen.load().maps(rng, chosen.source, settings.surfaces.roughness_clip)
+        maps = user_surface(chosen, rng, settings.surfaces.roughness_clip)
     return TexturedLook(
         maps=maps,
         tile_m=float(tile_m),

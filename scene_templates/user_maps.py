@@ -29,33 +29,26 @@ class UserMap(Generic[Made]):
     load: Callable[[], Made]
 
 
-@dataclass(frozen=True, kw_only=True, eq=False)
-class UserTexture:
-    """Reflectance maps of a user's texture."""
+UserTexture = tuple[NDArray[np.float32], NDArray[np.float32], NDArray[np.float32] | None]
+"""Diffuse and specular albedo [H, W, 3], linear, the top row first; and roughness [H, W, 1], or
+None where one number is to be drawn."""
 
-    diffuse_rgb: NDArray[np.float32]
-    """[H, W, 3] linear, the top row first."""
-    specular_rgb: NDArray[np.float32]
-    """Linear specular albedo [H, W, 3]."""
-    roughness: NDArray[np.float32] | None
-    """[H, W, 1]; None where one number is to be drawn."""
 
-    def maps(
-        self, rng: np.random.Generator, source: MapSource, roughness_clip: tuple[float, float]
-    ) -> SurfaceMaps:
-        """Return it as a surface; a roughness that is missing is uniform in `roughness_clip`."""
-        rough = self.roughness
-        low_high = roughness_clip
-        if rough is None:
-            rough = np.full((*self.diffuse_rgb.shape[:2], 1), rng.uniform(*low_high), np.float32)
-        return SurfaceMaps(
-            family=source.name,
-            diffuse_rgb=self.diffuse_rgb,
-            specular_rgb=self.specular_rgb,
-            roughness=np.clip(rough, *low_high).astype(np.float32),
-            parameters={},
-            source=source,
-        )
+def user_surface(
+    chosen: UserMap[UserTexture], rng: np.random.Generator, roughness_clip: tuple[float, float]
+) -> SurfaceMaps:
+    """Return a user's surface; a roughness that is missing is uniform in `roughness_clip`."""
+    diffuse_rgb, specular_rgb, rough = chosen.load()
+    if rough is None:
+        rough = np.full((*diffuse_rgb.shape[:2], 1), rng.uniform(*roughness_clip), np.float32)
+    return SurfaceMaps(
+        family=chosen.source.name,
+        diffuse_rgb=diffuse_rgb,
+        specular_rgb=specular_rgb,
+        roughness=np.clip(rough, *roughness_clip).astype(np.float32),
+        parameters={},
+        source=chosen.source,
+    )
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)

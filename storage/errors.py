@@ -1,8 +1,8 @@
-"""Errors: a user's mistake, a failure of the environment, an unusable item."""
+"""Errors: a user's mistake, a failure of the environment, an unusable item, a removed setting."""
 
-from collections.abc import Iterable
+from collections.abc import Iterable, Mapping
 from difflib import get_close_matches
-from typing import ClassVar
+from typing import Any, ClassVar
 
 
 class TrilightError(ValueError):
@@ -68,3 +68,31 @@ def expected_one_of(name: str, known: Iterable[str]) -> str:
     swapped = (near for near in names if sorted(near) == sorted(name))  # such as tyni
     close = get_close_matches(name, names, n=1) or list(swapped)
     return f"did you mean {close[0]}? E{listed}" if close else f"e{listed}"
+
+
+LAST_COMMIT = "643b412e"
+"""The last commit that reads what was removed in November 2026."""
+
+
+def removal_message(thing: str) -> str:
+    """Return the refusal of `thing`, such as "weights.safetensors: sky tokens"."""
+    return f"{thing}: removed since, and commit {LAST_COMMIT} is the last that reads it."
+
+
+def without_removed(
+    record: Mapping[str, Any], removed: Mapping[str, Any], source: str
+) -> dict[str, Any]:
+    """Return a stored record without the removed settings.
+
+    Args:
+        record: settings by name.
+        removed: the removed settings, at the values that meant none.
+        source: what stands before a setting's name in the refusal.
+
+    Raises:
+        TrilightError: a removed setting has another value.
+    """
+    for name, off in removed.items():
+        if record.get(name, off) != off:
+            raise TrilightError(removal_message(f"{source}.{name} is {record[name]!r}"))
+    return {name: value for name, value in record.items() if name not in removed}

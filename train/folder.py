@@ -7,7 +7,7 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from storage.atomic import append_line
+from storage.atomic import append_line, write_atomically
 from storage.errors import TrilightError
 from storage.file_locks import describe_holder, hold_lock
 from storage.records.safe_read import read_plain
@@ -96,6 +96,13 @@ def read_rows(path: Path) -> list[dict[str, Any]]:
         if not isinstance(row.get("step"), int):
             raise TrilightError(f"{path}:{number}: step is {row.get('step')!r}; expected a number.")
     return rows
+
+
+def copy_rows(source: Path, path: Path, last_step: int) -> None:
+    """Write the rows of a log up to a step, without a last line that a kill has cut."""
+    rows = [row for row in read_rows(source) if row["step"] <= last_step]
+    lines = [f"{json.dumps(row, sort_keys=True)}\n" for row in rows]
+    write_atomically(path, "".join(lines).encode())
 
 
 def add_note(path: Path, step: int, text: str) -> None:

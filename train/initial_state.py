@@ -21,7 +21,7 @@ from storage.extensions import extension_digests
 from storage.records.safe_read import read_plain
 from storage.typed_json import read_json
 from train.data.order import RECORD, plan_mixture
-from train.folder import RunFolder, pretty_json, read_rows
+from train.folder import RunFolder, copy_rows, pretty_json
 from train.loop.checkpoints import (
     newest_checkpoint,
     read_checkpoint,
@@ -30,7 +30,6 @@ from train.loop.checkpoints import (
 )
 from train.loop.distributed import DistributedContext
 from train.loop.optimizer import choose_muon_precision
-from train.loop.recorder import MetricsLog
 from train.loop.train_state import TrainState, new_state
 from train.progress import TrainProgress
 from train.resume import Event, ResumePlan, StartOptions, event_records, plan_resume
@@ -38,19 +37,18 @@ from train.settings import TrainSettings, stored_settings
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
-class StartPlan:
+class StartPlan(ResumePlan):
     """Everything that a run starts or resumes with; nothing is written yet."""
 
-    settings: TrainSettings
-    """Settings of the next step."""
+    history: tuple[Event, ...] = ()
+    notes: tuple[str, ...] = ()
+    changes_meaning: bool = True
     network: RenderFormer | None = None
     """Network whose weights are copied; None for random weights or a checkpoint."""
     network_source: str = ""
     """Path or name from which that network was opened."""
     checkpoint: Checkpoint | None = None
     """Checkpoint that is restored; None for a new run."""
-    resume_plan: ResumePlan | None = None
-    """Changed settings and history of a resumed run; None for a new run."""
     branch: Path | None = None
     """Checkpoint or run folder that a new folder continues; None otherwise."""
 
@@ -94,9 +92,7 @@ def plan_start(
         config = decode_config(checkpoint.header["model"], str(branch or folder.root))
         settings = dataclasses.replace(settings, model=config)
     resume_plan = plan_resume(checkpoint.header, settings, data_digest, start.decisions)
-    return StartPlan(
-        settings=resume_plan.settings, checkpoint=checkpoint, resume_plan=resume_plan, branch=branch
-    )
+    return StartPlan(**vars(resume_plan), checkpoint=checkpoint, branch=branch)
 
 
 def init_or_resume_state(
@@ -114,14 +110,14 @@ def init_or_resume_state(
         TrilightError: `data_weights` has another length than the list of datasets.
     """
     precision = choose_muon_precision(dist_context)
-    data_digest = data.digest
     header = None if plan.checkpoint is None else plan.checkpoint.header
     mixture = plan_mixture(data, plan.settings, header)
     if mixture is not None:
         progress.note(f"the stream mixes {mixture}")
-    if plan.checkpoint is None or plan.resume_plan is None:
+    if plan.checkpoint is None:
         state = new_state(plan.settings, dist_context.device, plan.network, precision)
         state.mixture = mixture
+        state.data_digest = data.digest
         digest = None
         if plan.network is not None:
             digest = sha256_hex(encode_weights(plan.network))
@@ -129,32 +125,23 @@ def init_or_resume_state(
             header = {**(read_header(source) if source else {}), "sha256": digest}
             state.history = (_origin(0, "weights", header),)
         if dist_context.is_first:
-            more = {"begun_with_sha256": digest}
-            _write_settings(folder, plan.settings, state, data_digest, dist_context, more)
+            _write_settings(folder, state, dist_context, {"begun_with_sha256": digest})
         return state
-    state = restore_state(plan.checkpoint, plan.resume_plan, dist_context.device, precision)
+    state = restore_state(plan.checkpoint, plan, dist_context.device, precision)
     state.mixture = mixture
+    state.data_digest = data.digest
     if plan.branch is not None:
         state.history += (_origin(state.step, "checkpoint", plan.checkpoint.header),)
-    for note in plan.resume_plan.notes:
+    for note in plan.notes:
         progress.note(note)
     _record_execution_changes(plan.checkpoint, dist_context, state, progress)
     if dist_context.is_first:  # on disk, so that a kill before the next checkpoint loses nothing
         if plan.branch is not None:
             root = plan.branch if plan.branch.is_dir() else plan.branch.parent.parent
-            log = MetricsLog(folder.metrics, first_step=0)
-            for row in read_rows(RunFolder(root).metrics):
-                if row["step"] <= state.step:
-                    log.append(row)
-        _write_settings(folder, plan.settings, state, data_digest, dist_context)
-        if plan.branch is not None or plan.resume_plan.changes_meaning:
-            save_checkpoint(
-                folder.checkpoints,
-                state,
-                plan.settings,
-                data_digest=data_digest,
-                world_size=dist_context.world_size,
-            )
+            copy_rows(RunFolder(root).metrics, folder.metrics, state.step)
+        _write_settings(folder, state, dist_context)
+        if plan.branch is not None or plan.changes_meaning:
+            save_checkpoint(folder.checkpoints, state, world_size=dist_context.world_size)
     return state
 
 
@@ -171,9 +158,7 @@ def _origin(step: int, name: str, header: Mapping[str, Any]) -> Event:
 
 def _write_settings(
     folder: RunFolder,
-    settings: TrainSettings,
     state: TrainState,
-    data_digest: str,
     dist_context: DistributedContext,
     more: Mapping[str, Any] | None = None,
 ) -> None:
@@ -188,8 +173,8 @@ def _write_settings(
         **(more or {}),
     }
     now = {
-        "settings": stored_settings(settings),
-        "data_digest": data_digest,
+        "settings": stored_settings(state.settings),
+        "data_digest": state.data_digest,
         **({RECORD: state.mixture.record()} if state.mixture else {}),
         "history": event_records(state.history),
     }

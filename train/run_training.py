@@ -2,7 +2,7 @@
 
 import dataclasses
 import time
-from collections.abc import Generator, Sequence
+from collections.abc import Sequence
 from contextlib import closing
 from dataclasses import dataclass
 from functools import partial
@@ -19,8 +19,8 @@ from storage.dataset.training_data import TrainingData, open_mixture
 from storage.errors import TrilightError
 from train.data.bad_samples import BadSampleCounter, first_samples
 from train.data.buckets import step_scenes
-from train.data.loader import LoaderSettings, choose_workers, load_batches
-from train.data.scenes import TrainingScene, training_scene
+from train.data.loader import choose_workers, load_batches
+from train.data.scenes import training_scene
 from train.evaluation.metrics import Lead
 from train.evaluation.sheet import draw_validation_sheet, write_picture
 from train.evaluation.validation import Judge, median_picture
@@ -77,13 +77,13 @@ class TrainResult:
 
 def finish_run(
     state: TrainState,
-    settings: TrainSettings,
     folder: RunFolder,
     data: TrainingData,
     judge: Judge | None,
     seconds: float,
 ) -> TrainResult:
     """Evaluate the finished network, and write its weights, sheet and summary."""
+    settings = state.settings
     trained = TrainedRange(max_triangles=data.max_triangles, resolution=settings.resolution)
     write_atomically(folder.weights, encode_weights(state.eval_model, trained))
     losses = [row["loss"] for row in read_rows(folder.metrics) if row.get("loss") is not None]
@@ -204,23 +204,23 @@ def _train(
     judge = recorder = None
     if dist_context.is_first:
         judge = _make_judge(dataset, settings, state.bad_samples)
-        recorder = Recorder(folder, settings, judge, progress, state, wandb=watched.wandb)
+        recorder = Recorder(folder, judge, progress, state, wandb=watched.wandb)
         how = "went on" if start.resume else "began"
         many = "process" if dist_context.world_size == 1 else "processes"
         where = f"{how} on {dist_context.device}, {dist_context.world_size} {many}"
         for text in (where, *early_notes.texts):
             add_note(folder.notes, state.step, text)
-    trainer = Trainer(
-        state=state,
-        settings=settings,
-        objective=objective,
-        dist_context=dist_context,
-        folder=folder,
-        data_digest=dataset.digest,
-        recorder=recorder,
-        watched=watched,
+    trainer = Trainer(state, objective, dist_context, folder, recorder, watched)
+    stream = load_batches(
+        dataset.split("train"),
+        settings,
+        state.step,
+        rank_slice=dist_context,
+        workers=workers,
+        unusable=state.bad_samples,
+        mixture=state.mixture,
     )
-    with closing(_batches(dataset, settings, state, dist_context, workers)) as batches:
+    with closing(stream) as batches:
         cost = partial(scene_flops, settings)
         most = settings.scenes_per_pass
         with closing(step_scenes(batches, cost, most, dist_context.device)) as steps:
@@ -228,29 +228,7 @@ def _train(
     if recorder is None:
         return None
     recorder.close()
-    return finish_run(state, settings, folder, dataset, judge, time.monotonic() - began)
-
-
-def _batches(
-    data: TrainingData,
-    settings: TrainSettings,
-    state: TrainState,
-    dist_context: DistributedContext,
-    workers: int,
-) -> Generator[list[TrainingScene], None, None]:
-    """Return the scenes of this process for each step, beginning with the state's step."""
-    # on a GPU targets are looked up there, which saves work of decoding threads
-    in_threads = dist_context.device.type != "cuda"
-    stream = dataclasses.replace(loader_settings(settings), lookup_in_threads=in_threads)
-    return load_batches(
-        data.split("train"),
-        stream,
-        state.step,
-        rank_slice=dist_context,
-        workers=workers,
-        unusable=state.bad_samples,
-        mixture=state.mixture,
-    )
+    return finish_run(state, folder, dataset, judge, time.monotonic() - began)
 
 
 class _NoteBuffer(TrainProgress):
@@ -263,20 +241,6 @@ class _NoteBuffer(TrainProgress):
     def note(self, text: str) -> None:
         self._progress.note(text)
         self.texts.append(text)
-
-
-def loader_settings(settings: TrainSettings) -> LoaderSettings:
-    """Return the settings of the data loader that feeds a run."""
-    return LoaderSettings(
-        seed=settings.seed,
-        window=settings.shuffle_shards,
-        batch_size=settings.scenes_per_step,
-        resolution=settings.resolution,
-        views_per_scene=settings.views_per_scene,
-        most_triangles=settings.most_triangles,
-        augmentation=settings.augmentation,
-        network=settings.model,
-    )
 
 
 def _check_data(data: TrainingData, settings: TrainSettings) -> None:

@@ -13,8 +13,7 @@ from typing import Annotated, Any, ClassVar, Literal
 
 from model.config import REMOVED as REMOVED_FROM_MODEL
 from model.config import BaseWidths, ModelConfig
-from storage.errors import TrilightError
-from storage.removed import without_removed
+from storage.errors import TrilightError, without_removed
 from storage.settings.described import checked, settings_record
 from storage.settings.ranges import EXECUTION, Seed, Share, Within
 

@@ -12,7 +12,7 @@ from matplotlib.figure import Figure
 from infra.bench.experiment import Column, Experiment, Point, Run, columns_of
 from pipeline.documents.figures import drawing
 from storage.errors import TrilightError
-from storage.intervals import mean_interval
+from storage.metrics import mean_interval
 from train.evaluation.cost_charts import SeriesPoint, draw_panels, number_text, on_front, plain_log
 
 _OVER: Mapping[str, Callable[[Sequence[float]], Any]] = {

@@ -49,12 +49,13 @@ def _row(standing: Any) -> dict[str, str]:
     from train.evaluation.judged_view import METRIC, interval_text
 
     lead = standing.lead
+    price = standing.price
     scores = standing.scores[METRIC]
     ends = interval_text(lead.low, lead.high, 1) if lead is not None else ""
     return {
         "": standing.name,
-        "first, s": "" if standing.first_s is None else number_text(standing.first_s),
-        "further": "" if standing.further_s is None else number_text(standing.further_s),
+        "first, s": "" if price is None else number_text(price.first_s),
+        "further": "" if price is None else number_text(price.further_s),
         "dB": f"{scores['median']:.1f}",
         "5th": f"{scores['worse_5_percent']:.1f}",
         "lead, dB": "" if lead is None else f"{lead.mean:+.1f}" + (f" ({ends})" if ends else ""),
@@ -67,7 +68,16 @@ def _plain(board: Any) -> list[dict[str, Any]]:
             "width": one.width,
             "views": one.num_views,
             "scenes": one.num_scenes,
-            "standings": [dataclasses.asdict(each) for each in one.standings],
+            "standings": [_plain_standing(each) for each in one.standings],
         }
         for one in board.widths
     ]
+
+
+def _plain_standing(standing: Any) -> dict[str, Any]:
+    """Return the fields of a standing, with both seconds of its price in the place of that."""
+    record: dict[str, Any] = {}
+    for name, value in dataclasses.asdict(standing).items():
+        no_price = {"first_s": None, "further_s": None}
+        record |= (value or no_price) if name == "price" else {name: value}
+    return record

@@ -13,6 +13,7 @@ from infra.cli.console import (
 from infra.cli.options import command
 from storage.dataset.dataset import open_dataset
 from storage.dataset.derived import derivation_of
+from storage.dataset.planned import num_planned
 from storage.dataset.progress import read_asked, value_of
 from storage.dataset.verify import Verification, verify_dataset
 from storage.remote.safe_url import safe_url
@@ -108,10 +109,10 @@ def _as_json(verification: Verification) -> dict[str, object]:
         "dataset_digest": verification.manifest.dataset_digest,
         "finished": verification.is_finished,
         "problems": list(verification.problems),
-        "samples": verification.num_samples,
+        "samples": verification.manifest.num_samples,
         "scenes_planned": verification.manifest.num_scenes,
         "shards": len(verification.manifest.shards),
-        "shards_planned": verification.num_shards_planned,
+        "shards_planned": num_planned(verification.manifest),
     }
 
 
@@ -120,12 +121,12 @@ def _report(verification: Verification, *, fast: bool) -> None:
     shards = f"{len(manifest.shards)}"
     title = "Verified"
     if not verification.is_finished:
-        shards += f" of {verification.num_shards_planned}"
+        shards += f" of {num_planned(verification.manifest)}"
         title = "Unfinished; everything present is valid"
     rows = [
         ("dataset digest", manifest.dataset_digest),
         ("shards", f"{shards}, {manifest.num_bytes / 1e6:.1f} MB"),
-        ("scenes", f"{verification.num_samples} of {manifest.num_scenes} planned"),
+        ("scenes", f"{verification.manifest.num_samples} of {manifest.num_scenes} planned"),
         ("checked", "sizes and counts" if fast else "hashes, members, laws, pictures, splits"),
         *(("wrong", problem) for problem in verification.problems),
     ]

@@ -155,11 +155,7 @@ def _source(locked: LockedObject) -> MapSource:
 
 def _texture(path: Path) -> UserTexture:
     arrays = decode_prepared(path.read_bytes(), path.name).arrays
-    return UserTexture(
-        diffuse_rgb=arrays["diffuse"],
-        specular_rgb=arrays["specular"],
-        roughness=arrays.get("roughness"),
-    )
+    return arrays["diffuse"], arrays["specular"], arrays.get("roughness")
 
 
 def _radiance(path: Path) -> NDArray[np.float32]:

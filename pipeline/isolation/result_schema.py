@@ -19,7 +19,7 @@ from pydantic_core import SchemaValidator, ValidationError
 from pydantic_core import core_schema as core
 
 from pipeline.isolation.answers import CLASS
-from storage.array_hints import array_scalar
+from storage.settings.fields import array_scalar
 
 DTYPES = [np.dtype(code).name for code in "?bhiqBHIQefd"]
 """Names of the supported array dtypes."""

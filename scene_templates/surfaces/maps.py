@@ -8,6 +8,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from scene_templates.exact import Numbers, lerp
+from scene_templates.layout import RGB
 from scene_templates.recorded_sampler import RecordedSampler
 from storage.records.texture import MapSource
 
@@ -95,10 +96,6 @@ def finish(base_rgb: ArrayLike, *, specular_share: float, roughness: float, meta
         specular_rgb=share * (base if metal else np.ones(3)),
         roughness=np.asarray(roughness, np.float64),
     )
-
-
-RGB = tuple[float, float, float]
-"""Linear, Rec.709 primaries."""
 
 
 class GlossRanges(TypedDict):

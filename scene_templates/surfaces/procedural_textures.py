@@ -16,9 +16,9 @@ from numpy.typing import NDArray
 
 from scene_templates.checks import Range, require
 from scene_templates.exact import Numbers, ramp, smoothstep
+from scene_templates.layout import RGB
 from scene_templates.surfaces.maps import (
     MOST_ALBEDO,
-    RGB,
     Finish,
     GlossRanges,
     SurfaceDraws,

@@ -75,16 +75,16 @@ _AT_WORK_S = 600.0
 class _Counts:
     """Counts of what is finished and of what is planned; 0 planned where it is not known yet."""
 
-    objects_done: int
+    objects_done: int = 0
     """Objects that are prepared or rejected; of a bucket, 0."""
-    objects_planned: int
+    objects_planned: int = 0
     """Objects to prepare; 0 before they are counted, and of a bucket."""
-    scenes_done: int
+    scenes_done: int = 0
     """Scenes in shards or waiting for theirs."""
-    scenes_given_up: int
+    scenes_given_up: int = 0
     """Scenes that no attempt could save; of a bucket, known once it is finished."""
-    scenes_planned: int
-    num_views: int
+    scenes_planned: int = 0
+    num_views: int = 0
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -153,29 +153,26 @@ def forget_views(folder: DatasetFolder, scene_index: int) -> None:
 
 def read_progress(folder: DatasetFolder) -> Progress:
     """Count files; cheap enough to be called twice a second: a manifest is read when it changes."""
-    try:
+    counts = _count_objects(folder)
+    with contextlib.suppress(TrilightError, OSError):
         facts = folder.manifest.stat()
         manifest, expected = _plan_of(folder.manifest, facts.st_mtime_ns, facts.st_size)
-        scenes_planned = manifest.num_scenes
-        num_views = manifest.num_views
         finished = existing_shards(folder) & set(expected) - set(manifest.growing)
-        scenes_done, given_up = _count_scenes(manifest, expected, finished, folder)
-    except (TrilightError, OSError):
-        scenes_planned = num_views = scenes_done = given_up = 0
-    objects = _read_counts(folder.staged_plan, dict[str, int], {"objects": 0})["objects"]
-    counted = folder.staged_done.stat().st_size if folder.staged_done.exists() else 0
+        counts = _count_scenes(counts, manifest, expected, finished, folder)
     done, total = _read_counts(folder.staged_downloads, tuple[int, int], (0, 0))
     return Progress(
+        **vars(counts),
         downloads_done=done,
         downloads_planned=total,
-        objects_done=min(counted, objects),  # several makers count what all of them found done
-        objects_planned=objects,
-        scenes_done=scenes_done,
-        scenes_given_up=given_up,
-        scenes_planned=scenes_planned,
-        num_views=num_views,
-        views_done=scenes_done * num_views + _views_at_work(folder),
+        views_done=counts.scenes_done * counts.num_views + _views_at_work(folder),
     )
+
+
+def _count_objects(folder: DatasetFolder) -> _Counts:
+    planned = _read_counts(folder.staged_plan, dict[str, int], {"objects": 0})["objects"]
+    done = folder.staged_done.stat().st_size if folder.staged_done.exists() else 0
+    # several makers count what all of them found done
+    return _Counts(objects_done=min(done, planned), objects_planned=planned)
 
 
 def _read_counts(path: Path, kind: type[T], none: T) -> T:
@@ -251,21 +248,22 @@ def _is_finished(dataset: Dataset) -> bool:
 
 
 def _count_scenes(
+    counts: _Counts,
     manifest: Manifest,
     expected: Mapping[str, int],
     finished: Collection[str],
     folder: DatasetFolder | None,
-) -> tuple[int, int]:
-    """Return how many scenes are in finished shards or wait for theirs, and how many are given up.
-
-    Without a folder of this machine, what waits is not known.
-    """
-    done = sum(expected[name] for name in finished)
-    lacking = max(manifest.num_scenes - sum(expected.values()), 0)
-    if folder is None:
-        return done, lacking
-    given_up = _scenes_given_up(folder, manifest)
-    return done + _num_waiting(folder) - given_up, given_up + lacking
+) -> _Counts:
+    """Return counts with those of scenes; without a folder here, what waits is not known."""
+    given_up = 0 if folder is None else _scenes_given_up(folder, manifest)
+    waiting = 0 if folder is None else _num_waiting(folder)
+    return dataclasses.replace(
+        counts,
+        scenes_done=sum(expected[name] for name in finished) + waiting - given_up,
+        scenes_given_up=given_up + max(manifest.num_scenes - sum(expected.values()), 0),
+        scenes_planned=manifest.num_scenes,
+        num_views=manifest.num_views,
+    )
 
 
 def _num_waiting(folder: DatasetFolder) -> int:
@@ -327,26 +325,21 @@ def read_status(url: str) -> DatasetStatus:
     local = dataset.local
     planned = expected_scenes(manifest)
     names = _finished_names(dataset, planned)
-    done, given_up = _count_scenes(manifest, planned, names, local)
-    objects = read_progress(local) if local else None
+    objects = _count_objects(local) if local else _Counts()
+    counts = _count_scenes(objects, manifest, planned, names, local)
     looked, share = (sample_logs(local), 1.0) if local else _sampled_logs(dataset)
     last = looked.last
     finished = _is_finished(dataset)
     listed = [entry.name for entry in manifest.shards]
-    scenes_left = 0 if finished else manifest.num_scenes - done - given_up
-    views_per_hour, remaining_s = _rate(last, share, manifest, scenes_left)
+    scenes_left = counts.scenes_planned - counts.scenes_done - counts.scenes_given_up
+    views_per_hour, remaining_s = _rate(last, share, manifest, 0 if finished else scenes_left)
     return DatasetStatus(
+        **vars(counts),
         display_name=dataset.display_name,
         build=manifest.build,
         shards_done=len(names),
         shards_planned=len(planned),
         shards_lost=len(listed) - len(_finished_names(dataset, listed)) if finished else 0,
-        scenes_done=done,
-        scenes_given_up=given_up,
-        scenes_planned=manifest.num_scenes,
-        objects_done=objects.objects_done if objects else 0,
-        objects_planned=objects.objects_planned if objects else 0,
-        num_views=manifest.num_views,
         finished=finished,
         at_work=local is not None and local.is_at_work,
         views_per_hour=views_per_hour,

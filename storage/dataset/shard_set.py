@@ -11,8 +11,7 @@ import math
 import os
 import re
 import threading
-from abc import ABC, abstractmethod
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import BinaryIO
@@ -21,8 +20,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from storage.conventions import SPLITS
-from storage.dataset.dataset import Dataset
-from storage.dataset.manifest import ShardEntry
 from storage.dataset.shard import ShardReader
 from storage.digests import sha256_hex
 from storage.errors import TrilightError
@@ -41,40 +38,25 @@ _RANGE = re.compile(r"(\d+)\.\.(\d+)")
 _WHAT = "shard"
 
 
-@dataclass(frozen=True, kw_only=True)
-class ShardPlace:
-    """The place of one shard."""
+@dataclass(frozen=True, kw_only=True, slots=True)
+class SetShard:
+    """One shard of a set."""
 
-    place: Path | RemoteUrl
-    """A file of this machine, or one on a server."""
-
-    @property
-    def display_name(self) -> str:
-        """The path or URL without secrets, for messages."""
-        if isinstance(self.place, RemoteUrl):
-            return self.place.display_url
-        return printable(str(self.place))
+    name: str
+    """Name in its dataset, or the path or URL without secrets, for messages."""
+    open: Callable[[], BinaryIO]
+    """Opens the file, checked where a digest is known; raises TrilightError where it cannot."""
+    num_samples: int | None = None
+    """Number of its samples, where a manifest says it."""
 
     @property
     def split(self) -> str:
         """What its name begins with, if that is a split, and else train."""
-        name = self.display_name.rpartition("/")[2]
+        name = self.name.rpartition("/")[2]
         return next((split for split in SPLITS if name.startswith(f"{split}-")), "train")
 
-    def open(self) -> BinaryIO:
-        """Open the shard; raises TrilightError where it cannot be read."""
-        if isinstance(self.place, RemoteUrl):
-            return shard_cache().open(self.place, num_bytes=None, sha256=None)
-        try:
-            return open_plain(self.place)
-        except OSError as error:
-            raise TrilightError(
-                f"shard {self.display_name!r}: cannot be read ({error.strerror}); expected a file. "
-                "Check the list: a dataset numbers its shards over all splits."
-            ) from error
 
-
-def listed_shards(patterns: Sequence[str]) -> list[ShardPlace]:
+def listed_shards(patterns: Sequence[str]) -> list[SetShard]:
     """Return the shards that patterns name, in their order.
 
     Args:
@@ -86,15 +68,36 @@ def listed_shards(patterns: Sequence[str]) -> list[ShardPlace]:
             than MAX_SHARDS, a range runs backwards, or a shard is named twice.
     """
     texts = list(itertools.chain.from_iterable(expand_pattern(pattern) for pattern in patterns))
-    places = [ShardPlace(place=parse_url(text, what=_WHAT)) for text in texts]
+    places = [parse_url(text, what=_WHAT) for text in texts]
     if len(places) > MAX_SHARDS:
         raise TrilightError(f"the list names {len(places)} shards; expected at most {MAX_SHARDS}.")
-    seen: set[Path | RemoteUrl] = set()
+    shards: dict[Path | RemoteUrl, SetShard] = {}
     for place in places:
-        if place.place in seen:
-            raise TrilightError(f"shard {place.display_name!r} is named twice; expected each once.")
-        seen.add(place.place)
-    return places
+        shard = _listed_shard(place)
+        if place in shards:
+            raise TrilightError(f"shard {shard.name!r} is named twice; expected each once.")
+        shards[place] = shard
+    return list(shards.values())
+
+
+def _listed_shard(place: Path | RemoteUrl) -> SetShard:
+    if isinstance(place, RemoteUrl):
+        return SetShard(
+            name=place.display_url,
+            open=lambda: shard_cache().open(place, num_bytes=None, sha256=None),
+        )
+    name = printable(str(place))
+
+    def open_file() -> BinaryIO:
+        try:
+            return open_plain(place)
+        except OSError as error:
+            raise TrilightError(
+                f"shard {name!r}: cannot be read ({error.strerror}); expected a file. Check the "
+                "list: a dataset numbers its shards over all splits."
+            ) from error
+
+    return SetShard(name=name, open=open_file)
 
 
 def expand_pattern(pattern: str, what: str = "shards") -> list[str]:
@@ -182,55 +185,6 @@ class OpenShard(ShardReader):
             raise TrilightError(f"{self.name}: {error}") from error
 
 
-class ShardSet(ABC):
-    """Shards by number."""
-
-    names: Sequence[str]
-    """Shard names as messages show them."""
-
-    @property
-    def parts(self) -> Sequence[range]:
-        """The numbers of each dataset's shards; they are those of one unless said."""
-        return (range(len(self.names)),)
-
-    @abstractmethod
-    def num_samples(self, number: int) -> int:
-        """Return how many samples a shard holds; opens it where nothing else tells."""
-
-    @abstractmethod
-    def open(self, number: int) -> OpenShard:
-        """Open a shard, fetched and checked.
-
-        Raises:
-            TrilightError: it cannot be read, or is not what it should be; the message names it.
-        """
-
-
-class ManifestShards(ShardSet):
-    """Shards of a manifest: sizes and digests are known, every one is checked."""
-
-    def __init__(self, dataset: Dataset, entries: Sequence[ShardEntry]) -> None:
-        self.names = [entry.name for entry in entries]
-        self._dataset = dataset
-        self._entries = entries
-        self._held = HeldMaps()
-
-    def num_samples(self, number: int) -> int:
-        return self._entries[number].num_samples
-
-    def open(self, number: int) -> OpenShard:
-        entry = self._entries[number]
-        stream = self._dataset.open_stream(entry, checked=True)
-        shard = OpenShard(entry.name, stream, self._held)
-        if len(shard.keys) != entry.num_samples:
-            shard.close()
-            raise TrilightError(
-                f"{entry.name}: holds {len(shard.keys)} samples; expected {entry.num_samples}, as "
-                "the manifest says. Run `trilight verify`."
-            )
-        return shard
-
-
 class KeysSeen:
     """The keys of all shards that were opened so far, as 8 bytes each."""
 
@@ -258,28 +212,53 @@ class KeysSeen:
             self._shards.add(shard)
 
 
-class ListedShards(ShardSet):
-    """Shards of a list: nothing is known of one before it was opened, and nothing is checked."""
+class ShardSet:
+    """Shards by number, those of one dataset after those of another."""
 
-    def __init__(self, places: Sequence[ShardPlace], seen: KeysSeen) -> None:
-        self.names = [place.display_name for place in places]
-        self._places = places
-        self._seen = seen
+    def __init__(self, *datasets: Sequence[SetShard], seen: KeysSeen | None = None) -> None:
+        """Take the shards of each dataset.
+
+        Args:
+            datasets: their shards.
+            seen: keys of shards whose number of samples is not known: no manifest lists those.
+        """
+        self._shards = list(itertools.chain(*datasets))
+        self.names: Sequence[str] = [shard.name for shard in self._shards]
+        """Shard names as messages show them."""
+        ends = itertools.accumulate(map(len, datasets), initial=0)
+        self.parts: Sequence[range] = tuple(itertools.starmap(range, itertools.pairwise(ends)))
+        """The numbers of each dataset's shards."""
+        self._seen = seen or KeysSeen()
         self._counts: dict[int, int] = {}
         self._held = HeldMaps()
 
     def num_samples(self, number: int) -> int:
+        """Return how many samples a shard holds; opens it where nothing else tells."""
+        if (stated := self._shards[number].num_samples) is not None:
+            return stated
         if number not in self._counts:
             self.open(number).close()
         return self._counts[number]
 
     def open(self, number: int) -> OpenShard:
-        place = self._places[number]
-        shard = OpenShard(place.display_name, place.open(), self._held)
+        """Open a shard, fetched, and checked as far as a manifest describes it.
+
+        Raises:
+            TrilightError: it cannot be read, or is not what it should be; the message names it.
+        """
+        shard = self._shards[number]
+        opened = OpenShard(shard.name, shard.open(), self._held)
+        count = len(opened.keys)
         try:
-            self._seen.add(place.display_name, shard.keys)
+            if shard.num_samples is None:
+                self._seen.add(shard.name, opened.keys)
+            elif count != shard.num_samples:
+                raise TrilightError(
+                    f"{shard.name}: holds {count} samples; expected {shard.num_samples}, as the "
+                    "manifest says. Run `trilight verify`."
+                )
         except TrilightError:
-            shard.close()
+            opened.close()
             raise
-        self._counts[number] = len(shard.keys)
-        return shard
+        self._counts[number] = count
+        return opened

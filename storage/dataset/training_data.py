@@ -7,18 +7,12 @@ of its own. What share of a stream comes from which, the trainer decides (train.
 import os
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
+from functools import partial
 
 from storage.conventions import SPLITS
-from storage.dataset.dataset import open_dataset
+from storage.dataset.dataset import Dataset, open_dataset
 from storage.dataset.manifest import Manifest
-from storage.dataset.shard_set import (
-    KeysSeen,
-    ListedShards,
-    ManifestShards,
-    OpenShard,
-    ShardSet,
-    listed_shards,
-)
+from storage.dataset.shard_set import KeysSeen, SetShard, ShardSet, listed_shards
 from storage.digests import canonical_json, sha256_hex
 from storage.errors import TrilightError
 from storage.remote.url import parse_local_path
@@ -36,7 +30,10 @@ class DataSource:
     name: str
     """Name of the dataset preset, or the display name of a list of shards."""
     digest: str
-    num_views: int | None
+    num_views: int | None = None
+    """Pictures per scene, where a manifest says it."""
+    max_triangles: int | None = None
+    """Most triangles of a scene, where a manifest says it."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -50,16 +47,22 @@ class TrainingData:
     only."""
     splits: Mapping[str, ShardSet]
     """Shards by split; splits without a shard are left out."""
-    num_views: int | None
-    """Pictures per scene, where a manifest says it."""
+    sources: tuple[DataSource, ...]
+    """The datasets, in the order of the parts of their splits (ShardSet.parts)."""
     build: str | None = None
-    """Name of the preset, where a manifest says it."""
-    max_triangles: int | None = None
-    """Most triangles of a scene, where a manifest says it."""
+    """Name of the preset, where the manifest of a single dataset says it."""
     notes: tuple[str, ...] = ()
     """Messages for the user, each printed once."""
-    sources: tuple[DataSource, ...] = ()
-    """The datasets, in the order of the parts of their splits (ShardSet.parts)."""
+
+    @property
+    def num_views(self) -> int | None:
+        """Fewest pictures of a scene, where all manifests say it."""
+        return _of_all([source.num_views for source in self.sources], min)
+
+    @property
+    def max_triangles(self) -> int | None:
+        """Most triangles of a scene, where all manifests say it."""
+        return _of_all([source.max_triangles for source in self.sources], max)
 
     def split(self, name: str) -> ShardSet:
         """Return the shards of a split; raises TrilightError where it holds no scene."""
@@ -92,7 +95,7 @@ def open_training_data(data: Sequence[str]) -> TrainingData:
             f"data: {len(data)} places of which {len(shards)} are shards; expected one dataset, or "
             "shards only (each ends in .tar)."
         )
-    return _of_dataset(data[0])
+    return _of_datasets([open_dataset(data[0])])
 
 
 def is_shards(text: str) -> bool:
@@ -101,85 +104,8 @@ def is_shards(text: str) -> bool:
     return not is_folder and text.partition("?")[0].endswith((".tar", "}"))
 
 
-def _of_dataset(root: str) -> TrainingData:
-    dataset = open_dataset(root)
-    splits: dict[str, ShardSet] = {}
-    for split in SPLITS:
-        entries = [shard for shard in dataset.shards_of(split) if shard.num_samples]
-        if entries:
-            splits[split] = ManifestShards(dataset, entries)
-    build = dataset.manifest.build
-    num_views = dataset.manifest.num_views
-    return TrainingData(
-        display_name=dataset.display_name,
-        digest=dataset.digest,
-        splits=splits,
-        num_views=num_views,
-        build=build,
-        sources=(DataSource(name=build, digest=dataset.digest, num_views=num_views),),
-        max_triangles=_max_triangles(dataset.manifest),
-    )
-
-
-def _max_triangles(manifest: Manifest) -> int | None:
-    scenes = manifest.settings.get("scenes")
-    limit = scenes.get("max_triangles") if isinstance(scenes, Mapping) else None
-    return limit if isinstance(limit, int) else None
-
-
-def _of_list(patterns: Sequence[str]) -> TrainingData:
-    places = listed_shards(patterns)
-    seen = KeysSeen()
-    splits: dict[str, ShardSet] = {}
-    for split in SPLITS:
-        chosen = [place for place in places if place.split == split]
-        if chosen:
-            splits[split] = ListedShards(chosen, seen)
-    names = sorted(place.display_name for place in places)
-    digest = f"list:{sha256_hex(canonical_json(names))}"
-    display_name = f"the list of {len(places)} shards"
-    return TrainingData(
-        display_name=display_name,
-        digest=digest,
-        splits=splits,
-        num_views=None,
-        sources=(DataSource(name=display_name, digest=digest, num_views=None),),
-        notes=(NO_MANIFEST,),
-    )
-
-
 MIXED = "mix:"
 """Begins the digest of several datasets."""
-
-
-class MixedShards(ShardSet):
-    """The shards of one split of several datasets, one dataset after another."""
-
-    def __init__(self, sets: Mapping[str, ShardSet]) -> None:
-        """Take the shards by what each dataset is called in messages."""
-        self._at: list[tuple[ShardSet, int]] = []
-        names = list[str]()
-        parts = list[range]()
-        for called, shards in sets.items():
-            parts.append(range(len(names), len(names) + len(shards.names)))
-            names += [f"{called}: {name}" for name in shards.names]
-            self._at += [(shards, number) for number in range(len(shards.names))]
-        self.names = names
-        self._parts = tuple(parts)
-
-    @property
-    def parts(self) -> Sequence[range]:
-        return self._parts
-
-    def num_samples(self, number: int) -> int:
-        shards, at = self._at[number]
-        return shards.num_samples(at)
-
-    def open(self, number: int) -> OpenShard:
-        shards, at = self._at[number]
-        opened = shards.open(at)
-        opened.name = self.names[number]
-        return opened
 
 
 def open_mixture(data: Sequence[str]) -> TrainingData:
@@ -193,32 +119,80 @@ def open_mixture(data: Sequence[str]) -> TrainingData:
     """
     if len(data) < 2 or any(is_shards(text) for text in data):
         return open_training_data(data)
-    opened = [open_training_data([root]) for root in data]
-    for row, each in enumerate(opened):
-        before = next((other for other in opened[:row] if other.digest == each.digest), None)
-        if before is not None:
+    datasets: dict[str, Dataset] = {}
+    for dataset in map(open_dataset, data):
+        before = datasets.setdefault(dataset.digest, dataset)
+        if before is not dataset:
             raise TrilightError(
-                f"data: {each.display_name} holds the same dataset as {before.display_name}; "
+                f"data: {dataset.display_name} holds the same dataset as {before.display_name}; "
                 "expected each once. How often its scenes are drawn, data_weights says."
             )
-        each.split("train")
+        _of_datasets([dataset]).split("train")
+    return _of_datasets([*datasets.values()])
+
+
+def _of_datasets(datasets: Sequence[Dataset]) -> TrainingData:
+    """Return the data of one dataset, or of several that are mixed."""
+    sources = tuple(
+        DataSource(
+            name=dataset.manifest.build,
+            digest=dataset.digest,
+            num_views=dataset.manifest.num_views,
+            max_triangles=_max_triangles(dataset.manifest),
+        )
+        for dataset in datasets
+    )
+    is_mixed = len(sources) > 1
+    mixed = MIXED + sha256_hex(canonical_json([source.digest for source in sources]))
+    splits = {}
+    for split in SPLITS:
+        held = [
+            # by number too, since folders may have one name and datasets one preset
+            _shards(dataset, split, f"dataset {number}: " if is_mixed else "")
+            for number, dataset in enumerate(datasets, start=1)
+        ]
+        if any(held):
+            splits[split] = ShardSet(*filter(None, held))
     return TrainingData(
-        display_name=" and ".join(each.display_name for each in opened),
-        digest=MIXED + sha256_hex(canonical_json([each.digest for each in opened])),
-        splits={split: shards for split in SPLITS if (shards := _mix_split(opened, split))},
-        num_views=_of_all([each.num_views for each in opened], min),
-        max_triangles=_of_all([each.max_triangles for each in opened], max),
-        notes=tuple(dict.fromkeys(note for each in opened for note in each.notes)),
-        sources=tuple(source for each in opened for source in each.sources),
+        display_name=" and ".join(dataset.display_name for dataset in datasets),
+        digest=mixed if is_mixed else sources[0].digest,
+        splits=splits,
+        sources=sources,
+        build=None if is_mixed else sources[0].name,
     )
 
 
-def _mix_split(opened: Sequence[TrainingData], split: str) -> MixedShards | None:
-    having = [row for row, each in enumerate(opened) if split in each.splits]
-    if not having:
-        return None
-    # by number too, since folders may have one name and datasets one preset
-    return MixedShards({f"dataset {row + 1}": opened[row].split(split) for row in having})
+def _shards(dataset: Dataset, split: str, prefix: str) -> list[SetShard]:
+    return [
+        SetShard(
+            name=f"{prefix}{entry.name}",
+            open=partial(dataset.open_stream, entry, checked=True),
+            num_samples=entry.num_samples,
+        )
+        for entry in dataset.shards_of(split)
+        if entry.num_samples
+    ]
+
+
+def _max_triangles(manifest: Manifest) -> int | None:
+    scenes = manifest.settings.get("scenes")
+    limit = scenes.get("max_triangles") if isinstance(scenes, Mapping) else None
+    return limit if isinstance(limit, int) else None
+
+
+def _of_list(patterns: Sequence[str]) -> TrainingData:
+    shards = listed_shards(patterns)
+    seen = KeysSeen()
+    by_split = {split: [each for each in shards if each.split == split] for split in SPLITS}
+    digest = f"list:{sha256_hex(canonical_json(sorted(shard.name for shard in shards)))}"
+    display_name = f"the list of {len(shards)} shards"
+    return TrainingData(
+        display_name=display_name,
+        digest=digest,
+        splits={split: ShardSet(held, seen=seen) for split, held in by_split.items() if held},
+        sources=(DataSource(name=display_name, digest=digest),),
+        notes=(NO_MANIFEST,),
+    )
 
 
 def _of_all(values: Sequence[int | None], chosen: Callable[[Sequence[int]], int]) -> int | None:

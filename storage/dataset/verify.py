@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 
 from storage.dataset.dataset import Dataset, open_dataset, published_manifest
 from storage.dataset.manifest import Manifest, ShardEntry, Totals, decode_manifest, index_stream
-from storage.dataset.planned import is_whole, num_planned
+from storage.dataset.planned import is_whole
 from storage.dataset.shard import ShardReader
 from storage.digests import seal_of, sha256_hex
 from storage.errors import EnvironmentFailure, ShardMissing, TrilightError, Unreadable
@@ -48,11 +48,8 @@ class Verification:
     manifest: Manifest
     problems: Sequence[str]
     """One line per fault, naming shard and sample; empty where the dataset is whole."""
-    num_samples: int
     bad_shards: Sequence[str]
     """Names of the shards that are missing, or were read and are not what they should be."""
-    num_shards_planned: int
-    """Shards of the finished dataset."""
     is_finished: bool
     """True: the manifest lists every shard."""
 
@@ -121,9 +118,7 @@ def verify_dataset(
     return Verification(
         manifest=manifest,
         problems=problems,
-        num_samples=manifest.num_samples,
         bad_shards=bad,
-        num_shards_planned=num_planned(manifest),
         is_finished=is_whole(manifest, dataset.num_listed),
     )
 

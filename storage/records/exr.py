@@ -78,24 +78,18 @@ Header = Mapping[str, Any]
 """The header of a file as the library gives it."""
 
 
-def encode_exr(
-    radiance_rgb: NDArray[np.float32],
-    codec: ExrCodec = ZIP,
-    *,
-    attributes: Attributes | None = None,
-) -> bytes:
+def encode_exr(radiance_rgb: NDArray[np.float32], codec: ExrCodec = ZIP) -> bytes:
     """Return the OpenEXR file of a picture, rounded to half floats; one thread.
 
     Args:
         radiance_rgb: [R, R, 3] linear radiance, finite, in [0, 65504].
         codec: how to pack it. A lossy one may leave values below 0, or infinite ones where the
             brightest rounds up: callers look at what comes back.
-        attributes: more entries of the header, by name.
 
     Raises:
         TrilightError: a value is not finite, negative, or too large for a half float.
     """
-    return encode_channels({"RGB": to_half(radiance_rgb)}, codec, attributes=attributes)
+    return encode_channels({"RGB": to_half(radiance_rgb)}, codec)
 
 
 def to_half(radiance_rgb: NDArray[np.float32]) -> NDArray[np.float16]:

@@ -23,8 +23,7 @@ from typing import Any, TypeVar, dataclass_transform
 import pydantic
 from pydantic.dataclasses import dataclass
 
-from storage.errors import TrilightError, expected_one_of
-from storage.removed import removal_message
+from storage.errors import TrilightError, expected_one_of, removal_message
 from storage.settings.fields import (
     FieldDescription,
     describe_fields,
@@ -93,16 +92,9 @@ def leaves_out(*names: str) -> Any:
     return record
 
 
-def settings_record(group: Any, *, stated: bool = False) -> dict[str, Any]:
-    """Return settings as JSON values, as manifests and checkpoints hold them.
-
-    Args:
-        group: an instance.
-        stated: leave out what is at its default; such a record stays what it is when a field is
-            added whose default is what was done before.
-    """
-    adapter = _adapter(typing.cast(Any, type(group)))
-    record: dict[str, Any] = adapter.dump_python(group, mode="json", exclude_defaults=stated)
+def settings_record(group: Any) -> dict[str, Any]:
+    """Return settings as JSON values, as manifests and checkpoints hold them."""
+    record: dict[str, Any] = _adapter(typing.cast(Any, type(group))).dump_python(group, mode="json")
     return record
 
 

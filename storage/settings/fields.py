@@ -15,6 +15,9 @@ from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Annotated, Any, Literal, get_args, get_origin
 
+import numpy as np
+from numpy.typing import NDArray
+
 from storage.settings.ranges import EXECUTION, LowFirst, Within, shown_number
 
 _KINDS = {bool: "true or false", str: "a text", int: "a whole number", float: "a number"}
@@ -164,6 +167,19 @@ def parts_of(hint: Any) -> Iterator[Any]:
             yield from parts_of(part)
     else:
         yield hint
+
+
+def array_scalar(hint: Any) -> Any:
+    """Return X of NDArray[X], or None where an annotation is none of arrays.
+
+    Until numpy 2.4 NDArray[X] is ndarray[shape, dtype[X]]; from 2.5 on it is an alias that keeps X.
+    """
+    origin = get_origin(hint)
+    args = get_args(hint)
+    if origin is np.ndarray:
+        (scalar,) = get_args(args[1])
+        return scalar
+    return args[0] if origin is NDArray else None
 
 
 def group_of(hint: Any) -> bool:

@@ -13,9 +13,8 @@ import re
 from collections.abc import Callable, Mapping, Sequence
 from typing import Any, TypeVar
 
-from storage.errors import OF_EXTENSION, TrilightError, expected_one_of
+from storage.errors import OF_EXTENSION, TrilightError, expected_one_of, removal_message
 from storage.extensions import mistakes_of_entry
-from storage.removed import removal_message
 from storage.settings.described import field_value, settings_record
 from storage.settings.fields import describe_fields, shown_name
 

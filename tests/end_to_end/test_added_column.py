@@ -40,7 +40,6 @@ from train.data.loader import load_batches
 from train.data.order import RankSlice
 from train.data.scenes import training_scene
 from train.loop.train_state import new_state
-from train.run_training import loader_settings
 from train.settings import TrainSettings
 
 SETTINGS = SceneSettings(families=DEFAULT_FAMILIES, num_views=2, max_triangles=600)
@@ -107,7 +106,7 @@ def test_a_draw_outside_of_the_range_is_named(number: float) -> None:
 
 
 def test_the_stream_shows_what_was_composed(data: Dataset) -> None:
-    settings = dataclasses.replace(loader_settings(coated_run()), batch_size=4)
+    settings = dataclasses.replace(coated_run(), scenes_per_step=4)
     batches = load_batches(
         open_training_data([str(data.folder.root)]).split("train"),
         settings,

@@ -22,7 +22,7 @@ from pipeline.exchange.renderformer_json import describe_scene
 from pipeline.presets.registry import preset_settings
 from storage.conventions import HALF_FLOAT_MAX
 from storage.errors import TrilightError
-from storage.records.exr import decode_exr, encode_exr
+from storage.records.exr import decode_exr, encode_channels, encode_exr
 from storage.records.material import EMISSION
 from storage.records.profiles import PROFILES, keeps_law, pack_picture
 from storage.records.sample import decode_sample, encode_sample
@@ -356,11 +356,11 @@ HEADER = [
 
 def test_the_ends_of_numbers_go_through_the_header_of_a_picture_and_no_others() -> None:
     for name, value in HEADER:
-        data = encode_exr(np.ones((8, 8, 3), np.float32), attributes={name: value})  # type: ignore[dict-item]
+        data = encode_channels({"RGB": np.ones((8, 8, 3), np.float16)}, attributes={name: value})  # type: ignore[dict-item]
         header = OpenEXR.File(io.BytesIO(data), header_only=True, num_threads=0).header()
         assert header[name] == value, name
 
     # OpenEXR would write 2^31 as -2^31, 1e39 as infinity, and raise SystemError for 2^64
     for value in (2**31, -(2**31) - 1, 2**64, 1e39, -1e39, math.inf, math.nan):
         with pytest.raises(TrilightError, match="attribute seed is .*; expected a number from -"):
-            encode_exr(np.ones((8, 8, 3), np.float32), attributes={"seed": value})
+            encode_channels({"RGB": np.ones((8, 8, 3), np.float16)}, attributes={"seed": value})

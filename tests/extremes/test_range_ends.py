@@ -270,7 +270,7 @@ def test_weights_stay_finite_at_the_ends_of_training(changes: dict[str, Any]) ->
     run = tiny_run(**changes)
     state = new_state(run)
     before = [weight.detach().clone() for weight in state.model.parameters()]
-    moving = stepper(state, run)
+    moving = stepper(state)
     for number in range(4):
         report = moving.step([batch()], learning_rate(number, run))
         assert report.applied
@@ -338,7 +338,7 @@ def test_every_target_that_can_be_stored_gives_a_step(run: TrainSettings) -> Non
             noise_BV=torch.full_like(usual.noise_BV, noise),
         )
         state = new_state(run)
-        report = stepper(state, run).step([ends], 1e-3)
+        report = stepper(state).step([ends], 1e-3)
         finite = math.isfinite(report.loss) and math.isfinite(report.grad_norm)
         assert report.applied and finite, (target, noise)
         assert all(torch.isfinite(weight).all() for weight in state.model.parameters())

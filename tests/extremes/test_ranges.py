@@ -38,13 +38,12 @@ from scene_templates.settings import MAX_TRIANGLES, Excursion, SceneSettings, Vi
 from scene_templates.skies.procedural_skies import SkyMapSettings, SkySettings
 from scene_templates.surfaces.procedural_textures import SurfaceMapSettings
 from scene_templates.textures import TextureSettings
-from storage.array_hints import array_scalar
 from storage.dataset.settings import ListedShard, SplitSettings
 from storage.errors import TrilightError
 from storage.records.material import PUBLISHED_COLUMNS, laid_out
 from storage.records.scene import MAP_ARRAYS, MAX_TEXTURES, Scene
 from storage.records.texture import CONSTANT
-from storage.settings.fields import FieldDescription, describe_fields
+from storage.settings.fields import FieldDescription, array_scalar, describe_fields
 from storage.settings.ranges import Within
 from tests.conftest import ROOT
 from tests.for_each import for_each
@@ -254,8 +253,6 @@ def test_no_number_is_without_a_range() -> None:
 
 
 INTERNAL = {
-    "LoaderSettings": "made of TrainSettings",
-    "PublishedConfig": "a ModelConfig, and one number that the published code fixes",
     "PreviewSettings": "made of RenderOptions",
     "StorageSettings": "has no number",
     "BaseSettings": "has no number",

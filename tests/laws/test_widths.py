@@ -71,7 +71,7 @@ def changes(config: ModelConfig, muon_rate: float, base: BaseWidths, seed: int) 
     state, batch = new_state(settings, muon_precision="float32"), batch_for(config)
     before = outputs(state.model, batch)
     crew = DistributedContext(device=torch.device("cpu"))
-    stepper = Stepper(state, settings, TrainingLoss(settings.loss, None), crew)
+    stepper = Stepper(state, TrainingLoss(settings.loss, None), crew)
     for _ in range(STEPS):
         assert stepper.step([batch], RATE).applied
         state.step += 1

@@ -36,7 +36,6 @@ from model.published import (
     NORMAL,
     TANGENT_NORMAL,
     TEXTURE_CHANNELS,
-    PublishedConfig,
     _require_frequencies,
     decode_published_config,
     encode_published_config,
@@ -56,9 +55,8 @@ from model.weights import (
     trained_range,
 )
 from storage.digests import sha256_hex
-from storage.errors import TrilightError
+from storage.errors import LAST_COMMIT, TrilightError
 from storage.records.safe_read import safetensors_header
-from storage.removed import LAST_COMMIT
 from tests.for_each import case, for_each
 from tests.model.kit import awake, publishable, tiny_config
 from tests.scenes_by_hand import tiny_scene
@@ -286,20 +284,20 @@ FREQS = "view_transformer.transformer.rope_emb.freqs"
 
 def test_the_published_sizes_are_the_named_ones() -> None:
     for fields, name, patch in (({}, "base", 32), (SWIN_LARGE, "large", 1)):
-        got = decode_published_config(fields)
-        assert dataclasses.replace(got.model, register_eps=0.0) == SIZES[name]()
-        assert got.model.register_eps == 1e-5
-        assert got.texture_patch == patch
+        got, texture_patch = decode_published_config(fields)
+        assert dataclasses.replace(got, register_eps=0.0) == SIZES[name]()
+        assert got.register_eps == 1e-5
+        assert texture_patch == patch
 
 
 @for_each("family", ["dpt", "swin"])
 @for_each("patch", [1, 8])
 def test_export_and_import_give_the_same_network(family: str, patch: int) -> None:
-    config = PublishedConfig(model=publishable(family), texture_patch=patch)
+    config = (publishable(family), patch)
     assert (
         decode_published_config(json.loads(json.dumps(encode_published_config(config)))) == config
     )
-    model = awake(config.model, torch.float32)
+    model = awake(config[0], torch.float32)
     again = load_published_weights(export_published_weights(model, patch), config)
     assert again.state_dict().keys() == model.state_dict().keys()
     for name, tensor in again.state_dict().items():
@@ -343,7 +341,7 @@ def test_what_was_never_published_is_refused_by_name(fields: dict, message: str)
 def test_what_their_code_cannot_build_is_not_exported(changes: dict, message: str) -> None:
     model = dataclasses.replace(publishable("dpt"), **changes)
     with pytest.raises(TrilightError, match=message):
-        encode_published_config(PublishedConfig(model=model, texture_patch=1))
+        encode_published_config((model, 1))
 
 
 @for_each(
@@ -357,8 +355,8 @@ def test_what_their_code_cannot_build_is_not_exported(changes: dict, message: st
     ],
 )
 def test_wrong_published_tensors_are_listed(name: str, tensor: Tensor | None, message: str) -> None:
-    config = PublishedConfig(model=publishable("dpt"), texture_patch=1)
-    tensors = export_published_weights(awake(config.model, torch.float32), 1)
+    config = (publishable("dpt"), 1)
+    tensors = export_published_weights(awake(config[0], torch.float32), 1)
     tensors.pop(name, None)
     if tensor is not None:
         tensors[name] = tensor
@@ -451,7 +449,7 @@ def test_export_gives_back_what_was_published(reference: Path) -> None:
         if key.startswith("param.")
     }
     network = load_published_weights(published, config)
-    exported = export_published_weights(network, config.texture_patch)
+    exported = export_published_weights(network, config[1])
     assert exported.keys() == published.keys()
     for key, tensor in exported.items():
         assert tensor.shape == published[key].shape, key

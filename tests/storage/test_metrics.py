@@ -16,9 +16,9 @@ from storage.conventions import (
     radiance_from_log10,
     srgb8,
 )
-from storage.intervals import mean_interval
 from storage.metrics import (
     MAX_DB,
+    mean_interval,
     object_psnr_log_db,
     pepper,
     psnr_linear_db,

@@ -18,7 +18,7 @@ from storage.dataset.training_data import TrainingData, open_training_data
 from tests.train.toy import toy_sample
 from train.data.bad_samples import BadSampleCounter
 from train.data.buckets import TrainingBatch, collate_batch
-from train.data.loader import LoaderSettings, load_batches
+from train.data.loader import load_batches
 from train.data.order import RankSlice
 from train.data.scenes import TrainingScene, training_scene
 from train.evaluation.evaluate import EvalConfig
@@ -64,6 +64,11 @@ def tiny_run(**changes: object) -> TrainSettings:
         checkpoint_every=4,
     )
     return dataclasses.replace(settings, **changes)  # type: ignore[arg-type]
+
+
+def plain_run(**changes: object) -> TrainSettings:
+    """Return a run whose scenes are as they are stored."""
+    return tiny_run(**{"augmentation": AugmentationSettings(), **changes})
 
 
 class Killed(BaseException):
@@ -143,13 +148,13 @@ def bare_scene(tensors: SceneTensors) -> TrainingScene:
     )
 
 
-def stepper(state: TrainState, settings: TrainSettings) -> Stepper:
-    return Stepper(state, settings, TrainingLoss(settings.loss, None), ALONE)
+def stepper(state: TrainState) -> Stepper:
+    return Stepper(state, TrainingLoss(state.settings.loss, None), ALONE)
 
 
 def take(
     data: TrainingData | Dataset,
-    settings: LoaderSettings,
+    settings: TrainSettings,
     count: int,
     *,
     first: int = 0,

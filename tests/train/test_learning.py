@@ -62,7 +62,7 @@ from train.loop.train_state import TrainState, new_state
 from train.loss.lpips import LINEAR_FILE, VGG16_FILE, load_lpips
 from train.presets import override_training_preset
 from train.resume import StartOptions
-from train.run_training import loader_settings, run_training
+from train.run_training import run_training
 from train.settings import AugmentationSettings, TrainSettings, learning_rate
 
 SMALL = dataclasses.replace(
@@ -81,7 +81,7 @@ def memorised(scenes: list[TrainingScene], model: ModelConfig, steps: int) -> Tr
         augmentation=AugmentationSettings(),
     )
     state = new_state(settings)
-    memorising = stepper(state, settings)
+    memorising = stepper(state)
     batches = [collate_batch([scene]) for scene in scenes]
     for step in range(steps):
         memorising.step(batches, learning_rate(step, settings))
@@ -153,13 +153,10 @@ def hits_run(**changes: object) -> TrainSettings:
 
 
 def test_what_is_traced_depends_on_no_thread_and_no_rank(dataset: Dataset) -> None:
-    alone = {
-        scene.key: scene.tensors.traced
-        for scene in take(dataset, loader_settings(hits_run()), 1, first=3)[0]
-    }
+    alone = {scene.key: scene.tensors.traced for scene in take(dataset, hits_run(), 1, first=3)[0]}
     for rank in range(3):
         part = {"workers": 3, "rank": rank, "world_size": 3}
-        ((other,),) = take(dataset, loader_settings(hits_run()), 1, first=3, **part)
+        ((other,),) = take(dataset, hits_run(), 1, first=3, **part)
         a, b = alone.pop(other.key), other.tensors.traced
         assert a is not None
         assert b is not None
@@ -168,7 +165,7 @@ def test_what_is_traced_depends_on_no_thread_and_no_rank(dataset: Dataset) -> No
 
 
 def test_views_are_traced_after_the_symmetries_and_lack_inputs_by_chance(dataset: Dataset) -> None:
-    scenes = take(dataset, loader_settings(hits_run()), 1, first=3)[0]
+    scenes = take(dataset, hits_run(), 1, first=3)[0]
     given = torch.cat([s.tensors.traced.given_VI for s in scenes if s.tensors.traced])
     assert given.shape == (6, len(INPUTS))
     assert 0 < given.mean() < 1

@@ -13,7 +13,6 @@ from collections import Counter, deque
 from collections.abc import Callable, Generator, Iterable, Iterator, Sequence
 from concurrent.futures import Executor, Future, ThreadPoolExecutor
 from contextlib import closing, nullcontext
-from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, TypeVar
@@ -36,16 +35,10 @@ from train.data.order import (
     shuffled_shards,
     visits_from,
 )
-from train.data.scenes import (
-    TrainingScene,
-    require_few_triangles,
-    scene_of_views,
-    with_target,
-)
+from train.data.scenes import TrainingScene, require_few_triangles, scene_of_views
 
 if TYPE_CHECKING:
-    from model.config import ModelConfig
-    from train.settings import AugmentationSettings, TrainSettings
+    from train.settings import TrainSettings
 
 
 PREFETCHED_SCENES = 16
@@ -54,33 +47,9 @@ PREFETCHED_SCENES = 16
 Item = TypeVar("Item")
 
 
-@dataclass(frozen=True, kw_only=True)
-class LoaderSettings:
-    """Settings that determine the batches of the data loader."""
-
-    seed: int
-    """Seed of the order, and of the views and augmentation of each visit."""
-    window: int
-    """Number of shards whose samples are shuffled together."""
-    batch_size: int
-    """Number of scenes of a global batch, over all ranks."""
-    resolution: int
-    """Width of the pictures in pixels."""
-    views_per_scene: int
-    """Number of views that are drawn of each scene."""
-    most_triangles: int = 0
-    """Maximum number of triangles; samples with more are unusable; 0 sets no limit."""
-    augmentation: "AugmentationSettings | None" = None
-    """Random symmetries of each visit; by default none."""
-    lookup_in_threads: bool = True
-    """True to look targets up in the decoding threads, False to do it on the device."""
-    network: "ModelConfig | None" = None
-    """Configuration of the network, whose traced inputs are computed here; None traces none."""
-
-
 def load_batches(
     shards: ShardSet,
-    settings: LoaderSettings,
+    settings: "TrainSettings",
     first: int,
     *,
     rank_slice: RankSlice,
@@ -105,16 +74,15 @@ def load_batches(
         TrilightError: a batch cannot be split equally, or too much data is unusable; the latter
             when the stream reaches it.
     """
-    rank_slice.require_equal(settings.batch_size)
+    rank_slice.require_equal(settings.scenes_per_step)
     pool = ThreadPoolExecutor(workers, "decode") if workers else _InlineExecutor()
     with OpenShards(shards) as opened, pool as decoders:
         maker = _SceneMaker(shards, opened, settings, unusable)
         counts = [partial(_count_samples, shards, unusable, part) for part in shards.parts]
         plan = _plan_batches(shards, counts, settings, mixture, first, rank_slice, opened)
         waiting: deque[tuple[list[Visit], list[Future[TrainingScene]]]] = deque()
-        depth = (
-            -(-PREFETCHED_SCENES * rank_slice.world_size // settings.batch_size) if workers else 0
-        )
+        ahead = -(-PREFETCHED_SCENES * rank_slice.world_size // settings.scenes_per_step)
+        depth = ahead if workers else 0
         try:
             with closing(prefetch(plan, _plan_ahead(shards, counts, settings, mixture))) as batches:
                 for mine in batches:
@@ -208,24 +176,24 @@ def _count_samples(shards: ShardSet, unusable: BadSampleCounter, part: range, nu
 def _plan_batches(
     shards: ShardSet,
     counts: Sequence[Callable[[int], int]],
-    settings: LoaderSettings,
+    settings: "TrainSettings",
     mixture: Mixture | None,
     first: int,
     rank_slice: RankSlice,
     opened: OpenShards,
 ) -> Iterator[list[Visit]]:
     """Yield this process's visits batch by batch, and start to open their shards."""
-    position = first * settings.batch_size
+    position = first * settings.scenes_per_step
     begin = (position,) if mixture is None else mixture.counts_before(position)
     streams = [
-        visits_from(len(part), count, start, seed=settings.seed, window=settings.window)
+        visits_from(len(part), count, start, seed=settings.seed, window=settings.shuffle_shards)
         for part, count, start in zip(shards.parts, counts, begin, strict=True)
     ]
     visits = streams[0]
     if mixture is not None:
         visits = mix_visits(mixture, streams, shards.parts, position)
     while True:
-        mine = rank_slice.of_batch(tuple(itertools.islice(visits, settings.batch_size)))
+        mine = rank_slice.of_batch(tuple(itertools.islice(visits, settings.scenes_per_step)))
         opened.plan(visit.shard for visit in mine)
         yield mine
 
@@ -233,7 +201,7 @@ def _plan_batches(
 def _plan_ahead(
     shards: ShardSet,
     counts: Sequence[Callable[[int], int]],
-    settings: LoaderSettings,
+    settings: "TrainSettings",
     mixture: Mixture | None,
 ) -> int:
     """Return the number of batches to plan ahead: about a window, to open its shards in time.
@@ -243,8 +211,8 @@ def _plan_ahead(
     weights = (1.0,) if mixture is None else mixture.weights
     ahead = []
     for part, count, weight in zip(shards.parts, counts, weights, strict=True):
-        window = count(shuffled_shards(len(part), settings.seed, 0)[0]) * settings.window
-        ahead.append(int(window * sum(weights) / weight) // settings.batch_size)
+        window = count(shuffled_shards(len(part), settings.seed, 0)[0]) * settings.shuffle_shards
+        ahead.append(int(window * sum(weights) / weight) // settings.scenes_per_step)
     return max(min(ahead), 1)
 
 
@@ -255,7 +223,7 @@ class _SceneMaker:
         self,
         shards: ShardSet,
         opened: OpenShards,
-        settings: LoaderSettings,
+        settings: "TrainSettings",
         unusable: BadSampleCounter,
     ) -> None:
         self._shards = shards
@@ -268,32 +236,27 @@ class _SceneMaker:
         """Return the augmented scene of a visit."""
         settings = self._settings
         seen, rng = self._usable_scene(visit)
-        if settings.augmentation:
-            seen = augment_scene(seen, settings.augmentation, rng)
-        return self._with_traced_inputs(
-            with_target(seen) if settings.lookup_in_threads else seen, rng
-        )
+        seen = augment_scene(seen, settings.augmentation, rng)
+        return self._with_traced_inputs(seen, rng)
 
     def _with_traced_inputs(self, seen: TrainingScene, rng: np.random.Generator) -> TrainingScene:
         """Return a scene with the traced inputs of its network, if it has any."""
         settings = self._settings
-        if settings.network is None:
-            return seen
         # imported here since they load pydantic
         from model.config import BundleStage
         from model.demodulated import with_albedo
         from model.hits.tracing import with_traced
 
         # after the augmentation, which therefore need not transform traced inputs
-        stage = settings.network.stage
+        stage = settings.model.stage
         if isinstance(stage, BundleStage):
             if not stage.albedo_rays:
                 return seen
             tensors = with_albedo(seen.tensors, settings.resolution, stage.albedo_rays)
             return dataclasses.replace(seen, tensors=tensors)
         noise = int(rng.integers(2**31))
-        tensors = with_traced(seen.tensors, settings.resolution, settings.network, noise)
-        withheld = settings.augmentation.withheld_inputs if settings.augmentation else 0.0
+        tensors = with_traced(seen.tensors, settings.resolution, settings.model, noise)
+        withheld = settings.augmentation.withheld_inputs
         return dataclasses.replace(seen, tensors=withhold_inputs(tensors, withheld, rng))
 
     def _usable_scene(self, visit: Visit) -> tuple[TrainingScene, np.random.Generator]:
@@ -344,10 +307,9 @@ class _SceneMaker:
                 f"{settings.views_per_scene} of each scene."
             )
         require_few_triangles(sample.key, sample.scene, settings.most_triangles)
-        if settings.network is not None:
-            require_known_sky(lit_sky(sample.scene.environment), settings.network)
+        require_known_sky(lit_sky(sample.scene.environment), settings.model)
         views = np.sort(rng.permutation(num_views)[: settings.views_per_scene])
-        per_light = settings.augmentation is not None and settings.augmentation.light_mix > 1
+        per_light = settings.augmentation.light_mix > 1
         return scene_of_views(sample, views.tolist(), settings.resolution, per_light=per_light)
 
 

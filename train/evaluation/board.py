@@ -343,10 +343,8 @@ class Standing:
     """Name of the method, or NOISE."""
     kind: str
     """Kind of method; empty for NOISE."""
-    first_s: float | None
-    """Median CPU seconds of a scene's first view; None without times."""
-    further_s: float | None
-    """Median CPU seconds of a further view; None without times."""
+    price: Price | None
+    """Median CPU seconds; None without times."""
     timed_scenes: int
     """Number of scenes behind these medians."""
     scores: Mapping[str, Any]
@@ -402,8 +400,7 @@ def standings_of(board: Board, width: int, rival: str) -> WidthStandings | None:
         Standing(
             name=name,
             kind=board.kinds.get(name, ""),
-            first_s=costs[name].first_s if name in costs else None,
-            further_s=costs[name].further_s if name in costs else None,
+            price=costs.get(name),
             timed_scenes=len(prices.get(name, ())),
             scores=summary,
             lead=pairs.get((name, rival)),

@@ -17,20 +17,13 @@ _COSTS = ("a scene's first view", "a further view")
 
 def plot_leaderboard(widths: Sequence[WidthStandings], title: str, path: Path) -> None:
     """Draw the panels into a PNG file; entries without a price are lines, NOISE a dashed one."""
-    import matplotlib
+    from matplotlib import rc_context
+    from matplotlib.figure import Figure
 
-    matplotlib.use("Agg")  # before pyplot: no display is needed
-    import matplotlib.pyplot as plt
-
-    with matplotlib.rc_context({"text.parse_math": False}):  # names may hold dollar signs
-        figure, panels = plt.subplots(
-            1,
-            len(widths),
-            figsize=(_PANEL[0] * len(widths), _PANEL[1]),
-            dpi=_DPI,
-            squeeze=False,
-            layout="constrained",
-        )
+    with rc_context({"text.parse_math": False}):  # names may hold dollar signs
+        size = (_PANEL[0] * len(widths), _PANEL[1])
+        figure = Figure(figsize=size, dpi=_DPI, layout="constrained")
+        panels = figure.subplots(1, len(widths), squeeze=False)
         groups = []
         for axes, one in zip(panels.flat, widths, strict=True):
             axes.set_title(f"{one.width} x {one.width} pixels, {one.num_views} views", fontsize=11)
@@ -38,7 +31,7 @@ def plot_leaderboard(widths: Sequence[WidthStandings], title: str, path: Path) -
             axes.set_ylabel(f"median {METRIC}, higher is better", fontsize=_FONT)
             groups.append(list[SeriesPoint]())
             for each in one.standings:
-                if each.first_s is None or each.further_s is None:
+                if each.price is None:
                     style = "--" if each.name == NOISE else ":"
                     axes.axhline(each.median_db, color="0.45", linewidth=1, linestyle=style)
                     axes.annotate(
@@ -52,14 +45,13 @@ def plot_leaderboard(widths: Sequence[WidthStandings], title: str, path: Path) -
                         horizontalalignment="right",
                     )
                     continue
-                costs = [each.first_s, each.further_s]
+                costs = [each.price.first_s, each.price.further_s]
                 groups[-1].append(
                     SeriesPoint(name=each.name, kind=each.kind, costs=costs, error=each.median_db)
                 )
         figure.suptitle(title, fontsize=12)
         draw_panels(figure, list(panels.flat), groups, _COSTS)
         figure.savefig(path, metadata={"Software": None})
-    plt.close(figure)
 
 
 _COLUMNS = 3
@@ -72,10 +64,7 @@ def plot_excursions(path: Path, views: Sequence[JudgedView]) -> int:
     Each axis has a plot: a dot is a view, the line the median at each value, the dashed line the
     median of the stated errors. Nothing is written if no view leaves the usual range.
     """
-    import matplotlib
-
-    matplotlib.use("Agg")  # before pyplot: no display is needed
-    import matplotlib.pyplot as plt
+    from matplotlib.figure import Figure
 
     axes: dict[str, list[JudgedView]] = {}
     for view in views:
@@ -84,9 +73,8 @@ def plot_excursions(path: Path, views: Sequence[JudgedView]) -> int:
     if not axes:
         return 0
     rows = -(-len(axes) // _COLUMNS)
-    figure, grid = plt.subplots(
-        rows, _COLUMNS, figsize=(4.2 * _COLUMNS, 3.2 * rows), squeeze=False, layout="constrained"
-    )
+    figure = Figure(figsize=(4.2 * _COLUMNS, 3.2 * rows), layout="constrained")
+    grid = figure.subplots(rows, _COLUMNS, squeeze=False)
     for place, (axis, members) in zip(grid.flat, sorted(axes.items()), strict=False):
         at = np.array([view.excursion[1] for view in members if view.excursion is not None])
         scores = np.array([view.scores[NETWORK]["psnr_log_db"] for view in members], float)
@@ -104,5 +92,4 @@ def plot_excursions(path: Path, views: Sequence[JudgedView]) -> int:
     for place in grid.flat[len(axes) :]:
         place.axis("off")
     figure.savefig(path, dpi=110)
-    plt.close(figure)
     return len(axes)

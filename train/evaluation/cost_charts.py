@@ -103,7 +103,7 @@ def draw_panels(
         handles=[*lines, *(grey if len(costs) > 1 else ())],
         loc="outside lower center", ncols=3, fontsize=_FONT, frameon=False,
     )  # fmt: skip
-    figure.canvas.draw()  # places are known from here on
+    figure.draw_without_rendering()  # places are known from here on
     for axes, points in zip(panels, groups, strict=True):
         names = [(one.name, (one.costs[0], one.error)) for one in points]
         further_costs = [(cost, one.error) for one in points for cost in one.costs[1:]]

@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 
 from model.weights import MAX_LIGHTS
-from storage.intervals import mean_interval
+from storage.metrics import mean_interval
 from storage.records.lights import num_lights
 from storage.records.material import ROUGHNESS
 from storage.records.sample import Sample

@@ -1,6 +1,6 @@
 """Metrics of a picture, scores of a validation, and summaries that include the worst views."""
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 
@@ -27,8 +27,8 @@ Scores = Mapping[str, float]
 
 def score_view(radiance_rgb: NDArray, target_rgb: NDArray, hits: NDArray[np.bool_]) -> Scores:
     """Score one picture [R, R, 3] of linear radiance by VALIDATED; `hits` is as in `hit_masks`."""
-    picture = JudgedPicture(radiance_rgb=radiance_rgb, target_rgb=target_rgb, hits=hits, lpips=None)
-    return {name: METRICS[name].score(picture) or 0.0 for name in VALIDATED}
+    scores = picture_scores(radiance_rgb, target_rgb, hits, None, VALIDATED)
+    return {name: score or 0.0 for name, score in scores.items()}
 
 
 def summarize_scores(views: Sequence[Scores]) -> dict[str, float]:
@@ -214,16 +214,20 @@ METRICS: Registry[Metric] = Registry(
 
 
 def picture_scores(
-    radiance_rgb: NDArray, target_rgb: NDArray, hits: NDArray[np.bool_], lpips: Lpips | None
+    radiance_rgb: NDArray,
+    target_rgb: NDArray,
+    hits: NDArray[np.bool_],
+    lpips: Lpips | None,
+    metrics: Iterable[str] = METRICS,
 ) -> dict[str, float | None]:
-    """Return every metric of one picture [R, R, 3] of linear radiance; None stands for n/a.
+    """Return metrics, by default all, of a picture [R, R, 3] of linear radiance; None is n/a.
 
     LPIPS is n/a without its weights, HDR-FLIP for a black target, which defines its exposures.
     """
     picture = JudgedPicture(
         radiance_rgb=radiance_rgb, target_rgb=target_rgb, hits=hits, lpips=lpips
     )
-    return {name: metric.score(picture) for name, metric in METRICS.items()}
+    return {name: METRICS[name].score(picture) for name in metrics}
 
 
 def noise_floors(

@@ -1,9 +1,9 @@
 """Evaluation and leaderboard as JSON values, as Markdown for people, and as CSV for programs."""
 
 import csv
-import dataclasses
 import io
 from collections.abc import Mapping, Sequence
+from dataclasses import asdict, astuple
 from typing import Any
 
 import numpy as np
@@ -90,7 +90,7 @@ def record(
         else None,
         "published": published if about.get("build") == BENCHMARK else None,
         "groups": by_group(views),
-        "views": [dataclasses.asdict(view) for view in views],
+        "views": [asdict(view) for view in views],
     }
 
 
@@ -241,7 +241,7 @@ def _standings_table(one: WidthStandings) -> str:
     rows = [
         [
             text(standing.name),
-            *("" if s is None else number_text(s) for s in (standing.first_s, standing.further_s)),
+            *(map(number_text, astuple(standing.price)) if standing.price else ("", "")),
             *(_with_tail(name, standing.scores) for name in METRICS),
             {True: "yes", False: "no", None: ""}[standing.on_front],
         ]
@@ -314,7 +314,7 @@ def standings_csv(widths: Sequence[WidthStandings], machine: str) -> bytes:
     rows = [
         [
             one.width, inert(each.name), each.kind, one.num_scenes, one.num_views,
-            each.first_s, each.further_s, None if each.first_s is None else inert(machine),
+            *((*astuple(each.price), inert(machine)) if each.price else (None, None, None)),
             *(each.scores[metric][part] for metric in METRICS for part in _PARTS),
             *_lead_cells(each.lead), each.on_front,
         ]

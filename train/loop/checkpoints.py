@@ -40,7 +40,7 @@ from train.loop.distributed import DistributedContext
 from train.loop.step import StepReport
 from train.loop.train_state import TrainState, new_state
 from train.resume import Event, ResumePlan, event_records
-from train.settings import Precision, TrainSettings, decay_start_step, stored_settings
+from train.settings import Precision, decay_start_step, stored_settings
 
 UNSEALED = "0" * 64
 """Placeholder of the sha256 while it is computed. Old checkpoints have no sha256."""
@@ -76,9 +76,7 @@ class _Header:
             )
 
 
-def _encode_checkpoint(
-    state: TrainState, settings: TrainSettings, data_digest: str, world_size: int
-) -> bytes:
+def _encode_checkpoint(state: TrainState, world_size: int) -> bytes:
     """Return the bytes of a checkpoint without its sha256; later steps do not change them."""
     tensors = state.optimizer.optimizer_state()
     for name, weight in state.model.named_parameters():
@@ -92,9 +90,9 @@ def _encode_checkpoint(
         "skipped_in_a_row": state.skipped_in_a_row,
         "unusable": dict(state.bad_samples.counts),
         "reports": [dataclasses.asdict(report) for report in state.reports],
-        "settings": stored_settings(settings),
-        "model": encode_config(settings.model),
-        "data_digest": data_digest,
+        "settings": stored_settings(state.settings),
+        "model": encode_config(state.settings.model),
+        "data_digest": state.data_digest,
         **({RECORD: state.mixture.record()} if state.mixture else {}),
         "history": event_records(state.history),
         "world_size": world_size,
@@ -209,9 +207,7 @@ def newest_checkpoint(
 def save_checkpoint(
     folder: Path,
     state: TrainState,
-    settings: TrainSettings,
     *,
-    data_digest: str,
     world_size: int,
     submit: Callable[[Callable[[], None]], None] = lambda work: work(),
 ) -> None:
@@ -229,7 +225,8 @@ def save_checkpoint(
         TrilightError: the disk is full or the folder cannot be written; older checkpoints remain.
     """
     step = state.step
-    data = _encode_checkpoint(state, settings, data_digest, world_size)
+    settings = state.settings
+    data = _encode_checkpoint(state, world_size)
 
     def write_and_prune() -> None:
         _write_sealed(path_of_step(folder, step), data)

@@ -14,12 +14,12 @@ from typing import Any
 import numpy as np
 
 from model.renderformer import count_parameters
-from storage.atomic import append_line, write_atomically
+from storage.atomic import append_line
 from storage.errors import TrilightError
 from storage.settings.described import settings_record
 from train.evaluation.sheet import draw_validation_sheet
 from train.evaluation.validation import Judge
-from train.folder import RunFolder, add_note, read_rows
+from train.folder import RunFolder, add_note, copy_rows, read_rows
 from train.loop.train_state import TrainState
 from train.progress import TrainProgress
 from train.settings import TrainSettings
@@ -54,17 +54,10 @@ def scalars(row: Mapping[str, Any]) -> dict[str, float]:
     }
 
 
-def require_wandb(project: str | None) -> None:
-    """Raise early if the package is requested and missing.
-
-    Raises:
-        TrilightError: a project is named and wandb is not installed.
-    """
-    if project is not None:
-        _package()
-
-
-def _package() -> Any:
+def require_wandb(project: str | None) -> Any:
+    """Return the package if a project is named; raises TrilightError where it is not installed."""
+    if project is None:
+        return None
     try:
         return import_module("wandb")
     except ImportError as error:
@@ -79,7 +72,7 @@ def _begin_wandb_run(project: str, folder: Path, settings: TrainSettings) -> Any
 
     Nothing leaves the machine unless WANDB_MODE is `online`: `wandb sync` uploads it later.
     """
-    return _package().init(
+    return require_wandb(project).init(
         project=project,
         group=folder.resolve().name,
         dir=str(folder),
@@ -95,7 +88,6 @@ class Recorder:
     def __init__(
         self,
         folder: RunFolder,
-        settings: TrainSettings,
         judge: Judge | None,
         progress: TrainProgress,
         state: TrainState,
@@ -105,18 +97,18 @@ class Recorder:
         """Report the start of the run at `state`, whose step is the last one of the log."""
         progress.begin(
             step=state.step,
-            num_steps=settings.num_steps,
+            num_steps=state.settings.num_steps,
             num_parameters=count_parameters(state.model),
             median_scores=judge.median_scores if judge else None,
         )
         self.progress = progress
         self._folder = folder
-        self._settings = settings
+        self._settings = state.settings
         self._judge = judge
-        self._log = MetricsLog(folder.metrics, first_step=state.step)
+        copy_rows(folder.metrics, folder.metrics, state.step)  # later ones will be written again
         self._wandb_run = None
         if wandb is not None:  # before the writer, whose files it follows
-            self._wandb_run = _begin_wandb_run(wandb, folder.root, settings)
+            self._wandb_run = _begin_wandb_run(wandb, folder.root, state.settings)
         from torch.utils.tensorboard import SummaryWriter  # half a second to import
 
         # a resumed run writes its rows after this step again
@@ -124,7 +116,7 @@ class Recorder:
 
     def row(self, row: Mapping[str, Any]) -> None:
         """Write one row of the log."""
-        self._log.append(row)
+        append_line(self._folder.metrics, json.dumps(row, sort_keys=True))
         self._show_scalars(row)
 
     def _show_scalars(self, row: Mapping[str, Any]) -> None:
@@ -164,21 +156,3 @@ class Recorder:
         self._board.close()
         if self._wandb_run is not None:
             self._wandb_run.finish()
-
-
-class MetricsLog:
-    """Writer of metrics.jsonl: one JSON object per line, each with its step."""
-
-    def __init__(self, path: Path, *, first_step: int) -> None:
-        """Drop rows after `first_step`, the step of the checkpoint: they will be written again.
-
-        An incomplete last line, left by a kill, is dropped too.
-        """
-        self.path = path
-        rows = [row for row in read_rows(path) if row["step"] <= first_step]
-        lines = [f"{json.dumps(row, sort_keys=True)}\n" for row in rows]
-        write_atomically(path, "".join(lines).encode())
-
-    def append(self, row: Mapping[str, Any]) -> None:
-        """Append one row and close the file, so that readers can follow the run."""
-        append_line(self.path, json.dumps(row, sort_keys=True))

@@ -53,12 +53,11 @@ class Stepper:
     def __init__(
         self,
         state: TrainState,
-        settings: TrainSettings,
         objective: TrainingLoss,
         dist_context: DistributedContext,
     ) -> None:
         self._state = state
-        self._settings = settings
+        self._settings = settings = state.settings
         self._objective = objective
         self._dist_context = dist_context
         self.defer_sync = defers_sync(dist_context.device)
@@ -155,7 +154,7 @@ class Stepper:
         applied = torch.isfinite(loss) & torch.isfinite(norm)
         decision = Decision(applied=applied, updates=updates, defer_sync=self.defer_sync)
         state.optimizer.step(learning_rate, decision)
-        state.update_ema(self._settings.ema_decay, decision)
+        state.update_ema(decision)
         self._updates += applied
         self.layers.record_update()
         return applied

@@ -34,6 +34,8 @@ _SKIP_ADVICE = (
 class TrainState:
     """State of a run between two steps."""
 
+    settings: TrainSettings
+    """Settings of the next step."""
     model: RenderFormer
     """Network that is trained."""
     optimizer: Optimizer
@@ -52,6 +54,8 @@ class TrainState:
     """Reports of the steps since the last row of the log, which the next row averages."""
     history: tuple[Event, ...] = ()
     """Events of the run, oldest first (train.resume)."""
+    data_digest: str = ""
+    """Digest of the data of this call."""
     mixture: Mixture | None = None
     """Mixture of its datasets; None if there has only been one."""
 
@@ -66,7 +70,7 @@ class TrainState:
         return self.step - self.skipped_steps
 
     @torch.no_grad()
-    def update_ema(self, decay: float, decision: Decision) -> None:
+    def update_ema(self, decision: Decision) -> None:
         """Update the EMA after an update of the weights, unless the step was skipped.
 
         After n updates its decay is at most (1 + n) / (10 + n), so that it forgets the random
@@ -76,7 +80,7 @@ class TrainState:
             return
         means: list[Tensor] = [*self.ema_model.parameters()]
         weights: list[Tensor] = [*self.model.parameters()]
-        move_towards(means, weights, ema_step(decay, decision.updates), decision)
+        move_towards(means, weights, ema_step(self.settings.ema_decay, decision.updates), decision)
 
 
 def ema_step(decay: float, updates: Updates) -> float | Tensor:
@@ -118,6 +122,7 @@ def new_state(
     if settings.ema_decay:
         ema_model = copy.deepcopy(model).requires_grad_(False)
     return TrainState(
+        settings=settings,
         model=model,
         optimizer=Optimizer(model, settings, muon_precision),
         bad_samples=BadSampleCounter(settings.most_unusable, bad_counts, advice=_SKIP_ADVICE),

@@ -185,24 +185,20 @@ class Trainer:
 
     def __init__(
         self,
-        *,
         state: TrainState,
-        settings: TrainSettings,
         objective: TrainingLoss,
         dist_context: DistributedContext,
         folder: RunFolder,
-        data_digest: str,
         recorder: Recorder | None,
-        watched: WatchSettings | None = None,
+        watched: WatchSettings,
     ) -> None:
         """Create the trainer; `recorder` is None in all processes but the first."""
         self.state = state
-        self.settings = settings
+        self.settings = settings = state.settings
         self.dist_context = dist_context
         self.folder = folder
-        self.data_digest = data_digest
         self.recorder = recorder
-        self.stepper = Stepper(state, settings, objective, dist_context)
+        self.stepper = Stepper(state, objective, dist_context)
         self.copies = CopyStream(dist_context.device)
         self.dead_start = DeadStartDetector(settings)
         self.window = Window(state.reports)
@@ -215,7 +211,7 @@ class Trainer:
         self.progress = progress
         self.watch = ProcessMonitor(
             settings,
-            watched or WatchSettings(),
+            watched,
             self.stepper,
             dist_context,
             folder,
@@ -409,8 +405,6 @@ class Trainer:
             save_checkpoint(
                 self.folder.checkpoints,
                 self.state,
-                self.settings,
-                data_digest=self.data_digest,
                 world_size=self.dist_context.world_size,
                 submit=self.writing.begin,
             )

@@ -1,5 +1,6 @@
 """Experiment `gpu`: throughput, correct pictures, and steps of every training preset on a GPU."""
 
+import dataclasses
 import itertools
 import os
 from collections.abc import Callable, Sequence
@@ -109,16 +110,9 @@ def _work(
 
 def _reading(threads: int, context: BenchContext, device: "torch.device") -> Figures:
     """Decode and augment samples as a training preset does."""
-    from train.data.loader import LoaderSettings
-
     run = training_preset(READ_AS)
-    settings = LoaderSettings(
-        seed=0,
-        window=run.shuffle_shards,
-        batch_size=_BATCH,
-        resolution=context.scale.picture_px,
-        views_per_scene=run.views_per_scene,
-        augmentation=run.augmentation,
+    settings = dataclasses.replace(
+        run, scenes_per_step=_BATCH, resolution=context.scale.picture_px, most_triangles=0
     )
     least_s = _READ_S[context.scale.name]
     seconds, core_s = time_reading(context.data, settings, threads, least_s=least_s)

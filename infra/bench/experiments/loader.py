@@ -4,6 +4,7 @@ It reads rendered scenes of `smoke`, each under many keys so that there are enou
 `--data`.
 """
 
+import dataclasses
 from functools import partial
 
 from infra.bench.context import BenchContext
@@ -13,6 +14,8 @@ from infra.bench_options import BenchOptions
 from storage.dataset.settings import StorageSettings
 from storage.dataset.training_data import TrainingData
 from storage.records.sample import decode_sample
+from train.presets import training_preset
+from train.settings import AugmentationSettings
 
 UNPACK = "unpacking, one thread"
 TRAIN = "batches as training reads them"
@@ -59,12 +62,11 @@ def _read(threads: int, context: BenchContext, trial: str) -> Figures:
 
 def read_figures(data: TrainingData, count: int, threads: int) -> Figures:
     """Read samples as training does, without the network."""
-    from train.data.loader import LoaderSettings
-
-    settings = LoaderSettings(
-        seed=0,
-        window=2,
-        batch_size=BATCH,
+    settings = dataclasses.replace(
+        training_preset("smoke"),
+        augmentation=AugmentationSettings(),
+        shuffle_shards=2,
+        scenes_per_step=BATCH,
         resolution=RESOLUTION,
         views_per_scene=min(_VIEWS, data.num_views or _VIEWS),
     )

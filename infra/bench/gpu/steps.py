@@ -214,7 +214,7 @@ def _measure_steps(
     state = new_state(settings, device)
     lpips = drawn_lpips(settings) if device.type == "cuda" else drawn_lpips(settings, THIN)
     objective = TrainingLoss(settings.loss, lpips).to(device)
-    stepper = Stepper(state, settings, objective, DistributedContext(device=device))
+    stepper = Stepper(state, objective, DistributedContext(device=device))
     batch = drawn_batch(settings, scenes).to(device)  # a run sends the next while one is computed
 
     def step() -> None:

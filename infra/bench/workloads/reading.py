@@ -26,7 +26,7 @@ from storage.records.sample import Sample, decode_sample, encode_sample, sample_
 from storage.records.scene import ARRAY_FIELDS
 
 if TYPE_CHECKING:
-    from train.data.loader import LoaderSettings
+    from train.settings import TrainSettings
 
 BUILD = "smoke"
 SCENES = 3
@@ -80,7 +80,7 @@ def write_copies(
 
 def time_reading(
     data: TrainingData,
-    settings: "LoaderSettings",
+    settings: "TrainSettings",
     threads: int,
     *,
     least_count: int = 1,
@@ -104,14 +104,14 @@ def time_reading(
         workers=threads, unusable=BadSampleCounter(0),
     )  # fmt: skip
     with closing(stream) as batches:
-        for _ in itertools.islice(batches, 1 + _DECODED_AHEAD // settings.batch_size):
+        for _ in itertools.islice(batches, 1 + _DECODED_AHEAD // settings.scenes_per_step):
             pass
         began = time.perf_counter()
         core_began = time.process_time()
         count = 0
         while count < least_count or time.perf_counter() - began < least_s:
             next(batches)
-            count += settings.batch_size
+            count += settings.scenes_per_step
         seconds = time.perf_counter() - began
         return seconds / count, (time.process_time() - core_began) / count
 

@@ -22,7 +22,6 @@ from train.loop.step import Stepper
 from train.loop.train_state import new_state
 from train.loop.trainer import scene_flops
 from train.loss.training_loss import TrainingLoss
-from train.run_training import loader_settings
 from train.settings import TrainSettings, learning_rate
 
 
@@ -75,11 +74,11 @@ def _trained_network(
 ) -> RenderFormer:
     crew = DistributedContext(device=device)
     state = new_state(settings, device, muon_precision=choose_muon_precision(crew))
-    stepper = Stepper(state, settings, TrainingLoss(settings.loss, None), crew)
+    stepper = Stepper(state, TrainingLoss(settings.loss, None), crew)
     cost = partial(scene_flops, settings)
     stream = load_batches(
         shards,
-        loader_settings(settings),
+        settings,
         0,
         rank_slice=crew,
         workers=1,

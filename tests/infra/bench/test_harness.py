@@ -51,7 +51,7 @@ from infra.bench.stated_errors import (
 from infra.bench_options import BenchOptions
 from pipeline.renders.calibrated_error import load_statement, versions_of_pictures
 from storage.errors import Rejected, TrilightError
-from storage.intervals import mean_interval
+from storage.metrics import mean_interval
 from tests.command_line import trilight
 from tests.for_each import case
 from train.evaluation.cost_charts import COST_NOISE, on_front

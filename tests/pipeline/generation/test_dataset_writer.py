@@ -311,7 +311,7 @@ def test_a_dataset_in_parts_is_whole(tmp_path: Path) -> None:
     ]  # fmt: skip
     assert read_manifest(tmp_path / "manifest.json") == writer.manifest
     found = verify_dataset(tmp_path)
-    assert (found.problems, found.num_samples) == ([], 20)
+    assert (found.problems, found.manifest.num_samples) == ([], 20)
     dataset = open_dataset(str(tmp_path))
     keys = [s.key for shard in dataset.manifest.shards for s in dataset.read_shard(shard)]
     assert keys == [sample_key(index) for index in range(20)]

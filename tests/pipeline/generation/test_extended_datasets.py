@@ -25,9 +25,8 @@ from storage.dataset.layout import DatasetFolder
 from storage.dataset.manifest import read_manifest, write_manifest
 from storage.dataset.progress import read_asked, write_asked
 from storage.dataset.verify import verify_dataset
-from storage.errors import TrilightError
+from storage.errors import TrilightError, removal_message
 from storage.extensions import load_extension, mistake_in_extension
-from storage.removed import removal_message
 from tests.command_line import trilight
 from tests.extensions_kit import EXAMPLES, loaded, parts_of, room_for_extensions, written
 from tests.for_each import for_each

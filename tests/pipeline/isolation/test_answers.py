@@ -36,9 +36,9 @@ from pipeline.isolation.answers import (
     encode_result,
 )
 from pipeline.isolation.result_schema import DTYPES, result_reader
-from storage.array_hints import array_scalar
 from storage.errors import EnvironmentFailure, Rejected, TrilightError
 from storage.installation import module_name
+from storage.settings.fields import array_scalar
 from tests.conftest import ROOT
 from tests.for_each import for_each
 from tests.pipeline.isolation import called

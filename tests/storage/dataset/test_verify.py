@@ -65,7 +65,7 @@ def test_a_whole_dataset_has_no_fault_and_every_shard_is_looked_at(
     for fast in (False, True):
         looked: list[str] = []
         found = verify_dataset(dataset.folder.root, fast=fast, shard_done=looked.append)
-        assert (found.problems, found.bad_shards, found.num_samples) == ([], [], 5)
+        assert (found.problems, found.bad_shards, found.manifest.num_samples) == ([], [], 5)
         assert looked == [shard.name for shard in dataset.manifest.shards]
 
 
@@ -74,7 +74,7 @@ def test_a_manifest_that_a_maker_writes_meanwhile_is_whole(dataset: Dataset) -> 
     dataset = open_dataset(str(dataset.folder.root))
     write_manifest(dataset.folder.manifest, dataclasses.replace(dataset.manifest, num_scenes=9))
     found = verify_dataset(dataset)
-    assert (found.problems, found.num_samples) == ([], 5)
+    assert (found.problems, found.manifest.num_samples) == ([], 5)
 
 
 def test_a_shard_that_grows_meanwhile_is_not_called_damaged(dataset: Dataset) -> None:

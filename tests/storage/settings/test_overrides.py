@@ -14,11 +14,10 @@ from hypothesis import strategies as st
 from numpy.typing import NDArray
 from typing_extensions import TypeAliasType
 
-from storage import array_hints
-from storage.array_hints import array_scalar
 from storage.errors import TrilightError
+from storage.settings import fields
 from storage.settings.described import checked
-from storage.settings.fields import describe_fields
+from storage.settings.fields import array_scalar, describe_fields
 from storage.settings.overrides import apply_overrides
 from storage.settings.ranges import EXECUTION, Within
 from tests.for_each import for_each
@@ -303,6 +302,6 @@ AliasOfLater = TypeAliasType(  # what numpy 2.5 has in the place of NDArray
 @for_each("scalar", [np.float32, np.int64, np.floating[Any]])
 def test_the_scalar_is_read_of_either(scalar: Any, monkeypatch: pytest.MonkeyPatch) -> None:
     assert array_scalar(NDArray[scalar]) == scalar
-    monkeypatch.setattr(array_hints, "NDArray", AliasOfLater)
+    monkeypatch.setattr(fields, "NDArray", AliasOfLater)
     assert array_scalar(AliasOfLater[scalar]) == scalar
     assert array_scalar(tuple[int, int]) is array_scalar(int) is None

@@ -27,7 +27,7 @@ from tests.model.hits.kit import corner, textured
 from tests.model.kit import hits_config, tensors_of, tiny_config
 from tests.pipeline.renders.scene_kit import join, light, material, quad
 from tests.sky_maps import constant, smooth
-from tests.train.kit import bare_scene
+from tests.train.kit import bare_scene, plain_run
 from tests.train.toy import toy_picture, toy_sample
 from train.data.augment import (
     augment_scene,
@@ -39,7 +39,7 @@ from train.data.augment import (
     scale_light,
 )
 from train.data.bad_samples import BadSampleCounter
-from train.data.loader import LoaderSettings, _SceneMaker
+from train.data.loader import _SceneMaker
 from train.data.scenes import TrainingScene, training_scene
 from train.settings import AugmentationSettings
 
@@ -264,8 +264,8 @@ def _below_a_sky() -> StoredSample:
     ],
 )
 def test_training_takes_skies_that_its_network_knows(config: object, is_known: bool) -> None:
-    settings = LoaderSettings(
-        seed=0, window=1, batch_size=1, resolution=16, views_per_scene=1, network=config  # type: ignore[arg-type]
+    settings = plain_run(
+        seed=0, shuffle_shards=1, scenes_per_step=1, resolution=16, views_per_scene=1, model=config
     )  # fmt: skip
     rng = np.random.default_rng(0)
     maker = _SceneMaker(None, None, settings, BadSampleCounter(0))  # type: ignore[arg-type]

@@ -18,12 +18,11 @@ from storage.dataset.training_data import TrainingData, open_training_data
 from storage.errors import TrilightError
 from storage.records.sample import encode_sample
 from tests.for_each import for_each
-from tests.train.kit import flip_a_bit, keys_of, take
+from tests.train.kit import flip_a_bit, keys_of, plain_run, take
 from tests.train.toy import toy_sample, write_toy_dataset
 from train.data.bad_samples import BadSampleCounter
-from train.data.loader import LoaderSettings
 
-SETTINGS = LoaderSettings(seed=0, window=2, batch_size=4, resolution=8, views_per_scene=1)
+SETTINGS = plain_run(seed=0, shuffle_shards=2, scenes_per_step=4, resolution=8, views_per_scene=1)
 BAD_KEY = "000000002"
 
 
@@ -126,7 +125,7 @@ def test_all_unusable_ends_the_run(dataset: Dataset) -> None:
         keys(dataset, BadSampleCounter(10**9))
 
 
-BOTH_VIEWS = LoaderSettings(seed=0, window=2, batch_size=2, resolution=8, views_per_scene=2)
+BOTH_VIEWS = plain_run(seed=0, shuffle_shards=2, scenes_per_step=2, resolution=8, views_per_scene=2)
 BAD, GOOD = "bad-000000.tar", "good-000000.tar"
 Members = dict[str, bytes]
 

@@ -33,11 +33,11 @@ from storage.seeds import rng_for
 from tests.conftest import ROOT
 from tests.for_each import for_each
 from tests.model.kit import tensors_of, tiny_config
-from tests.train.kit import take
+from tests.train.kit import plain_run, take
 from tests.train.toy import toy_sample, write_toy_dataset
 from train.data.augment import augment_scene
 from train.data.buckets import MOST_WASTE, bucket_scenes
-from train.data.loader import LoaderSettings, OpenShards, prefetch
+from train.data.loader import OpenShards, prefetch
 from train.data.order import RankSlice, Visit, visits_from
 from train.data.scenes import (
     TrainingScene,
@@ -49,10 +49,10 @@ from train.data.scenes import (
 )
 from train.settings import AugmentationSettings
 
-SETTINGS = LoaderSettings(
+SETTINGS = plain_run(
     seed=1,
-    window=2,
-    batch_size=6,
+    shuffle_shards=2,
+    scenes_per_step=6,
     resolution=16,
     views_per_scene=1,
     augmentation=AugmentationSettings(mirror=True, channels=True, vertex_order=True),
@@ -131,7 +131,9 @@ def test_epochs_show_every_scene_and_differ(whole: list[list[TrainingScene]]) ->
 def test_views_are_drawn_without_repetition_and_equal_shares(data: Dataset) -> None:
     with pytest.raises(TrilightError, match="not divisible by 4 ranks"):
         take(data, SETTINGS, 1, world_size=4)
-    settings = LoaderSettings(seed=0, window=1, batch_size=7, resolution=8, views_per_scene=2)
+    settings = plain_run(
+        seed=0, shuffle_shards=1, scenes_per_step=7, resolution=8, views_per_scene=2
+    )
     for scene in take(data, settings, 1)[0]:
         poses = scene.tensors.c2w_V44.numpy()
         assert poses.shape[0] == 2
@@ -153,8 +155,8 @@ def test_albedo_is_that_of_the_scene_after_its_symmetries(data: Dataset) -> None
     """Mirrored, turned and recoloured, as the network would ask for it itself."""
     augmentation = AugmentationSettings(rotation="uniform", mirror=True, channels=True)
     network = tiny_config(demodulated=True, hit_rays=2)
-    settings = dataclasses.replace(SETTINGS, augmentation=augmentation, network=network)
-    plain = dataclasses.replace(settings, network=tiny_config())
+    settings = dataclasses.replace(SETTINGS, augmentation=augmentation, model=network)
+    plain = dataclasses.replace(settings, model=tiny_config())
     pairs = zip(take(data, settings, 1)[0], take(data, plain, 1)[0], strict=True)
     for scene, other in pairs:
         expected = with_albedo(other.tensors, 16, 2).albedo_VRR6
@@ -434,9 +436,10 @@ import itertools, json, resource, sys
 from contextlib import closing
 from storage.dataset.training_data import open_training_data
 from train.data.order import RankSlice
-from train.data.loader import LoaderSettings, load_batches
+from tests.train.kit import plain_run
+from train.data.loader import load_batches
 from train.data.bad_samples import BadSampleCounter
-settings = LoaderSettings(seed=0, window=2, batch_size=8, resolution=16, views_per_scene=2)
+settings = plain_run(seed=0, shuffle_shards=2, scenes_per_step=8, resolution=16, views_per_scene=2)
 data = open_training_data([sys.argv[1]]).split("train")
 batches = load_batches(
     data, settings, 0, rank_slice=RankSlice(), workers=2, unusable=BadSampleCounter(0)

@@ -26,25 +26,33 @@ from storage.errors import TrilightError
 from tests.for_each import for_each
 from tests.train.data.test_loader import identities
 from tests.train.fake_card import CARD, fake_card
-from tests.train.kit import CPU, keys_of, require_resumed_to_the_bit, take, tiny_run
+from tests.train.kit import (
+    CPU,
+    keys_of,
+    plain_run,
+    require_resumed_to_the_bit,
+    take,
+    tiny_run,
+)
 from tests.train.toy import write_toy_dataset
 from train.data.bad_samples import BadSampleCounter, first_samples
-from train.data.buckets import CopyStream, StepScenes, step_scenes
+from train.data.buckets import CopyStream, StepScenes, collate_batch, step_scenes
 from train.data.loader import (
     MAX_THREADS,
-    LoaderSettings,
     choose_workers,
     load_batches,
 )
 from train.data.order import RECORD, Mixture, RankSlice, plan_mixture
-from train.data.scenes import TrainingScene, stored_levels
+from train.data.scenes import TrainingScene, stored_levels, with_target
 from train.loop.checkpoints import read_checkpoint
 from train.resume import StartOptions
 from train.run_training import run_training
 from train.settings import AugmentationSettings
 
 BATCH = 4
-SETTINGS = LoaderSettings(seed=1, window=2, batch_size=BATCH, resolution=16, views_per_scene=1)
+SETTINGS = plain_run(
+    seed=1, shuffle_shards=2, scenes_per_step=BATCH, resolution=16, views_per_scene=1
+)
 
 
 @pytest.fixture(scope="module")
@@ -262,8 +270,8 @@ def test_threads_are_what_a_machine_spares_as_its_files_say(
 
 
 LIT = AugmentationSettings(mirror=True, channels=True, light_scale=3.0)
-LIT_SETTINGS = LoaderSettings(
-    seed=2, window=2, batch_size=6, resolution=16, views_per_scene=2, augmentation=LIT
+LIT_SETTINGS = plain_run(
+    seed=2, shuffle_shards=2, scenes_per_step=6, resolution=16, views_per_scene=2, augmentation=LIT
 )
 
 
@@ -290,20 +298,17 @@ def steps(
         yield found
 
 
-@for_each("augmentation", [None, LIT])
+@for_each("augmentation", [AugmentationSettings(), LIT])
 def test_targets_that_are_looked_up_on_arrival_are_the_same_bits(
-    dataset: Dataset, augmentation: AugmentationSettings | None
+    dataset: Dataset, augmentation: AugmentationSettings
 ) -> None:
     """One table of all scenes, or one of each whose light was scaled."""
-    pairs = []
-    for looked_up in (True, False):
-        with steps(dataset, lookup_in_threads=looked_up, augmentation=augmentation) as found:
-            taken = list(itertools.islice(found, 2))
-            pairs.append([batch for step in taken for batch in step.batches])
-    for ready, rows in zip(*pairs, strict=True):
+    settings = dataclasses.replace(LIT_SETTINGS, augmentation=augmentation)
+    for scenes in take(dataset, settings, 2):
+        ready, rows = collate_batch([with_target(each) for each in scenes]), collate_batch(scenes)
         assert ready.levels_BL is None and rows.levels_BL is not None
         assert rows.target_BVRR3.dtype == torch.int16, "half of the bytes on the way"
-        assert len(rows.levels_BL) == (1 if augmentation is None else len(rows.noise_BV))
+        assert len(rows.levels_BL) == (1 if augmentation is not LIT else len(rows.noise_BV))
         there = rows.to(CPU)
         assert there.levels_BL is None and torch.equal(there.target_BVRR3, ready.target_BVRR3)
 
@@ -364,7 +369,7 @@ def test_a_card_gets_copies_beside_its_kernels(
 ) -> None:
     """From pinned memory, all queued at once, each waited for alone, kept until it is used."""
     said = logged(monkeypatch)
-    with steps(dataset, CARD, lookup_in_threads=False) as found:
+    with steps(dataset, CARD) as found:
         step = next(found)
     with fake_card():
         sent = CopyStream(CARD).send(step.batches)
@@ -386,5 +391,5 @@ def test_rows_of_targets_cover_all_pictures_but_those_of_another_resolution(tmp_
     halves = np.arange(0x7C00, dtype=np.uint16).view(np.float16).astype(np.float32)
     assert np.array_equal(stored_levels().numpy(), log10_radiance(halves).astype(np.float32))
     data = write_toy_dataset(tmp_path, train=6, validation=1, per_shard=3, resolution=32)
-    with steps(data, lookup_in_threads=False) as found:
+    with steps(data) as found:
         assert all(batch.levels_BL is None for batch in next(found).batches)

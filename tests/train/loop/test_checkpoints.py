@@ -66,7 +66,7 @@ state = new_state(settings)
 
 def keep(folder, step):
     state.step = state.skipped_steps = step
-    save_checkpoint(folder, state, settings, data_digest="d", world_size=1)
+    save_checkpoint(folder, state, world_size=1)
 
 def killed(folder, name, when):
     keep(folder, 1)
@@ -115,7 +115,7 @@ def test_the_newest_and_the_milestones_stay(tmp_path: Path) -> None:
 def test_killed_while_saving_leaves_a_whole_one(killed: Path, call: str, when: str) -> None:
     folder = killed / f"{call} {when}"
     newest = newest_checkpoint(folder, ALONE, pytest.fail)
-    step = restore_state(newest, plan_resume(newest.header, tiny_run(), "d", {})).step
+    step = restore_state(newest, plan_resume(newest.header, tiny_run(), "", {})).step
     assert step == (1 if (call, when) in (("fsync", "before"), ("replace", "before")) else 2)
     keep(folder, 3)
     assert not list(folder.glob("*.part")), "what the killed one left is cleared away"
@@ -127,7 +127,7 @@ def keep(folder: Path, *steps: int, **changes: Any) -> None:
     state = new_state(settings)
     for step in steps:
         state.step = state.skipped_steps = step
-        save_checkpoint(folder, state, settings, data_digest="d", world_size=1)
+        save_checkpoint(folder, state, world_size=1)
 
 
 def cut(path: Path) -> None:
@@ -235,7 +235,7 @@ def test_a_network_is_found_in_folder_checkpoint_and_file(tmp_path: Path) -> Non
         state.ema_model.decoder.token_W.fill_(0.25)
     with pytest.raises(TrilightError, match="no checkpoint here"):
         open_network(tmp_path)
-    save_checkpoint(folder.checkpoints, state, settings, data_digest="d", world_size=1)
+    save_checkpoint(folder.checkpoints, state, world_size=1)
     for place in (tmp_path, path_of_step(folder.checkpoints, 0)):
         found = find_network(place)
         assert found.trained.resolution == settings.resolution
@@ -259,7 +259,7 @@ def stepped(steps: int = 3) -> TrainState:
 
 
 def one_step(state: TrainState, batch: TrainingBatch) -> None:
-    stepper(state, tiny_run()).step([batch], 1e-3)
+    stepper(state).step([batch], 1e-3)
     state.step += 1
 
 
@@ -269,7 +269,8 @@ def equal_weights(one: TrainState, other: TrainState) -> bool:
 
 
 def save(folder: Path, state: TrainState) -> Path:
-    save_checkpoint(folder, state, tiny_run(), data_digest=DIGEST, world_size=1)
+    state.data_digest = DIGEST
+    save_checkpoint(folder, state, world_size=1)
     return path_of_step(folder, state.step)
 
 

@@ -53,15 +53,15 @@ def cost(num_triangles: int) -> float:
     return 100.0 + num_triangles
 
 
-def step(state: TrainState, batches: list[TrainingBatch], grad_clip: float = 1.0) -> StepReport:
-    report = stepper(state, tiny_run(grad_clip=grad_clip)).step(batches, 3e-3)
+def step(state: TrainState, batches: list[TrainingBatch]) -> StepReport:
+    report = stepper(state).step(batches, 3e-3)
     state.step += 1
     return report
 
 
 def gradients(batches: list[TrainingBatch]) -> tuple[float, list[Tensor]]:
-    state = new_state(tiny_run())
-    report = step(state, batches, grad_clip=1e9)
+    state = new_state(tiny_run(grad_clip=1e9))
+    report = step(state, batches)
     return report.loss, [w.grad.clone() for w in state.model.parameters() if w.grad is not None]
 
 
@@ -114,7 +114,7 @@ def test_the_mean_follows_the_weights_faster_at_first() -> None:
     batch = toy_batch(0, 1)
     by_hand = state.model.decoder.rays.weight.detach().clone()
     for updates in range(12):
-        stepper(state, settings).step([batch], 3e-3)
+        stepper(state).step([batch], 3e-3)
         state.step += 1
         decay = min(0.5, (1 + updates) / (10 + updates))
         by_hand = decay * by_hand + (1 - decay) * state.model.decoder.rays.weight.detach()
@@ -179,8 +179,8 @@ def test_the_report_says_how_bright_and_how_long_before_clipping() -> None:
     assert step(state, [batch]).brightness == pytest.approx(0.5, rel=1e-4)  # float32 sums
     lengths = []
     for clip in (1e-3, 1e9):
-        state = new_state(tiny_run())
-        report = step(state, [batch], grad_clip=clip)
+        state = new_state(tiny_run(grad_clip=clip))
+        report = step(state, [batch])
         grads = [w.grad.flatten() for w in state.model.parameters() if w.grad is not None]
         lengths.append((report.grad_norm, torch.cat(grads).norm().item()))
     (free, shortened), (free_again, unclipped) = lengths
@@ -209,7 +209,7 @@ def batch_of(index: int, *, bad: bool = False) -> TrainingBatch:
 def taken(batches: list[TrainingBatch]) -> tuple[TrainState, list[bool]]:
     """Take steps and learn only at the end what they did."""
     state = new_state(LATE, muon_precision="float32")
-    late, unread = stepper(state, LATE), []
+    late, unread = stepper(state), []
     for each in batches:
         unread.append(late.launch([each], 3e-3))
         state.step += 1
@@ -434,13 +434,13 @@ def _uncompilable(monkeypatch: pytest.MonkeyPatch, compile: Compile) -> Stepper:
     monkeypatch.setattr(compiled, "_is_worthwhile", lambda _: True)
     _compile_by(monkeypatch, _fails_to_compile)
     run = tiny_run(compile=compile)
-    return stepper(new_state(run), run)
+    return stepper(new_state(run))
 
 
 def test_what_cannot_be_compiled_is_trained_all_the_same(monkeypatch: pytest.MonkeyPatch) -> None:
     """On an H200 torch 2.11 failed to compile `smoke`, and the run ended before its first step."""
     batch = toy_batch(0, 1)
-    plain = stepper(new_state(tiny_run()), tiny_run())
+    plain = stepper(new_state(tiny_run()))
     wanted = plain.step([batch], 1e-3)
     with monkeypatch.context() as patch:
         failing = _uncompilable(patch, compile="auto")

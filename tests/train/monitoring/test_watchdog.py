@@ -262,7 +262,7 @@ def test_a_process_stands_out_by_its_own_work_or_none_does() -> None:
 def test_the_figures_are_those_of_an_update_before_clipping(clip: float) -> None:
     settings = tiny_run(grad_clip=clip)
     state = new_state(settings)
-    watched = stepper(state, settings)
+    watched = stepper(state)
     batch = toy_batch(0, 1)
     before = copy.deepcopy(dict(state.model.named_parameters()))
     watched.layers.expect_update(True)
