@@ -45,7 +45,7 @@ from train.evaluation.evaluate import (
     worst_of_each_excursion,
 )
 from train.evaluation.judged_view import NETWORK, JudgedView
-from train.evaluation.pages import evaluation_page, record
+from train.evaluation.report_pages import evaluation_page, record
 from train.evaluation.sheet import draw_sheet, write_picture
 from train.folder import pretty_json
 from train.loop.distributed import choose_device
@@ -62,7 +62,7 @@ class Judgement:
     """Result of an evaluation."""
 
     record: dict[str, Any]
-    """All figures as JSON values (train.evaluation.pages)."""
+    """All figures as JSON values (train.evaluation.report_pages)."""
     views: tuple[JudgedView, ...]
     contest: EvalConfig
     """Network, data and baselines of the evaluation."""

@@ -42,7 +42,7 @@ from train.evaluation.board import (
 from train.evaluation.chart import plot_leaderboard
 from train.evaluation.evaluate import BASELINE_SCENES, make_baselines, stored_resolution
 from train.evaluation.options import LeaderboardOptions
-from train.evaluation.pages import leaderboard_page, pairs_csv, standings_csv
+from train.evaluation.report_pages import leaderboard_page, pairs_csv, standings_csv
 from train.evaluation.validation import PictureSource, nearest_view
 from train.loss.lpips import load_lpips
 

@@ -14,7 +14,8 @@ from typing import Any, TypeVar
 
 from infra.bench.experiment import BenchScale, Figures
 from infra.bench.workloads.named_scenes import given_scenes, preset_scene, read_given
-from infra.bench.workloads.reading import Members, render_scenes, write_copies
+from infra.bench.workloads.reading import write_copies
+from infra.bench.workloads.rendering_speed import Members, render_scenes
 from infra.bench_options import BenchOptions
 from infra.render.held_out_scenes import composing_child
 from infra.render.path_tracer import RenderChild

@@ -26,7 +26,7 @@ from storage.errors import TrilightError
 from storage.records.objects import read_objects_lock
 from train.evaluation.equal_time import sentences
 from train.evaluation.judged_view import NETWORK
-from train.evaluation.pages import scores_table, swapped_text
+from train.evaluation.report_pages import scores_table, swapped_text
 from train.folder import RunFolder
 
 MOST_BYTES = 10_000_000

@@ -8,7 +8,7 @@ from numpy.typing import NDArray
 
 from infra.bench.context import BenchContext
 from infra.bench.experiment import BenchScale, Column, Experiment, Figures, Point, percent
-from infra.bench.experiments.frontier import adaptive
+from infra.bench.experiments.frontier import adaptive_settings
 from infra.bench.workloads.cycles import render_with_cycles
 from infra.bench.workloads.named_scenes import SKIES, given_scenes, mapped_scene, preset_scene
 from infra.bench.workloads.traced_pictures import (
@@ -76,7 +76,9 @@ def _measure(kind: str, context: BenchContext, trial: str) -> Figures:
     scene = _scene(context, kind, int(trial.split()[-1]))
     camera = first_camera(scene, RESOLUTION)
     ours = context.child.call(raw_reference, scene, camera, OUR_SHARE * spp)
-    view = context.child.call(render_shot, scene, adaptive(USUAL_FLOOR_DB, RESOLUTION, spp))
+    view = context.child.call(
+        render_shot, scene, adaptive_settings(USUAL_FLOOR_DB, RESOLUTION, spp)
+    )
     pictures, core_s = render_with_cycles(scene, RESOLUTION, spp, seeds=(0, 1))
     a_rgb, b_rgb = (picture.astype(np.float64) for picture in pictures)
     theirs = RawReference(a_rgb=a_rgb, b_rgb=b_rgb)

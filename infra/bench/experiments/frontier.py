@@ -60,7 +60,7 @@ _SINGLE_PIXEL = 0.5
 """Share of the squared error from which one pixel decides what a picture costs."""
 
 
-def adaptive(target_db: float, resolution: int, max_spp: int) -> RenderSettings:
+def adaptive_settings(target_db: float, resolution: int, max_spp: int) -> RenderSettings:
     """Return the settings of `pretrain-256` with another target, width and cap."""
     return dataclasses.replace(
         pretrain_256().renders,
@@ -80,7 +80,9 @@ def _points(scale: BenchScale, options: BenchOptions) -> list[Point]:
     ours = [
         Point(
             name=f"trilight {target_db:.0f} dB",
-            measure=partial(_measure_ours, adaptive(target_db, scale.resolution, scale.max_spp)),
+            measure=partial(
+                _measure_ours, adaptive_settings(target_db, scale.resolution, scale.max_spp)
+            ),
             default=target_db == pretrain_256().renders.noise_floor_db,
             kind=OURS,
         )
@@ -89,7 +91,7 @@ def _points(scale: BenchScale, options: BenchOptions) -> list[Point]:
     stated = [
         Point(
             name=f"trilight {USUAL_FLOOR_DB:.0f} dB, {px} px",
-            measure=partial(_measure_ours, adaptive(USUAL_FLOOR_DB, px, scale.max_spp)),
+            measure=partial(_measure_ours, adaptive_settings(USUAL_FLOOR_DB, px, scale.max_spp)),
             judged=False,
             kind=STATED,
         )

@@ -1,4 +1,4 @@
-"""Rendered scenes packed in several layouts, and reading of many copies as training does."""
+"""Samples packed in several layouts, and reading of many copies as training does."""
 
 import io
 import itertools
@@ -11,15 +11,11 @@ from typing import TYPE_CHECKING, TypeVar
 import h5py
 import numpy as np
 
-from infra.planning import measure_scenes
+from infra.bench.workloads.rendering_speed import Members
 from pipeline.exchange.renderformer_h5 import write_renderformer_h5
-from pipeline.generation.generate_options import GenerateOptions
-from pipeline.presets.registry import preset_settings
 from storage.dataset.layout import DatasetFolder
 from storage.dataset.manifest import Manifest, index_shard, write_manifest
 from storage.dataset.shard import write_shard
-from storage.dataset.splits import shard_name
-from storage.dataset.staging import read_staged_scene
 from storage.dataset.training_data import TrainingData
 from storage.records.profiles import PROFILES, Profile
 from storage.records.sample import Sample, decode_sample, encode_sample, sample_key
@@ -28,31 +24,8 @@ from storage.records.scene import ARRAY_FIELDS
 if TYPE_CHECKING:
     from train.settings import TrainSettings
 
-BUILD = "smoke"
-SCENES = 3
-"""Number of rendered scenes, fewer than a shard of the preset; the first compiles kernels."""
 _DECODED_AHEAD = 16
 """Number of samples that are read before any is timed: what is decoded ahead would count twice."""
-
-Members = Mapping[str, bytes]
-"""Files of a sample by name."""
-
-
-def render_scenes(px: int, place: Path) -> tuple[dict[str, float], list[Members]]:
-    """Render scenes of BUILD one after the other on all cores.
-
-    Returns:
-        Wall-clock milliseconds and CPU seconds of a view; and the files of each scene.
-    """
-    splits = preset_settings(BUILD).splits
-    options = GenerateOptions(build=BUILD, resolution=px, scenes=splits.scenes_per_shard)
-    marks: list[float] = []
-    measured = measure_scenes(options, SCENES, place, lambda: marks.append(time.monotonic()))
-    staged = DatasetFolder(place).staged_shard(shard_name(0, splits))
-    members: list[Members] = [read_staged_scene(staged, row).members for row in range(SCENES)]
-    view_s = (marks[-1] - marks[0]) / (len(marks) - 1) / measured.num_views
-    core_s = sum(measured.core_s[1:]) / (SCENES - 1) / measured.num_views
-    return {"ms": 1e3 * view_s, "views_per_s": 1 / view_s, "core_s": core_s}, members
 
 
 def write_copies(

@@ -41,7 +41,7 @@ from train.evaluation.evaluate import (
 from train.evaluation.judged_view import NETWORK, JudgedView, by_group, scene_facts, summarize_views
 from train.evaluation.metrics import METRICS, hdr_flip, picture_scores
 from train.evaluation.options import EvaluationOptions
-from train.evaluation.pages import BENCHMARK, evaluation_page, record
+from train.evaluation.report_pages import BENCHMARK, evaluation_page, record
 from train.evaluation.validation import (
     MEDIAN,
     NEAREST,

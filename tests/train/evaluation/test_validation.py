@@ -54,7 +54,7 @@ from train.evaluation.metrics import (
     picture_scores,
     summarize_scores,
 )
-from train.evaluation.pages import evaluation_page, record
+from train.evaluation.report_pages import evaluation_page, record
 from train.evaluation.sheet import (
     NOISE_WHITE,
     SheetView,

@@ -118,7 +118,7 @@ _PARTS = ("median", "worse_5_percent", "mean", "median_worse_than_noise")
 
 
 def evaluation_page(report: Mapping[str, Any]) -> str:
-    """Return evaluation.md of a report (train.evaluation.pages.record)."""
+    """Return evaluation.md of a report (train.evaluation.report_pages.record)."""
     contestants = report["contestants"]
     network = contestants[NETWORK]
     lines = ["# Evaluation", "", *_facts(report["about"])]
