@@ -31,7 +31,9 @@ from storage.digests import sha256_hex
 from storage.errors import TrilightError
 from storage.records.safe_read import read_plain
 from storage.records.sample import Sample
-from train.evaluation.board import (
+from train.evaluation.chart import plot_leaderboard
+from train.evaluation.evaluate import BASELINE_SCENES, make_baselines, stored_resolution
+from train.evaluation.leaderboard import (
     Board,
     OnProgress,
     WidthStandings,
@@ -39,8 +41,6 @@ from train.evaluation.board import (
     judge_all,
     standings_of,
 )
-from train.evaluation.chart import plot_leaderboard
-from train.evaluation.evaluate import BASELINE_SCENES, make_baselines, stored_resolution
 from train.evaluation.options import LeaderboardOptions
 from train.evaluation.report_pages import leaderboard_page, pairs_csv, standings_csv
 from train.evaluation.validation import PictureSource, nearest_view

@@ -9,7 +9,7 @@ from scene_templates.families import Family
 from scene_templates.placement import PlacementSettings
 from scene_templates.rooms import SharedRoom
 from scene_templates.sample_camera import CameraSettings
-from scene_templates.sample_emitters import LightSettings
+from scene_templates.sample_lights import LightSettings
 from scene_templates.sample_material import MaterialSettings
 from scene_templates.settings import SceneSettings, ViewLaws
 from scene_templates.skies.procedural_skies import SkyMapSettings, SkySettings

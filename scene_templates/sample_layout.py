@@ -15,7 +15,7 @@ from scene_templates.families import Family
 from scene_templates.layout import Layout, ObjectPlacement, ShellPart
 from scene_templates.placement import PlaceableShape, place_objects
 from scene_templates.rooms import PATCH_FACES, SeparateSides
-from scene_templates.sample_emitters import sample_emitters
+from scene_templates.sample_lights import sample_lights
 from scene_templates.sample_material import sample_material
 from scene_templates.settings import SceneSettings
 from scene_templates.templates import TEMPLATES
@@ -94,7 +94,7 @@ def sample_layout(
     surfaces = tuple(draw(kind="shell") for _ in template.parts)
     objects = tuple(ObjectPlacement(pose=pose, surface=draw(kind="object")) for pose in poses)
     centres = [pose.centre for pose in poses]
-    emitters = sample_emitters(rng, settings.lights, template.lights, plan.num_lights, centres)
+    emitters = sample_lights(rng, settings.lights, template.lights, plan.num_lights, centres)
     wall2_faces_out = isinstance(family.shell, SeparateSides) and family.shell.wall2_faces_out
     shell = tuple(
         ShellPart(

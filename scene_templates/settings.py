@@ -17,7 +17,7 @@ from scene_templates.checks import OFFSET, require
 from scene_templates.families import Family
 from scene_templates.placement import PlacementSettings
 from scene_templates.sample_camera import CameraSettings
-from scene_templates.sample_emitters import LightSettings
+from scene_templates.sample_lights import LightSettings
 from scene_templates.sample_material import MaterialSettings
 from scene_templates.skies.procedural_skies import SkySettings
 from scene_templates.textures import TextureSettings

@@ -45,7 +45,7 @@ if TYPE_CHECKING:
     from scene_templates.rooms import SharedRoom as SharedRoom
     from scene_templates.rooms import SideRanges as SideRanges
     from scene_templates.sample_camera import Sector as Sector
-    from scene_templates.sample_emitters import LightSettings as LightSettings
+    from scene_templates.sample_lights import LightSettings as LightSettings
     from scene_templates.settings import SceneSettings as SceneSettings
     from scene_templates.skies.procedural_skies import SKIES as SKIES
     from scene_templates.skies.procedural_skies import SkyDraws as SkyDraws

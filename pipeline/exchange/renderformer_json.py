@@ -57,7 +57,7 @@ _OUR_NAMES = {"rotation": "rotation_deg", "fov": "fov_deg"}
 """Our names of fields, by those of the file, where they differ."""
 
 
-def read_description(data: bytes, name: str) -> SceneDescription:
+def read_renderformer_json(data: bytes, name: str) -> SceneDescription:
     """Parse the bytes of a scene file; messages call it `name`.
 
     Raises:
@@ -93,7 +93,7 @@ def read_cameras(data: bytes, name: str) -> tuple[DescribedCamera, ...]:
     """Return the cameras of a scene file, or of a JSON file that has nothing but `cameras`.
 
     Raises:
-        TrilightError: as `read_description`, for the cameras alone.
+        TrilightError: as `read_renderformer_json`, for the cameras alone.
     """
     reader = _Reader(name)
     return reader.cameras(reader.read_tree(data))
@@ -286,7 +286,7 @@ def describe_scene(scene: Scene, stem: str) -> DescribedFiles:
             "bytes of a scene file": (len(data), MAX_BYTES),
         }
     )
-    read_description(data, f"{stem}.json")  # raises for anything that readers would refuse
+    read_renderformer_json(data, f"{stem}.json")  # raises for anything that readers would refuse
     return DescribedFiles(json=data, meshes=meshes, lost=(*_losses(scene), *lost))
 
 

@@ -22,7 +22,7 @@ from pipeline.exchange.from_description import (
     build_cameras,
     scene_from_description,
 )
-from pipeline.exchange.renderformer_json import MAX_BYTES, read_cameras, read_description
+from pipeline.exchange.renderformer_json import MAX_BYTES, read_cameras, read_renderformer_json
 from pipeline.foreign.material_files import find_in_any_case
 from storage.digests import sha256_hex
 from storage.errors import EnvironmentFailure, Rejected, TrilightError
@@ -78,7 +78,7 @@ class SceneFiles:
 
 def read_scene_description(root: Path, name: str) -> SceneDescription:
     """Read and parse a scene file of the folder `root`; raises TrilightError."""
-    return read_description(_read_scene_file(root, name), name)
+    return read_renderformer_json(_read_scene_file(root, name), name)
 
 
 def read_scene_cameras(root: Path, name: str) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
@@ -116,7 +116,7 @@ def build_scene(
         TrilightError: the file or a mesh is unusable; the message names it.
     """
     data = _read_scene_file(root, name)
-    description = read_description(data, name)
+    description = read_renderformer_json(data, name)
     num_views = len(description.cameras) if num_views is None else num_views
     digests = {name: sha256_hex(data)}
     meshes: dict[tuple[str, int | None], LoadedMesh] = {}

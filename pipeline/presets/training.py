@@ -29,7 +29,7 @@ from pipeline.renders.settings import CALIBRATED_LOOKS, RenderSettings
 from scene_templates.families import DEFAULT_FAMILIES, alone
 from scene_templates.placement import PlacementSettings
 from scene_templates.sample_camera import CameraSettings
-from scene_templates.sample_emitters import LightSettings
+from scene_templates.sample_lights import LightSettings
 from scene_templates.sample_material import MaterialSettings
 from scene_templates.settings import SceneSettings, ViewLaws
 from scene_templates.skies.procedural_skies import SkyMapSettings, SkySettings

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from pipeline.scenes.pieces import concatenate_pieces, emitter_piece, with_drawn_columns
 from pipeline.scenes.views import object_boxes
-from scene_templates.sample_emitters import LightSettings, sample_emitters
+from scene_templates.sample_lights import LightSettings, sample_lights
 from scene_templates.sample_material import MaterialSettings, sample_material
 from scene_templates.templates import TEMPLATES
 from storage.errors import Rejected
@@ -83,7 +83,7 @@ def with_new_lights(
     count = int(lit.sum()) if num_lights is None else num_lights
     rng = scene_key.rng("new lights")
     centres = list(object_boxes(scene).sum(axis=1).astype(np.float64) / 2)
-    emitters = sample_emitters(rng, settings, TEMPLATES[name].lights, count, centres)
+    emitters = sample_lights(rng, settings, TEMPLATES[name].lights, count, centres)
     lamps = [emitter_piece(emitter, row) for row, emitter in enumerate(emitters)]
     dark = _without(scene, lit)
     new = concatenate_pieces(lamps)

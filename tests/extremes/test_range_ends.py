@@ -33,7 +33,7 @@ from scene_templates.families import Family
 from scene_templates.placement import PlacementSettings
 from scene_templates.rooms import SharedRoom
 from scene_templates.sample_camera import CameraSettings
-from scene_templates.sample_emitters import LightSettings
+from scene_templates.sample_lights import LightSettings
 from scene_templates.sample_material import MaterialSettings
 from scene_templates.settings import SceneSettings, ViewLaws
 from storage.conventions import HALF_FLOAT_MAX

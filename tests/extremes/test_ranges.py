@@ -32,7 +32,7 @@ from scene_templates.frozen_v1 import ONE_FAMILY_EACH
 from scene_templates.placement import PlacementSettings
 from scene_templates.rooms import SharedRoom, SideRanges
 from scene_templates.sample_camera import CameraSettings
-from scene_templates.sample_emitters import LightSettings
+from scene_templates.sample_lights import LightSettings
 from scene_templates.sample_material import MaterialSettings
 from scene_templates.settings import MAX_TRIANGLES, Excursion, SceneSettings, ViewLaws
 from scene_templates.skies.procedural_skies import SkyMapSettings, SkySettings

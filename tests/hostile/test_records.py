@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from pipeline.exchange.renderformer_json import read_description
+from pipeline.exchange.renderformer_json import read_renderformer_json
 from pipeline.isolation.call_failures import ChildFailed
 from pipeline.objects.maps.prepared import prepare_map
 from storage.errors import Rejected, TrilightError
@@ -92,7 +92,7 @@ def _refusals(folder: Path) -> Iterator[tuple[str, Exception]]:
     text = changed()
     for at in range(0, len(text), 31):
         try:
-            read_description(text[:at] + b"\xff{1e999" + text[at + 2 :], "a.json")
+            read_renderformer_json(text[:at] + b"\xff{1e999" + text[at + 2 :], "a.json")
         except TrilightError as refusal:
             yield f"scene {at}", refusal
 

@@ -33,8 +33,11 @@ from tests.command_line import trilight
 from tests.for_each import case
 from tests.model.kit import awake, publishable
 from tests.train.toy import VIEWS, toy_sample, write_toy_dataset
-from train.evaluation import board as board_module
-from train.evaluation.board import (
+from train.evaluation import leaderboard as board_module
+from train.evaluation.chart import plot_leaderboard
+from train.evaluation.equal_time import Price
+from train.evaluation.judged_view import METRIC, NETWORK
+from train.evaluation.leaderboard import (
     NOISE,
     UNKNOWN_MACHINE,
     Row,
@@ -43,9 +46,6 @@ from train.evaluation.board import (
     Standing,
     WidthStandings,
 )
-from train.evaluation.chart import plot_leaderboard
-from train.evaluation.equal_time import Price
-from train.evaluation.judged_view import METRIC, NETWORK
 from train.evaluation.options import LeaderboardOptions
 from train.evaluation.validation import PictureSource, nearest_view
 

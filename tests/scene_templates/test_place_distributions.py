@@ -15,7 +15,7 @@ from scene_templates.layout import CameraPose
 from scene_templates.renderformer_v1 import Policy, stage_1_families, stage_2_families
 from scene_templates.rooms import SIDES, PatchPlacement, SharedRoom, plane_of
 from scene_templates.sample_camera import CameraSettings, Sector, sample_camera
-from scene_templates.sample_emitters import LightSettings, sample_emitters
+from scene_templates.sample_lights import LightSettings, sample_lights
 from scene_templates.templates import TEMPLATES
 from tests.for_each import for_each
 from tests.scene_templates.balls import DEFAULTS, MANY, Drawn, drawn, drawn_once, template_settings
@@ -216,7 +216,7 @@ def _sector_table(directions: NDArray[np.float64], sector: Sector) -> Table:
 def _light_centres(sector: Sector, **changes: object) -> NDArray[np.float64]:
     settings = LightSettings(**changes)  # type: ignore[arg-type]
     rng = np.random.default_rng(0)
-    drawn_ones = [sample_emitters(rng, settings, sector, 1, [])[0] for _ in range(COUNT)]
+    drawn_ones = [sample_lights(rng, settings, sector, 1, [])[0] for _ in range(COUNT)]
     return np.stack([one.triangle.mean(axis=0) for one in drawn_ones])
 
 

@@ -22,8 +22,8 @@ from scene_templates.recorded_sampler import RecordedSampler
 from scene_templates.rooms import SharedRoom, SideRanges
 from scene_templates.rotations import rotate_points, rotation_xyz, uniform_rotation
 from scene_templates.sample_camera import CameraSettings
-from scene_templates.sample_emitters import LightSettings
 from scene_templates.sample_layout import scene_plan
+from scene_templates.sample_lights import LightSettings
 from scene_templates.sample_material import MaterialSettings
 from scene_templates.settings import Excursion, SceneSettings, ViewLaws
 from scene_templates.skies.procedural_skies import SkyMapSettings

@@ -5,9 +5,9 @@ from pathlib import Path
 
 import numpy as np
 
-from train.evaluation.board import NOISE, WidthStandings
 from train.evaluation.cost_charts import SeriesPoint, draw_panels
 from train.evaluation.judged_view import METRIC, NETWORK, JudgedView
+from train.evaluation.leaderboard import NOISE, WidthStandings
 
 _PANEL = (7.4, 6.2)
 _DPI = 110

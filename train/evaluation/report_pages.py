@@ -9,7 +9,6 @@ from typing import Any
 import numpy as np
 
 from storage.markdown import inert, table, text
-from train.evaluation.board import NOISE, WidthStandings
 from train.evaluation.cost_charts import number_text
 from train.evaluation.equal_time import TRACER, sentences
 from train.evaluation.judged_view import (
@@ -23,6 +22,7 @@ from train.evaluation.judged_view import (
     interval_text,
     summarize_views,
 )
+from train.evaluation.leaderboard import NOISE, WidthStandings
 from train.evaluation.metrics import METRICS
 
 BENCHMARK = "benchmark-v1"

@@ -12,7 +12,7 @@ import pytest
 import trimesh
 
 from pipeline.exchange.from_description import DescribedObject, scaled_albedo_notes
-from pipeline.exchange.renderformer_json import MAX_BYTES, describe_scene, read_description
+from pipeline.exchange.renderformer_json import MAX_BYTES, describe_scene, read_renderformer_json
 from storage.errors import TrilightError
 from storage.records.material import DIFFUSE, EMISSION, ROUGHNESS, SPECULAR
 from storage.records.scene import Scene, SceneObject
@@ -41,7 +41,7 @@ from tests.scenes_by_hand import LIGHT, tiny_scene
 @for_each("name", EXAMPLES)
 def test_the_example_scenes_hold_no_unknown_field(shared: Path, name: str) -> None:
     data = (shared / "renderformer_scenes" / f"{name}.json").read_bytes()
-    described = read_description(data, name)
+    described = read_renderformer_json(data, name)
     assert described.unknown_fields == ()
     assert [entry.name for entry in described.objects] == list(json.loads(data)["objects"])
     assert len(described.cameras) == 1
@@ -52,13 +52,13 @@ def test_what_may_be_missing_has_the_published_default() -> None:
     del scene["objects"]["box"]["transform"]["normalize"]
     for name in ("rand_tri_diffuse_seed", "random_diffuse_max", "random_diffuse_type"):
         del scene["objects"]["box"]["material"][name]
-    (box,) = read_description(json.dumps(scene).encode(), "a.json").objects
+    (box,) = read_renderformer_json(json.dumps(scene).encode(), "a.json").objects
     assert box.transform.normalize
     assert box.material.rand_tri_diffuse_seed is None
     assert box.material.random_diffuse_max == 1
     assert box.material.random_diffuse_type == "per-shading-group"
     assert (box.remesh, box.remesh_target_face_num) == (False, 2048)
-    (box,) = read_description(changed(*MATERIAL, rand_tri_diffuse_seed=0), "a.json").objects
+    (box,) = read_renderformer_json(changed(*MATERIAL, rand_tri_diffuse_seed=0), "a.json").objects
     assert box.material.rand_tri_diffuse_seed == 0
 
 
@@ -68,7 +68,7 @@ def test_unknown_fields_are_named_and_harmless() -> None:
     scene["objects"]["box"]["material"]["ruoghness"] = 1
     scene["objects"]["box"]["transform"]["line\nbreak"] = 1
     scene["cameras"][0]["near"] = 0.1
-    described = read_description(json.dumps(scene).encode(), "a.json")
+    described = read_renderformer_json(json.dumps(scene).encode(), "a.json")
     assert sorted(described.unknown_fields) == sorted(
         [
             "environment",
@@ -77,7 +77,7 @@ def test_unknown_fields_are_named_and_harmless() -> None:
             "cameras[0].near",
         ]
     )
-    assert described.objects == read_description(changed(), "a.json").objects
+    assert described.objects == read_renderformer_json(changed(), "a.json").objects
 
 
 REFUSED = [
@@ -137,7 +137,7 @@ REFUSED = [
 @for_each("data, message", REFUSED)
 def test_what_is_wrong_is_named(data: bytes, message: str) -> None:
     with pytest.raises(TrilightError) as caught:
-        read_description(data, "a.json")
+        read_renderformer_json(data, "a.json")
     assert message in str(caught.value)
     assert str(caught.value).startswith("a.json: ")
     assert "\n" not in str(caught.value)
@@ -163,7 +163,7 @@ def test_every_field_is_looked_at() -> None:
 
 def _expect_refusal(data: bytes) -> None:
     with pytest.raises(TrilightError):
-        read_description(data, "a.json")
+        read_renderformer_json(data, "a.json")
 
 
 def test_a_scene_by_hand(tmp_path: Path) -> None:

@@ -17,7 +17,7 @@ from pxr import Gf, Usd, UsdGeom, UsdLux, UsdShade
 from pipeline.assets.source_materials.skin import _parts
 from pipeline.assets.source_materials.source_surface import FacePoints, SourceSurface
 from pipeline.exchange.open_scene import load_source, scene_source
-from pipeline.exchange.renderformer_json import read_description
+from pipeline.exchange.renderformer_json import read_renderformer_json
 from pipeline.foreign.gltf.document import data_uri_bytes, local_path
 from pipeline.foreign.limits import ReadLimits
 from pipeline.foreign.material import LEAST_ROUGHNESS, SourceMaterial
@@ -534,7 +534,7 @@ def usd(folder: Path, where: str, name: str, value: Any) -> str:
 
 def scene(folder: Path, where: str, name: str, value: Any) -> str:
     fields = MATERIAL if where == "material" else TRANSFORM
-    read_description(changed(*fields, **{name: value}), f"{name}.json")
+    read_renderformer_json(changed(*fields, **{name: value}), f"{name}.json")
     return ""
 
 

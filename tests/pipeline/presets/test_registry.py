@@ -16,7 +16,7 @@ from pipeline.presets.renderformer import RENDERFORMER_PRESETS
 from pipeline.presets.settings import DatasetSettings, differences
 from pipeline.renders.settings import NoiseTargets
 from scene_templates import placement
-from scene_templates import sample_emitters as emitters
+from scene_templates import sample_lights as emitters
 from scene_templates.rooms import PATCH_FACES, QUADS, SIDES
 from scene_templates.sample_camera import sample_camera
 from scene_templates.settings import SceneSettings

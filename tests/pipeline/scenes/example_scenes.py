@@ -18,7 +18,7 @@ from pipeline.exchange.from_description import (
     SceneDescription,
     scene_from_description,
 )
-from pipeline.exchange.renderformer_json import read_description
+from pipeline.exchange.renderformer_json import read_renderformer_json
 from pipeline.exchange.scene_files import build_scene
 from storage.records.scene import Scene
 
@@ -137,7 +137,7 @@ def described(*path: str | int, **change: Any) -> SceneDescription:
     light["material"]["emissive"] = [10.0, 5.0, 0.0]
     light["transform"]["translation"] = [0, 0, 3]
     scene["objects"]["light"] = light
-    return read_description(json.dumps(scene).encode(), "a.json")
+    return read_renderformer_json(json.dumps(scene).encode(), "a.json")
 
 
 def loaded(mesh: trimesh.Trimesh, uid: str = "box.obj") -> LoadedMesh:

@@ -63,7 +63,7 @@ class LightSettings:
     distribution."""
 
 
-def sample_emitters(
+def sample_lights(
     rng: np.random.Generator,
     settings: LightSettings,
     sector: Sector,
