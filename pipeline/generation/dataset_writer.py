@@ -244,7 +244,7 @@ class DatasetWriter:
     def unfinished_shards(self, requested: range | None = None) -> list[int]:
         """Return the unfinished or growing shards among the requested ones; by default of all.
 
-        To resume is to skip finished shards. The cost depends on the number of requested
+        To resume is to skip shards already finished. The cost depends on the number of requested
         shards alone.
         """
         self._shards.publish_all()

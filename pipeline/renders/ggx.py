@@ -4,7 +4,8 @@
 
 D is that of GGX and G2 the height-correlated Smith term (Heitz 2014), alpha = roughness^2; the
 scale gives back what single scattering loses (storage.optics.multiscatter). This is the material
-of Cycles with its "Multiscatter GGX" and a constant colour. The diffuse lobe is reciprocal, the
+of Cycles with its "Multiscatter GGX" and a constant colour, and Mitsuba's `diffuse` and
+`roughconductor` together, but for Fresnel. The diffuse lobe is reciprocal, the
 specular one is not, because its scale depends on the viewer's side alone: a path from a light must
 say which side that is. Directions are in the shading frame, the normal is +z.
 """

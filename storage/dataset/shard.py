@@ -40,7 +40,7 @@ def write_shard(path: Path, samples: Iterable[tuple[str, Mapping[str, bytes]]]) 
 
 
 def write_tar(stream: BinaryIO, samples: Iterable[tuple[str, Mapping[str, bytes]]]) -> None:
-    """Write samples to an open file as WebDataset reads them, and with fixed metadata."""
+    """Write samples to an open file as webdataset's TarWriter does, but with fixed metadata."""
     written = set[str]()
     with tarfile.open(fileobj=stream, mode="w|") as archive:
         for key, members in samples:
