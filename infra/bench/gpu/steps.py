@@ -111,10 +111,6 @@ def store(path: Path = STORED) -> None:
     np.savez_compressed(path, **stored_values)
 
 
-if __name__ == "__main__":
-    store()
-
-
 SHRUNK_PX = 32
 SHRUNK_TRIANGLES = 64
 SHRUNK_SCENES = 2
@@ -379,3 +375,7 @@ def time_calls(
             torch.cuda.synchronize(device)
         times.append(time.perf_counter() - began)
     return times[warm_up:]
+
+
+if __name__ == "__main__":
+    store()
