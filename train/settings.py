@@ -275,7 +275,7 @@ def decay_start_step(settings: TrainSettings) -> int | None:
 
 
 def learning_rate(step: int, settings: TrainSettings) -> float:
-    """Return the rate of step 0 ... num_steps - 1; the first is above 0, the last the final one.
+    """Return the scheduled rate of steps 0 to num_steps - 1: the first above 0, the last final.
 
     A warm-up, then a constant rate and a decay, or one cosine. A constant rate does not depend on
     the number of steps. So until its decay begins, a run is exactly the first part of any longer

@@ -85,11 +85,11 @@ def _in_form(mesh: TriangleMesh, form: Form) -> TriangleMesh:
     if form == "source":
         return mesh
     if form == "capped":
-        return _cap_holes(mesh)
+        return _fill_holes(mesh)
     return surface_around(mesh, fills=form == "solid")
 
 
-def _cap_holes(mesh: TriangleMesh) -> TriangleMesh:
+def _fill_holes(mesh: TriangleMesh) -> TriangleMesh:
     """Return a clean mesh with each connected border closed by a fan around its middle."""
     count = len(mesh.positions)
     border = open_half_edges(mesh)
