@@ -6,7 +6,7 @@ block. `SIZES` has the named configurations.
 
 import dataclasses
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass, fields
+from dataclasses import fields
 from typing import Annotated, Any, ClassVar, Literal, NoReturn
 
 from storage.errors import TrilightError
@@ -32,33 +32,14 @@ REMOVED: Mapping[str, Any] = {"projected_freqs": 0, "texture_cells": 0, "sky_cel
 HITS_PX = 8
 """Pixels whose multiple is the width of pictures of the view stage `hits`."""
 
+_OF_HITS = frozenset({
+    "hit_anchors", "gather_rays", "pixel_width", "filter_width", "scene_tokens", "sky_rays",
+    "denoise_from_px",
+})  # fmt: skip
+"""Settings of the view stage `hits` alone."""
+
 LAYERS = 256
 """Maximum number of layers of a stage: twenty times the largest published network's."""
-
-
-@dataclass(frozen=True, kw_only=True)
-class BundleStage:
-    """View stage of ray bundles, as published."""
-
-    albedo_rays: int
-    """Rays along a side of each pixel that trace its albedo; 0 where radiance is predicted."""
-
-
-@dataclass(frozen=True, kw_only=True)
-class HitStage:
-    """View stage of traced visible surfaces; ModelConfig describes the fields."""
-
-    hit_rays: int
-    hit_anchors: int
-    gather_rays: int
-    pixel_width: int
-    filter_width: int
-    sky_rays: int
-    denoise_from_px: int
-
-    def denoises(self, resolution: int) -> bool:
-        """Return whether the light of pictures of a width is denoised before the network."""
-        return 0 < self.denoise_from_px <= resolution
 
 
 @checked("model config")
@@ -160,12 +141,14 @@ class ModelConfig:
             _wrong(f"patch_px {self.patch_px} with a dpt head", "8, which its grids multiply up to")
 
     def _check_hits(self) -> None:
-        if self.view_stage == "bundles":
-            of_hits = {"scene_tokens", *(each.name for each in fields(HitStage))} - {"hit_rays"}
-            for each in fields(self):
-                value = getattr(self, each.name)
-                if each.name in of_hits and value != each.default:
-                    _wrong(f"{each.name} {value} with view_stage bundles", f"{each.default}")
+        fixed = {"head": "linear", "window_bundles": 0, "patch_px": HITS_PX, "demodulated": False}
+        if not self.traces_hits:
+            fixed = {each.name: each.default for each in fields(self) if each.name in _OF_HITS}
+        for name, value in fixed.items():
+            if getattr(self, name) != value:
+                got = f"{name} {getattr(self, name)} with view_stage {self.view_stage}"
+                _wrong(got, f"{value}")
+        if not self.traces_hits:
             if self.demodulated != (self.hit_rays > 0):
                 expected = "1 or more" if self.demodulated else "0, or demodulated true"
                 _wrong(f"hit_rays {self.hit_rays} with view_stage bundles", expected)
@@ -175,17 +158,15 @@ class ModelConfig:
                 _wrong(f"{name} {getattr(self, name)} with view_stage hits", "1 or more")
         if self.hit_anchors % HITS_PX:
             _wrong(f"hit_anchors {self.hit_anchors}", f"a multiple of {HITS_PX}")
-        fixed = {"head": "linear", "window_bundles": 0, "patch_px": HITS_PX, "demodulated": False}
-        for name, value in fixed.items():
-            if getattr(self, name) != value:
-                _wrong(f"{name} {getattr(self, name)} with view_stage hits", f"{value}")
 
     @property
-    def stage(self) -> BundleStage | HitStage:
-        """Sizes of the view stage."""
-        if self.view_stage == "bundles":
-            return BundleStage(albedo_rays=self.hit_rays)
-        return HitStage(**{field.name: getattr(self, field.name) for field in fields(HitStage)})
+    def traces_hits(self) -> bool:
+        """True with the view stage `hits`."""
+        return self.view_stage == "hits"
+
+    def denoises(self, resolution: int) -> bool:
+        """Return whether the light of pictures of a width is denoised before the network."""
+        return 0 < self.denoise_from_px <= resolution
 
     @property
     def head_width(self) -> int:
@@ -335,13 +316,6 @@ SIZES: Registry[Callable[[], ModelConfig]] = Registry(
 and no name, so that it opens without its size being registered."""
 
 ModelConfig.PRESETS = SIZES
-
-
-def hit_stage(config: ModelConfig) -> HitStage:
-    """Return the view stage `hits`; raises TrilightError where the network has another one."""
-    if not isinstance(config.stage, HitStage):
-        _wrong(f"view_stage {config.view_stage}", "hits")
-    return config.stage
 
 
 def _check_columns(names: tuple[str, ...]) -> None:

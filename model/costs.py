@@ -13,7 +13,7 @@ from dataclasses import dataclass
 import torch
 
 from model.attention import cut_windows
-from model.config import HitStage, ModelConfig
+from model.config import ModelConfig
 from model.hits.decoder import view_flops
 from model.positions import encoded_normal_width
 from model.precision import PRECISIONS, rounded_parts
@@ -91,7 +91,7 @@ def flops(config: ModelConfig, workload: Workload) -> dict[str, int]:
     token_inputs = material_width(config.material_columns) + encoded_normal_width(
         config.normal_octaves
     )
-    if isinstance(config.stage, HitStage):
+    if config.traces_hits:
         token_inputs += SIDE_LIGHTS
     stage = {
         "triangle tokens": 2 * workload.triangles * token_inputs * d,
@@ -99,7 +99,7 @@ def flops(config: ModelConfig, workload: Workload) -> dict[str, int]:
         "triangle feed-forward": config.encoder_layers * 6 * n * d * f,
         "keys and values": config.decoder_layers * 4 * n * d * d,
     }
-    if isinstance(config.stage, HitStage):
+    if config.traces_hits:
         view = view_flops(config, n, workload.resolution)
         scene_stage = stage if config.scene_tokens else {}
         return scene_stage | {name: views * count for name, count in view.items()}

@@ -9,7 +9,6 @@ irradiance over pi; neither light is ever negative, and the network predicts bot
 Glossy reflection has no exact factor: its light contains a blurred mirror image.
 """
 
-import dataclasses
 import math
 
 import numpy as np
@@ -19,9 +18,8 @@ from torch.nn.functional import softplus
 
 from model.hits.anchors import Rays
 from model.hits.lit_scene import LitScene
-from model.hits.tracing import like, lit_scene_of
 from model.precision import without_autocast
-from model.scene_tensors import Cameras, SceneTensors
+from model.scene_tensors import Cameras
 
 _START = -1.5
 """Offset before softplus: the initial light of 0.6 in every pixel is about that of the scenes."""
@@ -43,26 +41,20 @@ def compose_radiance(light_BVRR6: Tensor, albedo_BVRR6: Tensor) -> Tensor:
         return torch.log1p(reflected[..., :3] + reflected[..., 3:]) / math.log(10)
 
 
-def with_albedo(scene: SceneTensors, resolution: int, rays_a_side: int) -> SceneTensors:
-    """Return a scene with the albedo of its views, which a trainer's threads compute ahead."""
-    albedo = _of_views(lit_scene_of(scene), scene.c2w_V44, scene.fov_deg_V, resolution, rays_a_side)
-    return dataclasses.replace(scene, albedo_VRR6=like(albedo, scene.c2w_V44))
-
-
 def albedo_of_cameras(
     scenes: tuple[LitScene, ...], cameras: Cameras, resolution: int, rays_a_side: int
 ) -> Tensor:
-    """Return the albedo [B, V, R, R, 6] that cameras of a batch see, with their device and type."""
+    """Return the albedo [B, V, R, R, 6] that cameras of a batch see, float32 on the CPU."""
     albedo = [
-        _of_views(scene, c2w_V44, fov_deg_V, resolution, rays_a_side)
+        albedo_of_views(scene, c2w_V44, fov_deg_V, resolution, rays_a_side)
         for scene, c2w_V44, fov_deg_V in zip(
             scenes, cameras.c2w_BV44, cameras.fov_deg_BV, strict=True
         )
     ]
-    return like(torch.stack(albedo), cameras.fov_deg_BV)
+    return torch.stack(albedo)
 
 
-def _of_views(
+def albedo_of_views(
     scene: LitScene, c2w_V44: Tensor, fov_deg_V: Tensor, resolution: int, rays_a_side: int
 ) -> Tensor:
     """Return the diffuse and specular albedo [V, R, R, 6] of visible surfaces.

@@ -24,7 +24,7 @@ import torch
 from numpy.typing import ArrayLike, NDArray
 from torch import Tensor
 
-from model.config import HitStage, ModelConfig, hit_stage
+from model.config import ModelConfig
 from model.hits.traced import Traced, denoise_traced
 from model.open import find_network
 from model.positions import EncodedScene
@@ -271,11 +271,11 @@ class NeuralRenderer:
             knows_sky = self.config.sky_rays
             sky = dataclasses.replace(sky, is_seen=False) if knows_sky else None
             scene = dataclasses.replace(scene, environment=sky)
-        by_hits = isinstance(self.config.stage, HitStage)
         all_lights = [LightGroup(scene=scene, fraction=1.0)]
+        traces_hits = self.config.traces_hits
         groups = [
             (_encode(self._model, group.scene, self.device), group.fraction)
-            for group in (all_lights if by_hits else light_groups(scene, lights_per_pass))
+            for group in (all_lights if traces_hits else light_groups(scene, lights_per_pass))
         ]
         return PreparedScene(groups=tuple(groups), notes=self._notes(below_sky, len(groups)))
 
@@ -302,7 +302,7 @@ class NeuralRenderer:
         angle = torch.tensor(fov_deg, dtype=torch.float32, device=self.device)
         views = prepared.views
         if resolution not in views:
-            if isinstance(self.config.stage, HitStage):
+            if self.config.traces_hits:
                 ((encoded, _),) = prepared.groups
                 views[resolution] = _TracedView(self._model, encoded, resolution)
             else:
@@ -315,8 +315,7 @@ class NeuralRenderer:
     def resolution_notes(self, resolution: int) -> tuple[str, ...]:
         """Return sentences on what pictures of this width by this network lack."""
         trained = self.trained.resolution
-        by_pixel = isinstance(self.config.stage, HitStage)
-        if trained is None or resolution == trained or by_pixel:
+        if trained is None or resolution == trained or self.config.traces_hits:
             return ()
         return (
             f"pictures of {resolution} pixels, and the network was trained on {trained}: expect "
@@ -396,14 +395,14 @@ class _TracedView:
         self._model = model
         self._encoded = encoded
         self._resolution = resolution
-        is_recorded = any(scene.lit.place is not None for scene in encoded.traced)
+        is_recorded = any(scene.place is not None for scene in encoded.surfaces)
         self._trace = Replayed(self._tensors) if is_recorded else self._tensors
         self._decode = Replayed(self._picture) if is_recorded else self._picture
 
     def __call__(self, c2w_44: Tensor, fov_deg: Tensor) -> Tensor:
         """Return linear radiance [R, R, 3] of at least 0."""
         traced = Traced(*self._trace(c2w_44, fov_deg))
-        denoised = denoise_traced(traced, hit_stage(self._model.config))
+        denoised = denoise_traced(traced, self._model.config)
         (picture_RR3,) = self._decode(*denoised.tensors())
         return picture_RR3
 

@@ -122,7 +122,7 @@ def find_network(place: str | Path) -> NetworkFile:
         return NetworkFile(
             path=checkpoint,
             trained=TrainedRange(resolution=width if isinstance(width, int) else None),
-            any_width=config.view_stage == "hits",
+            any_width=config.traces_hits,
             open=read.network,
         )
     weights = _weights_file(source, path)
@@ -131,7 +131,7 @@ def find_network(place: str | Path) -> NetworkFile:
         return NetworkFile(
             path=weights,
             trained=trained_range(metadata) or TrainedRange(),
-            any_width=decode_config(metadata[CONFIG_KEY], str(weights)).view_stage == "hits",
+            any_width=decode_config(metadata[CONFIG_KEY], str(weights)).traces_hits,
             open=lambda: from_tensors(*read_tensors(weights), str(weights)),
         )
     return NetworkFile(

@@ -16,7 +16,6 @@ from model.attention import Keys, Packing, pack_lengths, pack_tokens, supports_p
 
 if TYPE_CHECKING:
     from model.hits.lit_scene import LitScene
-    from model.hits.tracing import TracedScene
 
 
 KeysValues = tuple[Tensor, Tensor]
@@ -63,10 +62,9 @@ class EncodedScene:
     space."""
     packing: Packing | None = None
     """Packing of the tokens, scene after scene in one row [1, H, P, D]; None for padded scenes."""
-    traced: "tuple[TracedScene, ...]" = ()
-    """Scenes ready for ray casting, for `hits`; empty if the views are traced already."""
     surfaces: "tuple[LitScene, ...]" = ()
-    """Scenes ready for albedo rays, for demodulated bundles; empty if the albedo is known."""
+    """Scenes ready for rays, for `hits` and demodulated bundles; empty if views are traced already.
+    """
 
     def keys(self, views: int = 1) -> Keys:
         """Return the valid keys; packed ones are repeated for each view, view after view."""

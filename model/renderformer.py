@@ -12,18 +12,12 @@ from torch import Tensor, nn
 from torch.nn.utils.rnn import pad_sequence
 
 from model.attention import Keys, Packing, pack_tokens
-from model.config import BundleStage, HitStage, ModelConfig, hit_stage
+from model.config import ModelConfig
 from model.demodulated import albedo_of_cameras, compose_radiance
 from model.hits.decoder import HitDecoder
 from model.hits.lit_scene import LitScene
 from model.hits.traced import Traced, denoise_traced
-from model.hits.tracing import (
-    TracedScene,
-    like,
-    lit_scenes,
-    traced_batch,
-    traced_cameras,
-)
+from model.hits.tracing import as_tensor, like, lit_scenes, traced_cameras
 from model.layers import TOKEN_NORM_EPS, EncoderLayer, Norm, dtype_of, run_layer
 from model.positions import (
     EncodedScene,
@@ -60,8 +54,7 @@ class TriangleTokens(nn.Module):
         self.material_norm = Norm(config.width, eps=TOKEN_NORM_EPS)
         self.normal = nn.Linear(encoded_normal_width(self.octaves), config.width)
         self.normal_norm = Norm(config.width, eps=TOKEN_NORM_EPS)
-        reads_light = isinstance(config.stage, HitStage)
-        self.light = nn.Linear(SIDE_LIGHTS, config.width) if reads_light else None
+        self.light = nn.Linear(SIDE_LIGHTS, config.width) if config.traces_hits else None
 
     def forward(
         self, material_BTM: Tensor, normals_BT33: Tensor, light_BTL: Tensor | None = None
@@ -150,7 +143,7 @@ class RenderFormer(nn.Module):
             head_width=config.head_width,
         )
         self.encoder: Any = TriangleEncoder(config, rotary) if config.scene_tokens else None
-        stage = HitDecoder if isinstance(config.stage, HitStage) else ViewDecoder
+        stage = HitDecoder if config.traces_hits else ViewDecoder
         self.decoder: Any = stage(config, rotary)
 
     def forward(self, batch: SceneBatch, resolution: int) -> Tensor:
@@ -160,42 +153,32 @@ class RenderFormer(nn.Module):
             TrilightError: the resolution is not a multiple of `config.picture_px`, or the network
                 does not support the sky of a scene.
         """
-        stage = self.config.stage
-        albedo_BVRR6 = batch.albedo_BVRR6
-        if isinstance(stage, BundleStage) and albedo_BVRR6 is None:
+        traced = batch.traced
+        if (traced if self.config.traces_hits else batch.albedo_BVRR6) is None:
             return self.decode(self.encode(batch), batch, resolution)
         self.config.require_resolution(resolution)
-        if isinstance(stage, BundleStage):
-            return self._bundles(self._encode_scenes(batch), batch, resolution, albedo_BVRR6)
-        scenes: tuple[TracedScene, ...] = ()
-        traced = batch.traced
-        if traced is None:
-            scenes = traced_batch(batch)
-            traced = traced_cameras(scenes, batch, resolution, stage)
-            traced = denoise_traced(traced, stage)
-        encoded = self._encode_scenes(batch, scenes, traced.sides_T12, traced.unit_3)
+        if traced is None or not self.config.traces_hits:
+            return self._bundles(self._encode_scenes(batch), batch, resolution, batch.albedo_BVRR6)
+        encoded = self._encode_scenes(batch, (), traced.sides_T12, traced.unit_3)
         return self.decode_traced(encoded, traced)
 
     def encode(self, batch: SceneBatch) -> EncodedScene:
         """Return the encoded scenes of a batch; its cameras are ignored."""
-        stage = self.config.stage
-        if isinstance(stage, BundleStage):
-            surfaces = lit_scenes(batch) if stage.albedo_rays else ()
-            return self._encode_scenes(batch, surfaces=surfaces)
-        scenes = traced_batch(batch)
-        sides_BT12 = pad_sequence([each.sides_T12 for each in scenes], True)
-        sides_BT12 = like(sides_BT12, batch.triangles_BT33)
-        units_B3 = like(torch.stack([each.unit_3 for each in scenes]), batch.triangles_BT33)
-        scenes = tuple(each.on(batch.triangles_BT33.device) for each in scenes)
-        return self._encode_scenes(batch, scenes, sides_BT12, units_B3)
+        scenes = lit_scenes(batch) if self.config.hit_rays else ()
+        if not self.config.traces_hits:
+            return self._encode_scenes(batch, scenes)
+        sides_BT12 = pad_sequence([as_tensor(each.light.sides_T12) for each in scenes], True)
+        units_B3 = torch.stack([as_tensor(each.light.mean_3) for each in scenes])
+        light = (like(each, batch.triangles_BT33) for each in (sides_BT12, units_B3))
+        scenes = tuple(each.on_device(batch.triangles_BT33.device) for each in scenes)
+        return self._encode_scenes(batch, scenes, *light)
 
     def _encode_scenes(
         self,
         batch: SceneBatch,
-        traced: tuple[TracedScene, ...] = (),
+        surfaces: tuple[LitScene, ...] = (),
         sides_BT12: Tensor | None = None,
         unit_B3: Tensor | None = None,
-        surfaces: tuple[LitScene, ...] = (),
     ) -> EncodedScene:
         """Encode scenes by the view-independent stage, if there is one."""
         for sky in batch.skies or ():
@@ -219,11 +202,7 @@ class RenderFormer(nn.Module):
                 context_BNW = self.encoder(batch, places, sides_BT12, packing)
                 keys_values = self.decoder.keys_values(context_BNW, places, packing)
         return EncodedScene(
-            places=places,
-            keys_values=keys_values,
-            packing=packing,
-            traced=traced,
-            surfaces=surfaces,
+            places=places, keys_values=keys_values, packing=packing, surfaces=surfaces
         )
 
     def decode(self, scene: EncodedScene, cameras: Cameras, resolution: int) -> Tensor:
@@ -240,19 +219,19 @@ class RenderFormer(nn.Module):
             TrilightError: the resolution is no such multiple.
         """
         self.config.require_resolution(resolution)
-        stage = self.config.stage
-        if isinstance(stage, HitStage):
+        if self.config.traces_hits:
             traced = self.trace(scene, cameras, resolution)
-            return self.decode_traced(scene, denoise_traced(traced, stage))
+            return self.decode_traced(scene, denoise_traced(traced, self.config))
         albedo_BVRR6 = None
-        if rays := stage.albedo_rays:
+        if rays := self.config.hit_rays:
             albedo_BVRR6 = albedo_of_cameras(scene.surfaces, cameras, resolution, rays)
+            albedo_BVRR6 = like(albedo_BVRR6, cameras.fov_deg_BV)
         return self._bundles(scene, cameras, resolution, albedo_BVRR6)
 
     def trace(self, scene: EncodedScene, cameras: Cameras, resolution: int) -> Traced:
         """Return the traced inputs of views, for `hits`; arguments are as of `decode`."""
         with tf32(self.tf32):
-            return traced_cameras(scene.traced, cameras, resolution, hit_stage(self.config))
+            return traced_cameras(scene.surfaces, cameras, resolution, self.config)
 
     def decode_traced(self, scene: EncodedScene, traced: Traced) -> Tensor:
         """Return the pictures [B, V, R, R, 3] of traced views, denoised where the network asks."""

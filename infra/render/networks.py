@@ -3,7 +3,7 @@
 import functools
 import time
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -152,13 +152,13 @@ class DirectLightRenderer(RendererHere):
 
     def load(self, scene: Scene, name: str) -> SceneHere:
         """Sort the triangles of a scene for its rays."""
-        from model.config import hit_stage, hits_smoke
+        from model.config import hits_smoke
         from model.hits.lit_scene import LitScene
         from model.hits.radiosity import SceneLight
         from model.hits.view_inputs import Channel, view_inputs
         from storage.records.material import PUBLISHED_COLUMNS, chosen_columns
 
-        stage = hit_stage(hits_smoke())
+        config = replace(hits_smoke(), gather_rays=0)
         began = time.perf_counter()
         began_s = time.process_time()
         rows = chosen_columns(scene.materials, PUBLISHED_COLUMNS)[scene.material_index]
@@ -167,14 +167,10 @@ class DirectLightRenderer(RendererHere):
         )
         lit = LitScene(corners, normals, rows)
         dark = np.zeros((2, lit.num_triangles, 3), np.float32)
-        light = SceneLight(direct_2T3=dark, indirect_2T3=dark, mean_3=np.ones(3, np.float32))
+        lit.light = SceneLight(direct_2T3=dark, indirect_2T3=dark, mean_3=np.ones(3, np.float32))
 
         def view(camera: Camera) -> NDArray[np.float32]:
-            inputs = view_inputs(
-                lit, light, camera.c2w, camera.fov_deg, self.resolution,
-                rays_a_side=stage.hit_rays, anchors_a_side=1, gather_rays=0,
-                shades_each_ray=not stage.denoises(self.resolution),
-            )  # fmt: skip
+            inputs = view_inputs(lit, camera.c2w, camera.fov_deg, self.resolution, config)
             of_lamps = inputs.pixels[..., Channel.SHOWN_DIFFUSE]
             return of_lamps + inputs.pixels[..., Channel.DIRECT_SPECULAR]
 
@@ -191,11 +187,9 @@ def traced_network() -> "NeuralRenderer":
     Every gain is 1, nothing is added or filtered, and gathered light is weighted by the distance of
     anchors. Layers have the least possible size, so that only the tracing takes time.
     """
-    import dataclasses
-
     from model.config import VERTEX_COORDINATES, hits_smoke
 
-    smallest = dataclasses.replace(
+    smallest = replace(
         hits_smoke(), width=2 * VERTEX_COORDINATES, num_heads=1, rope_num_freqs=1,
         encoder_layers=1, decoder_layers=1, hidden_width=1, num_registers=0, pixel_width=1,
         filter_width=0, scene_tokens=False,

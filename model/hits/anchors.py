@@ -20,7 +20,6 @@ from numpy.typing import NDArray
 
 from model.hits.direct_light import chosen_lamp_light, lamp_chances, lobe_ray_weight
 from model.hits.lit_scene import LitScene, PerPoint, Points
-from model.hits.radiosity import SceneLight
 from model.hits.reflectance import gloss_at, lobe, sample_lobe
 from model.hits.vectors import Floats, at_rows, brightest, cosine_direction, dot, spread, unit
 from storage.conventions import focal_px
@@ -51,7 +50,6 @@ DEVICE_PAIRS = 2**26
 
 def outgoing_radiance(
     scene: LitScene,
-    light: SceneLight,
     points: Points,
     u_lamp: Floats,
     on_lamp: Floats,
@@ -78,7 +76,7 @@ def outgoing_radiance(
     spread_out = scene.material_at(points, "diffuse")
     spread_out = spread_out + np.where(is_mirror, np.float32(0), specular)
     sides = points.back.astype(np.intp)
-    sent: Floats = spread_out * light.but_lamps_2T3[sides, points.triangle].T
+    sent: Floats = spread_out * scene.light.but_lamps_2T3[sides, points.triangle].T
     has_lobe_ray = is_sharp & is_mirror
     keeps_width = has_lobe_ray | (is_sharp & (alpha >= SMOOTH_ALPHA))
     gloss = gloss_at(scene, points, np.where(keeps_width, np.float32(0), WIDENED_ALPHA))
@@ -88,14 +86,13 @@ def outgoing_radiance(
     rows = np.flatnonzero(is_mirror)
     if mirrors and len(rows):
         sent[:, rows] += _mirrored_radiance(
-            scene, light, points, rows, chances, (u_lamp, on_lamp), is_sharp[rows], mirrors
+            scene, points, rows, chances, (u_lamp, on_lamp), is_sharp[rows], mirrors
         )
     return sent
 
 
 def _mirrored_radiance(
     scene: LitScene,
-    light: SceneLight,
     points: Points,
     rows: NDArray[np.intp],
     chances: Floats,
@@ -110,9 +107,7 @@ def _mirrored_radiance(
     gloss = gloss_at(scene, mirror_points)
     onward, weight = sample_lobe(gloss, mirror_points, on_lamp)
     beyond, is_hit = scene.meet(scene.everything, mirror_points.start(onward), onward)
-    seen = outgoing_radiance(
-        scene, light, beyond, u_lamp, on_lamp[::-1], is_sharp, mirrors=mirrors - 1
-    )
+    seen = outgoing_radiance(scene, beyond, u_lamp, on_lamp[::-1], is_sharp, mirrors=mirrors - 1)
     lit = np.flatnonzero(is_sharp & is_hit & scene.emits[beyond.triangle])
     if len(lit) and len(scene.lamps):  # on a GPU, `lit` are all rows
         some = mirror_points.only(lit)
@@ -223,12 +218,7 @@ def anchor_pixels(coverage_RR: NDArray[np.float32], anchors_a_side: int) -> NDAr
 
 
 def gathered_at(
-    scene: LitScene,
-    light: SceneLight,
-    hits: CameraHits,
-    anchor: NDArray[np.int64],
-    gather_rays: int,
-    seed: int,
+    scene: LitScene, hits: CameraHits, anchor: NDArray[np.int64], gather_rays: int, seed: int
 ) -> Floats:
     """Return irradiance over pi from other surfaces [A, 3] at the first thing in anchors' pixels.
 
@@ -253,13 +243,11 @@ def gathered_at(
         rows = np.flatnonzero(in_group)
         if len(rows):
             points = scene.points(np.maximum(triangle[rows], 0), uv[:, rows], direction[:, rows])
-            total[:, rows] = _gather_light(scene, light, points, shift[:, rows], gather_rays)
+            total[:, rows] = _gather_light(scene, points, shift[:, rows], gather_rays)
     return total.T.copy()
 
 
-def _gather_light(
-    scene: LitScene, light: SceneLight, points: Points, shift: Floats, gather_rays: int
-) -> Floats:
+def _gather_light(scene: LitScene, points: Points, shift: Floats, gather_rays: int) -> Floats:
     """Return the means [3, P] over rays; `shift` [5, P] are uniform numbers."""
     count = shift.shape[1]
     owner = np.tile(np.arange(count), gather_rays)
@@ -277,7 +265,7 @@ def _gather_light(
         direction = cosine_direction(u[:2, part], anchor_points.normal, anchor_points.edge)
         beyond, is_hit = scene.meet(scene.everything, anchor_points.start(direction), direction)
         spreads = np.zeros_like(is_hit)
-        radiance = outgoing_radiance(scene, light, beyond, u_lamp[part], u[2:, part], spreads)
+        radiance = outgoing_radiance(scene, beyond, u_lamp[part], u[2:, part], spreads)
         total[:, part] = np.where(is_hit, radiance, np.float32(0))
     return total.reshape(3, gather_rays, count).mean(axis=1)
 

@@ -20,7 +20,7 @@ from torch import Tensor, nn
 from torch.nn.functional import normalize, silu, softplus
 
 from model.attention import Keys, Packing, attend
-from model.config import HitStage, ModelConfig, hit_stage
+from model.config import ModelConfig
 from model.hits.anchors import DEVICE_BLOCK
 from model.hits.light_filter import LightFilter, filter_flops
 from model.hits.traced import INPUTS, Traced
@@ -88,13 +88,12 @@ BLOCK_PIXELS = 2**12
 def view_flops(config: ModelConfig, tokens: int, resolution: int) -> dict[str, int]:
     """Return the FLOPs of the parts of this stage for one view of a scene of so many tokens."""
     d = config.width
-    stage = hit_stage(config)
-    p = stage.pixel_width
-    a = math.gcd(stage.hit_anchors, resolution) ** 2
+    p = config.pixel_width
+    a = math.gcd(config.hit_anchors, resolution) ** 2
     asks = 4 * a * d * d + 4 * a * tokens * d if config.scene_tokens else 0
     pixel = PIXEL_DIM * p + p * p + NEIGHBOURS * (2 * p + 3) + OFFSET_DIM * p + NEIGHBOURS * 4 * 3
     pixel += (2 * p + 3) * 2 * p + 2 * p * p + p * 3 * (_GAINED + 2)
-    width = stage.filter_width
+    width = config.filter_width
     return {
         "filter": filter_flops(PIXEL_DIM, width, resolution**2) if width else 0,
         "anchors": 2 * a * ((PIXEL_DIM + 3) * d + d * d),
@@ -144,9 +143,9 @@ class AnchorLayer(nn.Module):
 class PixelHead(nn.Module):
     """Pixels and the anchors around them -> what is learned of each pixel's light."""
 
-    def __init__(self, config: ModelConfig, stage: HitStage) -> None:
+    def __init__(self, config: ModelConfig) -> None:
         super().__init__()
-        width = stage.pixel_width
+        width = config.pixel_width
         self.told = nn.Linear(PIXEL_DIM, width)
         self.query = nn.Linear(width, width)
         self.key = nn.Linear(config.width, width)
@@ -213,13 +212,12 @@ class HitDecoder(nn.Module):
         self.config = config
         self.rotary = rotary
         self.recompute = False
-        stage = hit_stage(config)
-        self.filter = LightFilter(PIXEL_DIM, stage.filter_width) if stage.filter_width else None
+        self.filter = LightFilter(PIXEL_DIM, config.filter_width) if config.filter_width else None
         self.told = nn.Linear(PIXEL_DIM + 3, config.width)
         self.anchors = nn.Linear(config.width, config.width)
         self.layers = nn.ModuleList(AnchorLayer(config) for _ in range(config.decoder_layers))
         self.norm = Norm(config.width, eps=LAYER_NORM_EPS)
-        self.head = PixelHead(config, stage)
+        self.head = PixelHead(config)
 
     def keys_values(
         self, context_BNW: Tensor, places: TokenPositions, packing: Packing | None = None
@@ -267,7 +265,7 @@ class HitDecoder(nn.Module):
             lights = torch.log1p(4 * torch.cat([light, mirrored], dim=-1))
             return torch.cat([surface, lights, available], dim=-1)
 
-        is_denoised = hit_stage(self.config).denoises(pixels.shape[2])
+        is_denoised = self.config.denoises(pixels.shape[2])
         if self.filter is not None and not is_denoised:
             albedo = pixels[..., Channel.SPECULAR] * pixels[..., Channel.COVERAGE]
             views = mirrored.shape[:2]

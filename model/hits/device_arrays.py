@@ -6,6 +6,7 @@ may be recorded as one graph: rows that a mask chooses are all rows, and what is
 that it leaves out is dropped where it would be stored (`MaskedRows`).
 """
 
+import copy
 import operator
 from collections.abc import Callable
 from typing import Any
@@ -17,6 +18,7 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from storage.digests import sha256_hex
+from storage.records.environment import Environment
 
 _TYPES = {
     np.dtype(np.float32): torch.float32,
@@ -41,6 +43,20 @@ class DevicePlace:
             copy = np.array(array, dtype=None if array.dtype in _TYPES else np.int64)
             self._held[key] = torch.from_numpy(copy).to(self.device)
         return self._held[key]
+
+    def moved(self, holder: Any, but: tuple[str, ...] = ()) -> Any:
+        """Return a copy of an object whose arrays, and those of its records, are here.
+
+        Args:
+            holder: not changed.
+            but: names of arrays that stay on the host.
+        """
+        moved = copy.copy(holder)
+        for name, each in vars(holder).items():
+            if name not in but and isinstance(each, np.ndarray | Environment):
+                new = self.array(each) if isinstance(each, np.ndarray) else self.moved(each)
+                object.__setattr__(moved, name, new)  # of a frozen record too
+        return moved
 
     def array(self, array: NDArray) -> Any:
         """Return a `DeviceArray` of an array of the host, held by nothing else."""

@@ -1,16 +1,16 @@
 """`LitScene`: the triangles of a scene as rays need them, with their lobes and their emission."""
 
-import copy
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 from functools import cached_property
-from typing import Any, Literal, Self
+from typing import TYPE_CHECKING, Any, Literal, Self
 
 import numpy as np
 import torch
 from numpy.typing import NDArray
 
 from model.hits.device_arrays import DeviceArray, DevicePlace
+from model.hits.device_rays import DeviceTriangles, compiled_kernel
 from model.hits.sky_sampler import SkySampler
 from model.hits.textures import DeviceTextures, SurfaceTextures
 from model.hits.vectors import Floats, as_rows, at_rows, brightest, dot, unit
@@ -19,6 +19,13 @@ from storage.optics.multiscatter import scattered_again
 from storage.raycast.caster import RayCaster, RayHits, Triangles
 from storage.records.environment import Environment
 from storage.records.material import EMISSION, ROUGHNESS
+
+if TYPE_CHECKING:
+    from model.hits.radiosity import SceneLight
+
+MOST_LAMPS = 2**11
+"""Emitting triangles with which a scene's rays are traced by a GPU: their random numbers take 1 GB
+at 256 pixels, and 4 GB at 512."""
 
 _OFFSET = np.float32(1500 * 2.0**-24)
 """Distance from a surface at which rays start, as a fraction of 1 m plus their distance from the
@@ -164,26 +171,41 @@ class LitScene:
         """The GPU where its rays are traced; None: the CPU."""
         return None if self.place is None else self.place.device
 
+    def on_device(self, device: torch.device) -> "LitScene":
+        """Return the scene on a GPU that traces its rays; itself where none does.
+
+        Scenes with thousands of lamps stay with the CPU.
+        """
+        if len(self.lamps) > MOST_LAMPS or compiled_kernel(device) is None:
+            return self
+        return self.on(DevicePlace(device), DeviceTriangles)
+
     def on(self, place: DevicePlace, caster: Callable[..., RayCaster]) -> "LitScene":
-        """Return the scene on a device, where `caster` prepares its rays."""
-        moved = copy.copy(self)
-        for name, table in vars(self).items():
-            if isinstance(table, np.ndarray) and name not in ("lamps", "_corner_rows"):
-                setattr(moved, name, place.array(table))
+        """Return the scene and its light on a device, where `caster` prepares its rays."""
+        moved = place.moved(self, but=("lamps", "_corner_rows"))
         moved.place = place
+        moved.light = place.moved(self.light)
         if self.textures is not None:
             moved.textures = DeviceTextures(self.textures, place)
         if self.sky is not None:
-            moved.drawn_sky = self.drawn_sky.on(place)
+            moved.drawn_sky = place.moved(self.drawn_sky)
         moved.seen = caster(self._corner_rows, np.flatnonzero(~self.emits), place)
         moved.everything = caster(self._corner_rows, np.arange(self.num_triangles), place)
-        return moved
+        scene: LitScene = moved
+        return scene
 
     def here(self, array: NDArray) -> Any:
         """Return an array of the host where the scene's tables are."""
         if self.place is None:
             return array
         return DeviceArray(self.place.tensor(array), self.place)
+
+    @cached_property
+    def light(self) -> "SceneLight":
+        """Light that the triangles receive."""
+        from model.hits.radiosity import scene_light  # it traces rays in scenes
+
+        return scene_light(self)
 
     @cached_property
     def drawn_sky(self) -> SkySampler:

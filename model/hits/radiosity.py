@@ -56,9 +56,11 @@ class SceneLight:
             return self.indirect_2T3
         return self.indirect_2T3 + self.sky_2T3
 
-    @property
-    def num_triangles(self) -> int:
-        return self.direct_2T3.shape[1]
+    @cached_property
+    def sides_T12(self) -> Floats:
+        """Direct and indirect light of the front, then of the back, of each triangle."""
+        both = (self.direct_2T3, self.indirect_2T3)
+        return np.concatenate([part[side] for side in (0, 1) for part in both], axis=-1)
 
 
 LEAST_SHARE = np.float32(0.03)

@@ -5,15 +5,12 @@ that most samples hit a sun of one texel. Samples are drawn in the axes of the m
 rotated together with its map has the same noise.
 """
 
-import copy
 import dataclasses
 from functools import cached_property
-from typing import Self
 
 import numpy as np
 from numpy.typing import NDArray
 
-from model.hits.device_arrays import DevicePlace
 from model.hits.vectors import Floats, as_rows
 from storage.conventions import latlong_uv
 from storage.records.environment import Environment, row_solid_angles, texel_means
@@ -27,7 +24,8 @@ class SkySampler:
     """Sampler of an environment map that is not all black."""
 
     def __init__(self, sky: Environment) -> None:
-        self.sky = sky
+        # in double precision, in which rays are turned to the map
+        self.sky = dataclasses.replace(sky, rotation=sky.rotation.astype(np.float64))
         height, width = sky.radiance_rgb.shape[:2]
         angles = row_solid_angles(height)[:, None]
         flux = texel_means(sky.radiance_rgb.mean(axis=-1, dtype=np.float64)) * angles
@@ -37,19 +35,6 @@ class SkySampler:
         self._edges = np.cos(np.pi * np.arange(height + 1) / height)
         self._height = height
         self._width = width
-
-    def on(self, place: DevicePlace) -> Self:
-        """Return the sampler with its tables on a device."""
-        moved = copy.copy(self)
-        for name, table in {**vars(self), "_coarse": self._coarse}.items():
-            if isinstance(table, np.ndarray):
-                setattr(moved, name, place.array(table))
-            elif isinstance(table, Environment):
-                radiance_rgb = place.array(table.radiance_rgb)
-                rotation = place.array(table.rotation.astype(np.float64))
-                sky = dataclasses.replace(table, radiance_rgb=radiance_rgb, rotation=rotation)
-                setattr(moved, name, sky)
-        return moved
 
     def sample_directions(self, u: Floats) -> Floats:
         """Return unit world directions [3, P] for numbers u [2, P] in the unit square."""
@@ -65,7 +50,7 @@ class SkySampler:
         azimuth = (0.5 - (column + along.clip(0, 1)) / self._width) * 2 * np.pi
         flat = np.sqrt(np.maximum(1 - z * z, 0))
         local = np.stack([flat * np.cos(azimuth), flat * np.sin(azimuth), z])
-        return (self.sky.rotation.astype(np.float64) @ local).astype(np.float32)
+        return (self.sky.rotation @ local).astype(np.float32)
 
     def pdf(self, direction: Floats) -> Floats:
         """Return the probability density [P] of unit directions [3, P], per steradian."""

@@ -12,7 +12,7 @@ from model.hits.view_inputs import Channel
 from storage.denoiser import gpu_is_supported, open_filter
 
 if TYPE_CHECKING:  # it loads pydantic
-    from model.config import HitStage
+    from model.config import ModelConfig
 
 INPUTS = ("open", "direct", "mirrored", "gathered", "tokens")
 """Inputs that a network of hits may lack: light from lamps as if nothing stood between, with its
@@ -81,7 +81,7 @@ def stack_traced(scenes: Sequence[Traced]) -> Traced:
 _SUMMED = (Channel.SHOWN_DIFFUSE, Channel.DIRECT_SPECULAR, Channel.MIRRORED)
 
 
-def denoise_traced(traced: Traced, stage: "HitStage") -> Traced:
+def denoise_traced(traced: Traced, config: "ModelConfig") -> Traced:
     """Return views whose direct and mirrored light is filtered as one picture, if a network asks.
 
     It is in SHOWN_DIFFUSE; DIRECT_SPECULAR and MIRRORED become 0: two filters cost twice as much
@@ -90,10 +90,10 @@ def denoise_traced(traced: Traced, stage: "HitStage") -> Traced:
 
     Args:
         traced: views of one scene, or of a batch; on any device.
-        stage: of the network.
+        config: of the network.
     """
     resolution = traced.pixels_VRRC.shape[-2]
-    if not stage.denoises(resolution):
+    if not config.denoises(resolution):
         return traced
     unit = traced.unit_3[..., None, None, None, :].expand(*traced.pixels_VRRC.shape[:-3], 1, 1, 3)
     views = traced.pixels_VRRC.clone()

@@ -1,9 +1,6 @@
 """Scenes as the network has them -> traced inputs of them and of their views."""
 
 import dataclasses
-import math
-from collections.abc import Callable
-from dataclasses import dataclass, fields
 from typing import Any
 
 import numpy as np
@@ -11,13 +8,12 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from model.config import HitStage, ModelConfig, hit_stage
-from model.hits.device_arrays import DeviceArray, DevicePlace
-from model.hits.device_rays import DeviceTriangles, compiled_kernel
+from model.config import ModelConfig
+from model.demodulated import albedo_of_views
+from model.hits.device_arrays import DeviceArray
 from model.hits.lit_scene import LitScene
-from model.hits.radiosity import SceneLight, scene_light
 from model.hits.traced import INPUTS, Traced, denoise_traced, stack_traced
-from model.hits.view_inputs import ViewInputs, view_inputs
+from model.hits.view_inputs import view_inputs
 from model.scene_tensors import (
     Cameras,
     SceneBatch,
@@ -27,84 +23,7 @@ from model.scene_tensors import (
     require_known_sky,
 )
 from storage.conventions import radiance_from_log10
-from storage.raycast.caster import RayCaster
 from storage.records.material import PUBLISHED_COLUMNS, laid_out
-
-MOST_LAMPS = 2**11
-"""Emitting triangles with which a scene's rays are traced by a GPU: their random numbers take 1 GB
-at 256 pixels, and 4 GB at 512."""
-
-
-@dataclass(frozen=True, kw_only=True, eq=False)
-class TracedScene:
-    """A scene whose views can be traced."""
-
-    lit: LitScene
-    light: SceneLight
-    sides_T12: Tensor
-    """Direct and indirect light of the front, then of the back, of each triangle."""
-    unit_3: Tensor
-    """The scene's mean light (model.hits.radiosity)."""
-
-    def on(self, device: torch.device) -> "TracedScene":
-        """Return the scene on a GPU that traces its rays; itself where none does.
-
-        Scenes with thousands of lamps stay with the CPU.
-        """
-        if len(self.lit.lamps) > MOST_LAMPS or compiled_kernel(device) is None:
-            return self
-        return self.on_place(DevicePlace(device), DeviceTriangles)
-
-    def on_place(self, place: DevicePlace, caster: Callable[..., RayCaster]) -> "TracedScene":
-        """Return the scene there, with rays as `caster` prepares them."""
-        tables = {each.name: getattr(self.light, each.name) for each in fields(SceneLight)}
-        held: dict[str, Any] = {
-            name: place.array(table) for name, table in tables.items() if table is not None
-        }
-        return TracedScene(
-            lit=self.lit.on(place, caster),
-            light=SceneLight(**held),
-            sides_T12=self.sides_T12.to(place.device),
-            unit_3=self.unit_3.to(place.device),
-        )
-
-    def view(
-        self, c2w_44: Tensor, fov_deg: Tensor, resolution: int, stage: HitStage, seed: int
-    ) -> ViewInputs:
-        """Trace the inputs of one view."""
-        place = self.lit.place
-        c2w: Any = c2w_44.detach().cpu().numpy() if place is None else DeviceArray(c2w_44, place)
-        angle: Any = float(fov_deg) if place is None else DeviceArray(fov_deg, place)
-        return view_inputs(
-            self.lit,
-            self.light,
-            c2w,
-            angle,
-            resolution,
-            rays_a_side=stage.hit_rays,
-            anchors_a_side=math.gcd(stage.hit_anchors, resolution),  # it divides the width
-            gather_rays=stage.gather_rays,
-            sky_rays=stage.sky_rays,
-            shades_each_ray=not stage.denoises(resolution),
-            seed=seed,
-        )
-
-
-def traced_batch(batch: SceneBatch) -> tuple[TracedScene, ...]:
-    """Return the scenes of a batch, without their padding, ready for rays."""
-    return tuple(traced_scene(lit) for lit in lit_scenes(batch))
-
-
-def traced_scene(lit: LitScene) -> TracedScene:
-    """Return surfaces, with the light that they receive, ready for rays."""
-    light = scene_light(lit)
-    parts = [part[side] for side in (0, 1) for part in (light.direct_2T3, light.indirect_2T3)]
-    return TracedScene(
-        lit=lit,
-        light=light,
-        sides_T12=torch.from_numpy(np.concatenate(parts, axis=-1)),
-        unit_3=torch.from_numpy(light.mean_3),
-    )
 
 
 def lit_scenes(batch: SceneBatch) -> tuple[LitScene, ...]:
@@ -140,34 +59,40 @@ def with_traced(
     seed: int = 0,
     device: torch.device | None = None,
 ) -> SceneTensors:
-    """Return a scene with the traced inputs of its views; a trainer's threads do this ahead.
+    """Return a scene with what rays find of its views; a trainer's threads do this ahead.
+
+    That is Traced for `hits`, the albedo for demodulated bundles, and nothing for other networks.
 
     Args:
         scene, resolution, config: of the views.
         seed: of the noise: a network that saw one noise alone might learn it.
-        device: what traces, if it can; the result is where the scene is.
+        device: what traces `hits`, if it can; the result is where the scene is.
     """
+    if not config.hit_rays:
+        return scene
+    lit = lit_scene_of(scene)
+    if not config.traces_hits:
+        cameras = scene.c2w_V44, scene.fov_deg_V
+        albedo_VRR6 = albedo_of_views(lit, *cameras, resolution, config.hit_rays)
+        return dataclasses.replace(scene, albedo_VRR6=like(albedo_VRR6, scene.c2w_V44))
     require_known_sky(scene.sky, config)
-    ready = traced_scene(lit_scene_of(scene))
     if device is not None:
-        ready = ready.on(device)
-    cameras = [each.to(ready.unit_3.device) for each in (scene.c2w_V44, scene.fov_deg_V)]
-    stage = hit_stage(config)
-    traced = traced_views(ready, cameras[0], cameras[1], resolution, stage, seed)
+        lit = lit.on_device(device)
     place = scene.c2w_V44.device
-    traced = map_tensors(denoise_traced(traced, stage), lambda each: each.to(place))
+    traced = traced_views(lit, scene.c2w_V44, scene.fov_deg_V, resolution, config, seed)
+    traced = map_tensors(denoise_traced(traced, config), lambda each: each.to(place))
     return dataclasses.replace(scene, traced=traced)
 
 
 def traced_cameras(
-    scenes: tuple[TracedScene, ...], cameras: Cameras, resolution: int, stage: HitStage
+    scenes: tuple[LitScene, ...], cameras: Cameras, resolution: int, config: ModelConfig
 ) -> Traced:
     """Trace the inputs of any cameras of the scenes of a batch.
 
     It is where the cameras are, and of their type.
     """
     traced = [
-        traced_views(scene, c2w_V44, fov_deg_V, resolution, stage)
+        traced_views(scene, c2w_V44, fov_deg_V, resolution, config)
         for scene, c2w_V44, fov_deg_V in zip(
             scenes, cameras.c2w_BV44, cameras.fov_deg_BV, strict=True
         )
@@ -181,28 +106,35 @@ def like(numbers: Tensor, other: Tensor) -> Tensor:
 
 
 def traced_views(
-    scene: TracedScene,
+    scene: LitScene,
     c2w_V44: Tensor,
     fov_deg_V: Tensor,
     resolution: int,
-    stage: HitStage,
+    config: ModelConfig,
     seed: int = 0,
 ) -> Traced:
     """Return the tensors of some views of a scene, where its rays are traced."""
-    views = [
-        scene.view(c2w_44, fov_deg, resolution, stage, seed)
-        for c2w_44, fov_deg in zip(c2w_V44, fov_deg_V, strict=True)
-    ]
+    place = scene.place
+    views = []
+    for c2w_44, fov_deg in zip(c2w_V44, fov_deg_V, strict=True):
+        c2w: Any = c2w_44.detach()
+        angle: Any = fov_deg
+        if place is None:
+            c2w, angle = c2w.cpu().numpy(), float(angle)
+        else:
+            c2w, angle = (DeviceArray(each.to(place.device), place) for each in (c2w, angle))
+        views.append(view_inputs(scene, c2w, angle, resolution, config, seed))
+    given_VI = np.ones((len(views), len(INPUTS)), np.float32)
     return Traced(
-        sides_T12=scene.sides_T12,
-        unit_3=scene.unit_3,
-        pixels_VRRC=_stack([view.pixels for view in views]),
-        anchor_VA=_stack([view.anchor for view in views]),
-        gathered_VA3=_stack([view.gathered for view in views]),
-        given_VI=torch.ones(len(views), len(INPUTS), device=scene.unit_3.device),
+        sides_T12=as_tensor(scene.light.sides_T12),
+        unit_3=as_tensor(scene.light.mean_3),
+        pixels_VRRC=as_tensor(np.stack([view.pixels for view in views])),
+        anchor_VA=as_tensor(np.stack([view.anchor for view in views])),
+        gathered_VA3=as_tensor(np.stack([view.gathered for view in views])),
+        given_VI=as_tensor(scene.here(given_VI)),
     )
 
 
-def _stack(arrays: list[NDArray]) -> Tensor:
-    stacked: Any = np.stack(arrays)
-    return stacked.tensor if isinstance(stacked, DeviceArray) else torch.from_numpy(stacked)
+def as_tensor(array: NDArray | DeviceArray) -> Tensor:
+    """Return the tensor of an array of the host, in whose memory it is, or of a device."""
+    return array.tensor if isinstance(array, DeviceArray) else torch.from_numpy(array)

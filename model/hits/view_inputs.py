@@ -6,8 +6,9 @@ anchors, a grid over the picture. Mirrors reflect every ray of a pixel, since wh
 edges too; of a rougher surface one ray stands for all, unless nothing denoises the picture.
 """
 
+import math
 from dataclasses import dataclass, replace
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -26,12 +27,14 @@ from model.hits.anchors import (
 from model.hits.device_arrays import DeviceArray
 from model.hits.direct_light import DirectLight, direct_light, lobe_ray_weight, no_light
 from model.hits.lit_scene import LitScene, PerPoint, Points
-from model.hits.radiosity import SceneLight
 from model.hits.reflectance import Gloss, gloss_at, lobe, sample_lobe
 from model.hits.sky_light import add_sky_light, escaped_light
 from model.hits.vectors import Floats, at_rows, brightest, dot, spread
 from model.replayed import aside
 from storage.seeds import rng_for
+
+if TYPE_CHECKING:  # it loads pydantic
+    from model.config import ModelConfig
 
 
 class Channel:
@@ -88,16 +91,10 @@ class ViewInputs:
 
 def view_inputs(
     scene: LitScene,
-    light: SceneLight,
     c2w: Floats,
     fov_deg: Any,
     resolution: int,
-    *,
-    rays_a_side: int,
-    anchors_a_side: int,
-    gather_rays: int,
-    sky_rays: int = 0,
-    shades_each_ray: bool = False,
+    config: "ModelConfig",
     seed: int = 0,
 ) -> ViewInputs:
     """Trace the inputs of a view; equal arguments give equal numbers.
@@ -106,18 +103,17 @@ def view_inputs(
         c2w: [4, 4] of the camera.
         fov_deg: its full field of view.
         resolution: pixels across.
-        rays_a_side: rays along a side of each pixel.
-        anchors_a_side: anchors along a side of the picture, a divisor of the resolution.
-        gather_rays: of each anchor; 0: nothing is gathered, and nothing mirrored.
-        sky_rays: towards the sky from each point that is shaded, where the scene has a sky.
-        shades_each_ray: instead of one of a pixel that meets a single triangle.
+        config: numbers of rays and anchors, of which as many a side are taken as divide the
+            resolution. Without gather_rays nothing is gathered, and nothing mirrored. Each ray of
+            a pixel is shaded where nothing denoises pictures of this width.
         seed: of the noise, which stays where it is on the picture from view to view.
     """
-    rays = Rays(c2w, fov_deg, resolution, rays_a_side)
+    rays = Rays(c2w, fov_deg, resolution, config.hit_rays)
     hits = camera_hits(scene, rays)
-    anchor = anchor_pixels(hits.coverage.reshape(resolution, resolution), anchors_a_side)
+    coverage_RR = hits.coverage.reshape(resolution, resolution)
+    anchor = anchor_pixels(coverage_RR, math.gcd(config.hit_anchors, resolution))
     with aside(scene.device) as join_gathered:
-        gathered = gathered_at(scene, light, hits, anchor, gather_rays, seed)
+        gathered = gathered_at(scene, hits, anchor, config.gather_rays, seed)
     rng = rng_for(seed, "hits", resolution)
     noise = _Noise(
         on_lamps=scene.here(rng.random((2, len(scene.lamps), resolution**2), np.float32)),
@@ -129,10 +125,9 @@ def view_inputs(
         ),
     )
     sums = np.zeros_like(noise.chance, shape=(NUM_CHANNELS, resolution**2))
-    counts = _RayCounts(sky=sky_rays, lobe=int(gather_rays > 0), shades_each_ray=shades_each_ray)
     for part in blocks(scene, resolution**2):
         of_part = hits.only(part), noise.only(part)
-        _add_pixels(sums[:, part], scene, light, rays, *of_part, counts)
+        _add_pixels(sums[:, part], scene, rays, *of_part, config)
     join_gathered()
     return ViewInputs(
         pixels=_average_rays(sums, rays.rays_per_pixel)
@@ -155,26 +150,20 @@ class _Noise(PerPoint):
     """[2, P] for rays to the sky; None without a sky."""
 
 
-@dataclass(frozen=True, kw_only=True)
-class _RayCounts:
-    """Rays of each point that is shaded, and whether each ray of a pixel has a point."""
-
-    sky: int
-    lobe: int
-    shades_each_ray: bool
-
-
 def _add_pixels(
     sums: Floats,
     scene: LitScene,
-    light: SceneLight,
     rays: Rays,
     hits: CameraHits,
     noise: _Noise,
-    counts: _RayCounts,
+    config: "ModelConfig",
 ) -> None:
     """Add what rays find of a block of pixels to its sums [40, P]; on a GPU, in two branches."""
-    block, by_lobe, shading = _shading_points(scene, hits, noise.chance[5], sums, counts)
+    has_lobe_rays = config.gather_rays > 0
+    shades_each = not config.denoises(rays.resolution)
+    block, by_lobe, shading = _shading_points(
+        scene, hits, noise.chance[5], sums, has_lobe_rays, shades_each
+    )
     if not len(block.pixel):
         return
     with aside(scene.device) as join_direct:
@@ -183,21 +172,21 @@ def _add_pixels(
         def on_lamps(some: slice) -> Floats:
             return spread(at_rows(noise.on_lamps[:, some], block.pixel), block.ray_index)
 
-        lit = direct_light(scene, block.points, block.gloss, on_lamps, lobe_rays=counts.lobe)
+        lit = direct_light(scene, block.points, block.gloss, on_lamps, lobe_rays=int(has_lobe_rays))
         _add_light(block, scene, lit)
         if noise.to_sky is not None:
             lit = no_light(block.points)
             shift = noise.to_sky[:, block.pixel]
             add_sky_light(
                 lit, scene, block.points, block.gloss, shift, block.ray_index,
-                rays=counts.sky, lobe_rays=counts.lobe,
+                rays=config.sky_rays, lobe_rays=int(has_lobe_rays),
             )  # fmt: skip
             _add_light(block, scene, lit)
-    if counts.lobe:
+    if has_lobe_rays:
         u = at_rows(noise.chance[:5], by_lobe.pixel)
         u[:2] = spread(u[:2], by_lobe.ray_index)
         u[3:] = spread(u[3:], by_lobe.ray_index)
-        _add_lobe_rays(by_lobe, scene, light, u, shading, counts.sky)
+        _add_lobe_rays(by_lobe, scene, u, shading, config.sky_rays)
     join_direct()
     if by_lobe.sums is not sums:
         sums[:] += by_lobe.sums
@@ -255,7 +244,8 @@ def _shading_points(
     hits: CameraHits,
     chance: NDArray[np.float32],
     sums: Floats,
-    counts: _RayCounts,
+    has_lobe_rays: bool,
+    shades_each: bool,
 ) -> tuple[_Block, _Block, Floats]:
     """Return the points of a block of pixels that are lit, and those whose lobes send a ray.
 
@@ -272,10 +262,10 @@ def _shading_points(
     is_one = (triangle == triangle[0]).all(axis=0)
     if scene.textures is not None:
         is_one &= ~scene.textures.is_textured[triangle[0]]
-    if counts.shades_each_ray:
+    if shades_each:
         is_one &= False
     sends_one = is_one
-    if counts.lobe:
+    if has_lobe_rays:
         is_mirror = (scene.alpha < SMOOTH_ALPHA) & (brightest(scene.specular) > DIMMEST)
         sends_one = is_one & ~is_mirror[triangle[0]]
     stands = (triangle >= 0) & (alone | ~sends_one)
@@ -298,7 +288,7 @@ def _shading_points(
         weight=weight,
     )
     by_lobe = replace(lit, weight=np.where(sends_one[pixel], chosen, is_there))
-    each_alpha = np.float32(np.inf) if counts.shades_each_ray else SMOOTH_ALPHA
+    each_alpha = np.float32(np.inf) if shades_each else SMOOTH_ALPHA
     shading = np.where(by_lobe.gloss.alpha < each_alpha, by_lobe.weight, chosen)
     if scene.place is None:
         return lit.only(np.flatnonzero(weight)), by_lobe, shading
@@ -330,7 +320,6 @@ def _add_light(block: _Block, scene: LitScene, lit: DirectLight) -> None:
 def _add_lobe_rays(
     block: _Block,
     scene: LitScene,
-    light: SceneLight,
     u: NDArray[np.float32],
     shading: NDArray[np.float32],
     sky_rays: int,
@@ -377,7 +366,7 @@ def _add_lobe_rays(
         rows = some[shaded]
         is_sharp = gloss.alpha[shaded] < SMOOTH_ALPHA
         seen = beyond.only(shaded)
-        radiance = outgoing_radiance(scene, light, seen, u[2, rows], u[3:5, rows], is_sharp)
+        radiance = outgoing_radiance(scene, seen, u[2, rows], u[3:5, rows], is_sharp)
         # `add` multiplies by the rays whose lamps a point stands for
         counts = shading[rows] / np.maximum(block.weight[rows], np.float32(1))
         block.add(Channel.MIRRORED, radiance * at_rows(arrives, shaded) * counts, rows)

@@ -19,7 +19,8 @@ from torch.nn.functional import interpolate
 
 from model import inference
 from model.config import ModelConfig, smoke
-from model.demodulated import compose_radiance, with_albedo
+from model.demodulated import compose_radiance
+from model.hits.tracing import with_traced
 from model.inference import LightGroup, NeuralRenderer, light_groups
 from model.renderformer import RenderFormer, radiance
 from model.scene_tensors import SceneTensors, scene_tensors
@@ -298,7 +299,8 @@ def with_albedos(scene: Scene, diffuse: float, specular: float) -> Scene:
 
 def test_one_ray_a_pixel_sees_the_albedo_that_the_pixel_sees_first() -> None:
     scene = corner()
-    seen = with_albedo(scene_tensors(scene), 32, 1).albedo_VRR6
+    one_ray = dataclasses.replace(DEMODULATED, hit_rays=1)
+    seen = with_traced(scene_tensors(scene), 32, one_ray).albedo_VRR6
     assert seen is not None
     found = first_hits(scene, view=0, resolution=32)
     materials = np.append(scene.materials[scene.material_index], np.zeros((1, 10)), axis=0)
@@ -312,7 +314,9 @@ def test_one_ray_a_pixel_sees_the_albedo_that_the_pixel_sees_first() -> None:
 def test_rays_of_a_pixel_are_averaged() -> None:
     """Four rays of a pixel are those of four pixels of a picture twice as wide."""
     tensors = scene_tensors(corner())
-    coarse, fine = with_albedo(tensors, 16, 2).albedo_VRR6, with_albedo(tensors, 32, 1).albedo_VRR6
+    coarse = with_traced(tensors, 16, DEMODULATED).albedo_VRR6
+    one_ray = dataclasses.replace(DEMODULATED, hit_rays=1)
+    fine = with_traced(tensors, 32, one_ray).albedo_VRR6
     assert coarse is not None and fine is not None
     mean = fine.unflatten(2, (16, 2)).unflatten(1, (16, 2)).mean(dim=(2, 4))
     # rays through one place, rounded otherwise, may pass an edge on the other side
@@ -324,7 +328,7 @@ def test_what_reflects_nothing_and_the_background_are_black(config: ModelConfig)
     model, scene = awake(config, torch.float32), corner()
     assert (picture(model, with_albedos(scene, 0, 0)) == 0).all()
     shown = picture(model, scene)
-    tensors = with_albedo(scene_tensors(scene), RESOLUTION, config.hit_rays)
+    tensors = with_traced(scene_tensors(scene), RESOLUTION, config)
     assert tensors.albedo_VRR6 is not None
     is_black = (tensors.albedo_VRR6[0] == 0).all(dim=-1)
     assert (shown[is_black] == 0).all() and 0 < is_black.double().mean() < 1
@@ -367,7 +371,7 @@ def test_albedo_that_a_loader_brings_gives_the_picture_that_the_network_asks_for
     scenes = [random_scene(7, seed=1), random_scene(15, seed=2)]
 
     def brought(scene: SceneTensors) -> SceneTensors:
-        return with_albedo(scene, RESOLUTION, config.hit_rays)
+        return with_traced(scene, RESOLUTION, config)
 
     asked, given = render(model, *scenes), render(model, *map(brought, scenes))
     assert torch.equal(asked, given)

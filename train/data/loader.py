@@ -234,26 +234,12 @@ class _SceneMaker:
 
     def scene(self, visit: Visit) -> TrainingScene:
         """Return the augmented scene of a visit."""
+        from model.hits.tracing import with_traced  # it loads pydantic
+
         settings = self._settings
         seen, rng = self._usable_scene(visit)
         seen = augment_scene(seen, settings.augmentation, rng)
-        return self._with_traced_inputs(seen, rng)
-
-    def _with_traced_inputs(self, seen: TrainingScene, rng: np.random.Generator) -> TrainingScene:
-        """Return a scene with the traced inputs of its network, if it has any."""
-        settings = self._settings
-        # imported here since they load pydantic
-        from model.config import BundleStage
-        from model.demodulated import with_albedo
-        from model.hits.tracing import with_traced
-
         # after the augmentation, which therefore need not transform traced inputs
-        stage = settings.model.stage
-        if isinstance(stage, BundleStage):
-            if not stage.albedo_rays:
-                return seen
-            tensors = with_albedo(seen.tensors, settings.resolution, stage.albedo_rays)
-            return dataclasses.replace(seen, tensors=tensors)
         noise = int(rng.integers(2**31))
         tensors = with_traced(seen.tensors, settings.resolution, settings.model, noise)
         withheld = settings.augmentation.withheld_inputs

@@ -291,14 +291,9 @@ def drawn_batch(settings: TrainSettings, scenes: int) -> TrainingBatch:
 
 def _prepare(tensors: SceneTensors, model: ModelConfig, px: int) -> SceneTensors:
     """Return a scene with the inputs of its network, as the stream does."""
-    if not model.hit_rays:
-        return tensors
-    from model.demodulated import with_albedo
     from model.hits.tracing import with_traced
 
-    if model.demodulated:
-        return with_albedo(tensors, px, model.hit_rays)
-    return with_traced(tensors, px, model, 0)
+    return with_traced(tensors, px, model)
 
 
 def drawn_lpips(settings: TrainSettings, widths: tuple[int, ...] = VGG16_WIDTHS) -> Lpips | None:

@@ -1,11 +1,11 @@
 """Scenes for the tests of what is traced, as `LitScene` has them."""
 
+from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
 
 from model.hits.lit_scene import LitScene
-from model.hits.radiosity import scene_light
 from model.hits.textures import surface_textures
 from model.hits.view_inputs import Channel, ViewInputs, view_inputs
 from storage.records.environment import Environment
@@ -45,16 +45,27 @@ def corner(
 
 
 def traced(scene: Scene, resolution: int = 32, **changes: int) -> ViewInputs:
-    numbers: dict[str, Any] = {
-        "rays_a_side": 2,
-        "anchors_a_side": 8,
-        "gather_rays": 16,
-        "sky_rays": 4,
-        "seed": 0,
-    }
     lit, fov_deg = lit_scene(scene), float(scene.fov_deg[0])
-    numbers |= changes
-    return view_inputs(lit, scene_light(lit), scene.c2w[0], fov_deg, resolution, **numbers)
+    seed = changes.pop("seed", 0)
+    return view_inputs(lit, scene.c2w[0], fov_deg, resolution, rays(**changes), seed)
+
+
+def rays(
+    *,
+    rays_a_side: int = 2,
+    anchors_a_side: int = 8,
+    gather_rays: int = 16,
+    sky_rays: int = 4,
+    shades_each_ray: int = False,
+) -> Any:
+    """Stand for a network that reads so many rays, also more than one may."""
+    return SimpleNamespace(
+        hit_rays=rays_a_side,
+        hit_anchors=anchors_a_side,
+        gather_rays=gather_rays,
+        sky_rays=sky_rays,
+        denoises=lambda _: not shades_each_ray,
+    )
 
 
 def direct(inputs: ViewInputs) -> np.ndarray:

@@ -18,13 +18,13 @@ from numpy.typing import NDArray
 from torch import Tensor, nn
 from torch.utils._python_dispatch import TorchDispatchMode
 
-from model.config import ModelConfig, hit_stage
+from model.config import ModelConfig
 from model.hits import decoder
 from model.hits.decoder import _around
 from model.hits.device_arrays import DeviceArray, DevicePlace
 from model.hits.device_rays import SOURCE, DeviceTriangles, build_tree
 from model.hits.traced import INPUTS
-from model.hits.tracing import traced_scene, traced_views, with_traced
+from model.hits.tracing import traced_views, with_traced
 from model.hits.view_inputs import Channel
 from model.inference import NeuralRenderer
 from model.renderformer import RenderFormer, radiance
@@ -307,24 +307,21 @@ BELOW_SKIES = [
 
 @for_each("scene", [corner(), textured(), _below_a_lit_ball(), *BELOW_SKIES])
 def test_a_view_of_tensors_is_numpys(scene: Scene) -> None:
-    numpy_form = traced_scene(lit_scene(scene))
+    numpy_form = lit_scene(scene)
     place = DevicePlace(HOST)
-    tensor_form = numpy_form.on_place(place, _OnHost)
-    camera = torch.tensor(scene.c2w[0]), torch.tensor(float(scene.fov_deg[0]))
-    stage = hit_stage(hits_config(hit_rays=2, gather_rays=4, sky_rays=3))
-    given = (*camera, 32, stage, 0)
-    expected, got = numpy_form.view(*given), tensor_form.view(*given)
+    tensor_form = numpy_form.on(place, _OnHost)
+    config = hits_config(hit_rays=2, gather_rays=4, sky_rays=3)
+    given = torch.tensor(scene.c2w[:1]), torch.tensor(scene.fov_deg[:1]), 32
+    expected, got = (traced_views(form, *given, config) for form in (numpy_form, tensor_form))
     held = len(place._held)
     with _NothingRead():  # or it could not be recorded
-        tensor_form.view(*given)
+        traced_views(tensor_form, *given, config)
     assert len(place._held) == held
-    for name, array in vars(expected).items():
-        tensor = getattr(got, name).tensor
-        np.testing.assert_allclose(tensor.numpy(), array, rtol=1e-3, atol=2e-5, err_msg=name)
-    denoising = dataclasses.replace(stage, denoise_from_px=32)
+    for name, tensor in vars(expected).items():
+        torch.testing.assert_close(getattr(got, name), tensor, rtol=1e-3, atol=2e-5, msg=name)
+    denoising = dataclasses.replace(config, denoise_from_px=32)
     views = [
-        traced_views(form, camera[0][None], camera[1][None], 32, denoising).pixels_VRRC
-        for form in (numpy_form, tensor_form)
+        traced_views(form, *given, denoising).pixels_VRRC for form in (numpy_form, tensor_form)
     ]
     torch.testing.assert_close(views[1], views[0], rtol=1e-2, atol=1e-3)
 

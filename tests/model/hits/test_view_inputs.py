@@ -9,9 +9,8 @@ import torch
 from scipy.spatial.transform import Rotation
 from torch import Tensor
 
-from model.config import hit_stage
 from model.hits.traced import Traced, denoise_traced
-from model.hits.tracing import lit_scene_of, traced_scene, traced_views, with_traced
+from model.hits.tracing import lit_scene_of, traced_views, with_traced
 from model.hits.view_inputs import NUM_CHANNELS, Channel
 from model.inference import NeuralRenderer
 from model.renderformer import radiance
@@ -247,7 +246,7 @@ def _traced(**changes: int) -> Tensor:
 def _denoise(pixels_VRRC: Tensor, unit_3: Tensor) -> Tensor:
     empty = torch.zeros(0)
     views = Traced(empty, unit_3, pixels_VRRC, empty, empty, empty)
-    return denoise_traced(views, hit_stage(hits_config(denoise_from_px=WIDE_PX))).pixels_VRRC
+    return denoise_traced(views, hits_config(denoise_from_px=WIDE_PX)).pixels_VRRC
 
 
 def _light(pixels: Tensor) -> Tensor:
@@ -294,7 +293,7 @@ def test_wide_pictures_are_denoised_wherever_their_light_is_traced() -> None:
     assert below[0] is not None and below[1] is not None
     assert torch.equal(below[0].pixels_VRRC, below[1].pixels_VRRC)
     cameras = tensors.c2w_V44[:1], tensors.fov_deg_V[:1]
-    noisy = traced_views(traced_scene(lit_scene_of(tensors)), *cameras, WIDE_PX, hit_stage(config))
+    noisy = traced_views(lit_scene_of(tensors), *cameras, WIDE_PX, config)
     wide = with_traced(tensors, WIDE_PX, config).traced
     assert wide is not None
     assert torch.equal(wide.pixels_VRRC, _denoise(noisy.pixels_VRRC, noisy.unit_3))

@@ -7,14 +7,12 @@ has these symmetries is a law of its own (tests/laws).
 
 import dataclasses
 from collections.abc import Callable
-from typing import Any
 
 import numpy as np
 import pytest
 import torch
 from numpy.typing import NDArray
 
-from model.hits.radiosity import scene_light
 from model.hits.tracing import lit_scene_of
 from model.hits.view_inputs import Channel, view_inputs
 from model.scene_tensors import SceneTensors, scene_tensors
@@ -23,7 +21,7 @@ from storage.records.sample import StoredSample, encode_sample, stored_sample
 from storage.records.scene import Scene
 from storage.seeds import rng_for
 from tests.for_each import for_each
-from tests.model.hits.kit import corner, textured
+from tests.model.hits.kit import corner, rays, textured
 from tests.model.kit import hits_config, tensors_of, tiny_config
 from tests.pipeline.renders.scene_kit import join, light, material, quad
 from tests.sky_maps import constant, smooth
@@ -191,8 +189,8 @@ def _pixels(tensors: SceneTensors, **changes: int) -> NDArray:
     """Return what rays find of the first view, 32 pixels wide."""
     lit = lit_scene_of(tensors)
     camera = tensors.c2w_V44[0].numpy(), float(tensors.fov_deg_V[0])
-    rays: dict[str, Any] = {"rays_a_side": 2, "anchors_a_side": 8, "gather_rays": 0, **changes}
-    return view_inputs(lit, scene_light(lit), *camera, 32, **rays).pixels
+    seed = changes.pop("seed", 0)
+    return view_inputs(lit, *camera, 32, rays(gather_rays=0, **changes), seed).pixels
 
 
 def _direct(tensors: SceneTensors) -> NDArray:

@@ -21,7 +21,7 @@ import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from model.demodulated import with_albedo
+from model.hits.tracing import with_traced
 from storage.dataset.dataset import Dataset
 from storage.dataset.shard import write_shard
 from storage.dataset.shard_set import OpenShard, ShardSet
@@ -159,7 +159,7 @@ def test_albedo_is_that_of_the_scene_after_its_symmetries(data: Dataset) -> None
     plain = dataclasses.replace(settings, model=tiny_config())
     pairs = zip(take(data, settings, 1)[0], take(data, plain, 1)[0], strict=True)
     for scene, other in pairs:
-        expected = with_albedo(other.tensors, 16, 2).albedo_VRR6
+        expected = with_traced(other.tensors, 16, network).albedo_VRR6
         assert expected is not None and scene.tensors.albedo_VRR6 is not None
         assert torch.equal(scene.tensors.albedo_VRR6, expected) and expected.max() > 0
         assert identity(other) == identity(dataclasses.replace(scene, tensors=other.tensors))
