@@ -101,27 +101,24 @@ class DeviceArray(NDArrayOperatorsMixin):
         return len(self.tensor)
 
     def __array_ufunc__(self, ufunc: Any, method: str, *inputs: Any, **named: Any) -> Any:
-        operation = _UFUNCS.get(ufunc.__name__)
+        operation = _UFUNCS.get(ufunc.__name__, getattr(torch, ufunc.__name__, None))
         if method != "__call__" or operation is None:
             return NotImplemented
-        operands = [_operand(each, self.place) for each in inputs]
+        operands = _operand(inputs, self.place)
         if "dtype" in named:
             operands = [each.to(_TYPES[np.dtype(named["dtype"])]) for each in operands]
         result = operation(*operands)
         target = named.get("out", (None,))[0]
         if target is None:
             return self._like(result)
-        where = named.get("where", True)
-        if where is not True:
-            result = torch.where(where.tensor, result, target.tensor)
         target.tensor = result.to(target.tensor.dtype)
         return target
 
     def __array_function__(self, function: Any, types: Any, inputs: Any, named: Any) -> Any:
-        operation = _FUNCTIONS.get(function)
+        operation = _FUNCTIONS.get(function.__name__, getattr(torch, function.__name__, None))
         if operation is None:
             return NotImplemented
-        result = operation(self.place, *inputs, **named)
+        result = operation(*_operand(inputs, self.place), **named)
         return self._like(result) if isinstance(result, Tensor) else result
 
     def __getitem__(self, key: Any) -> "DeviceArray":
@@ -182,7 +179,9 @@ class DeviceArray(NDArrayOperatorsMixin):
 
 
 def _operand(value: Any, place: DevicePlace) -> Any:
-    """Return a tensor, or a number of Python."""
+    """Return a tensor, a number of Python, or a list of these."""
+    if isinstance(value, list | tuple):
+        return [_operand(each, place) for each in value]
     if isinstance(value, DeviceArray):
         return value.tensor
     if isinstance(value, np.ndarray) and value.ndim:
@@ -212,7 +211,6 @@ _UFUNCS: dict[str, Callable] = {
     "remainder": operator.mod,
     "power": operator.pow,
     "negative": operator.neg,
-    "positive": operator.pos,
     "matmul": operator.matmul,
     "less": operator.lt,
     "less_equal": operator.le,
@@ -224,64 +222,33 @@ _UFUNCS: dict[str, Callable] = {
     "invert": operator.invert,
     "maximum": _clamp_or(torch.maximum, "min"),
     "minimum": _clamp_or(torch.minimum, "max"),
-    "absolute": torch.abs,
-    "arctan2": torch.atan2,
-    "copysign": torch.copysign,
-    "cos": torch.cos,
-    "floor": torch.floor,
-    "hypot": torch.hypot,
     "radians": torch.deg2rad,
-    "sin": torch.sin,
-    "sqrt": torch.sqrt,
-    "square": torch.square,
-    "tan": torch.tan,
 }
+"""Operations that torch has not under numpy's name, or not of numbers."""
 
 
-def _all(inputs: Any, place: DevicePlace) -> list[Tensor]:
-    return [_operand(each, place) for each in inputs]
+def _take(array: Tensor, index: Tensor, axis: int = 0) -> Tensor:
+    return array[(slice(None),) * (axis % array.ndim) + (index,)]
 
 
-def _where(place: DevicePlace, condition: Any, a: Any, b: Any) -> Tensor:
-    condition, a, b = _all((condition, a, b), place)
-    return torch.where(condition, a, b)
-
-
-def _take(place: DevicePlace, array: Any, index: Any, axis: int = 0) -> Tensor:
-    dim = axis % array.ndim
-    return _operand(array, place)[(slice(None),) * dim + (_operand(index, place),)]
-
-
-def _interp(place: DevicePlace, *inputs: Any) -> Tensor:
-    x, known, values = _all(inputs, place)
+def _interp(x: Tensor, known: Tensor, values: Tensor) -> Tensor:
     right = torch.searchsorted(known, x.contiguous()).clamp(1, len(known) - 1)
     share = ((x - known[right - 1]) / (known[right] - known[right - 1])).clamp(0, 1)
     return values[right - 1] + share * (values[right] - values[right - 1])
 
 
-def _nonzero(place: DevicePlace, mask: DeviceArray) -> tuple[NDArray, ...]:
+def _nonzero(mask: Tensor) -> tuple[NDArray, ...]:
     """Return the places of all elements: those that the mask leaves out may be given no weight."""
     return tuple(each.ravel() for each in np.indices(mask.shape))
 
 
-_FUNCTIONS: dict[Any, Callable] = {
-    np.broadcast_to: lambda place, a, shape: a.tensor.expand(shape),
-    np.clip: lambda place, a, least, most: a.tensor.clamp(least, most),
-    np.concatenate: lambda place, a, axis=0: torch.cat(_all(a, place), dim=axis),
-    np.cumsum: lambda place, a, axis: a.tensor.cumsum(dim=axis),
-    np.flatnonzero: lambda place, mask: MaskedRows(mask.tensor.flatten() != 0),
-    np.full_like: lambda place, a, value: torch.full_like(a.tensor, float(value)),
-    np.interp: _interp,
-    np.moveaxis: lambda place, a, source, target: a.tensor.movedim(source, target),
-    np.nonzero: _nonzero,
-    np.ones_like: lambda place, a: torch.ones_like(a.tensor),
-    np.searchsorted: lambda place, a, v, side="left": torch.searchsorted(
-        *_all((a, v), place), side=side
-    ),
-    np.stack: lambda place, a, axis=0: torch.stack(_all(a, place), dim=axis),
-    np.take: _take,
-    np.take_along_axis: lambda place, a, index, axis: a.tensor.gather(axis, index.tensor),
-    np.tile: lambda place, a, count: a.tensor.repeat(count),
-    np.where: _where,
-    np.zeros_like: lambda place, a, shape=None: a.tensor.new_zeros(shape or a.shape),
+_FUNCTIONS: dict[str, Callable] = {
+    "flatnonzero": lambda mask: MaskedRows(mask.flatten() != 0),
+    "interp": _interp,
+    "nonzero": _nonzero,
+    "take": _take,
+    "take_along_axis": torch.take_along_dim,
+    "tile": lambda a, count: a.repeat(count),
+    "zeros_like": lambda a, shape=None: a.new_zeros(shape or a.shape),
 }
+"""Functions that torch has not under numpy's name, or not alike."""
