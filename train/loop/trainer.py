@@ -4,12 +4,13 @@ A step is launched, and later synced: until then it is in `Trainer.pending`. Ste
 once on a CPU, at each row of the log on a GPU, and before every validation and checkpoint.
 """
 
+import json
 import math
 import time
 from collections.abc import Callable, Iterable, Iterator, Sequence
-from contextlib import contextmanager, suppress
+from contextlib import closing, contextmanager, suppress
+from dataclasses import asdict
 from functools import lru_cache
-from typing import Any
 
 import torch
 
@@ -25,57 +26,18 @@ from train.loop.recorder import Recorder
 from train.loop.step import PendingStats, Stepper, StepReport, explain_out_of_memory
 from train.loop.train_state import TrainState
 from train.loss.training_loss import TrainingLoss
-from train.monitoring.process_monitor import ProcessMonitor
+from train.monitoring.process_monitor import (
+    Spike,
+    SpikeDetector,
+    StepProfiler,
+    memory_mb,
+    merge_spikes,
+    own_seconds,
+    slowest_rank,
+)
+from train.monitoring.watchdog import Watchdog
 from train.progress import TrainProgress
 from train.settings import TrainSettings, WatchSettings, decay_start_step, learning_rate
-
-
-class Window:
-    """Accumulates steps until a row of the log is written."""
-
-    def __init__(self, reports: list[StepReport]) -> None:
-        """Begin with steps of an earlier call, whose losses count and whose time does not.
-
-        Args:
-            reports: reports of those steps, to which the caller appends further ones.
-        """
-        self._reports = reports
-        self._began = time.monotonic()
-        self.views = 0
-        """Number of views over all processes."""
-        self.waited_s = 0.0
-        """Seconds in which the network waited for data."""
-        self.flops = 0.0
-        """FLOPs of this process's scenes, without padding."""
-
-    @contextmanager
-    def pause(self) -> Iterator[None]:
-        """Exclude the time of a block from the window's, for validation and checkpoints."""
-        began = time.monotonic()
-        try:
-            yield
-        finally:
-            self._began += time.monotonic() - began
-
-    @property
-    def views_per_s(self) -> float:
-        """Views of all processes per second so far."""
-        return self.views / self._seconds()
-
-    def row(self, peak_flops_per_s: float) -> dict[str, Any]:
-        """Return the log's values of these steps; a mean is None if no step was finite."""
-        return {
-            "loss": _finite_mean(report.loss for report in self._reports),
-            "l1": _finite_mean(report.l1 for report in self._reports),
-            "grad_norm": _finite_mean(report.grad_norm for report in self._reports),
-            "views_per_s": self.views_per_s,
-            "data_wait_share": self.waited_s / self._seconds(),
-            "flops_per_s": self.flops / self._seconds(),
-            "peak_share": self.flops / self._seconds() / peak_flops_per_s,
-        }
-
-    def _seconds(self) -> float:
-        return max(time.monotonic() - self._began, 1e-9)
 
 
 def _finite_mean(values: Iterable[float]) -> float | None:
@@ -181,6 +143,10 @@ class Trainer:
         saved_step: step of the last checkpoint of this call; None before the first.
         num_reported_bad: messages about damaged data that were already reported.
         dead_start: checks once, after the warm-up, that pictures are not black.
+        found_spikes: spikes since the last row of the log.
+        slow_rank: process that the last row of the log found slow; None for none.
+        window_steps: steps since the last row of the log in this call.
+        window_flops: FLOPs of this process's scenes in them, without padding.
     """
 
     def __init__(
@@ -201,22 +167,31 @@ class Trainer:
         self.stepper = Stepper(state, objective, dist_context)
         self.copies = CopyStream(dist_context.device)
         self.dead_start = DeadStartDetector(settings)
-        self.window = Window(state.reports)
+        self.activity = self.stepper.activity
         self.pending: list[_PendingStep] = []
         self.asked_to_stop = False
         self.num_reported_bad = 0
         self.saved_step: int | None = None
         self.writing = BackgroundWriter()
-        progress = TrainProgress() if recorder is None else recorder.progress
-        self.progress = progress
-        self.watch = ProcessMonitor(
-            settings,
+        self.progress = TrainProgress() if recorder is None else recorder.progress
+        self.spikes = SpikeDetector(watched.spike_bound)
+        self.found_spikes: list[Spike] = []
+        self.slow_rank: int | None = None
+        self.window_steps = 0
+        self.window_flops = 0.0
+        self.profiler = StepProfiler(
+            watched.profile if dist_context.is_first else 0,
+            dist_context.device,
+            folder.monitoring,
+            self._note,
+        )
+        self.watchdog = Watchdog(
             watched,
-            self.stepper,
+            self.activity,
             dist_context,
-            folder,
+            folder.monitoring,
             note=self._note,
-            report_hang=progress.report_hang,
+            report_hang=self.progress.report_hang,
         )
 
     def train(self, steps: Iterator[StepScenes]) -> None:
@@ -227,10 +202,12 @@ class Trainer:
                 many steps in a row fail.
         """
         with (
-            self.watch,
+            closing(self.profiler),
+            self.watchdog,
             self.writing,
             deferred_interrupts(self.progress.report_interrupt) as asked_to_stop,
         ):
+            self.activity.pop_seconds()  # drop the time before the first step
             self._catch_up(asked_to_stop)
             while self.state.step < self.settings.num_steps:
                 self._step(steps, asked_to_stop)
@@ -258,13 +235,13 @@ class Trainer:
         """
         stopping = self.asked_to_stop
         if together or self.dist_context.world_size == 1:
-            with self.watch.exchange():
+            with self.activity.during("exchange"):
                 stopping = self.dist_context.any(asked_to_stop())
         if stopping:
             self._save_and_raise(Stopped(self.state.step))
 
     def _save_and_raise(self, reason: TrilightError) -> None:
-        with self.watch.pause("saving"):
+        with self._pause("saving"):
             if self.saved_step != self.state.step:
                 self._save()
             self.writing.wait()
@@ -273,14 +250,14 @@ class Trainer:
         raise reason
 
     def _step(self, steps: Iterator[StepScenes], asked_to_stop: Callable[[], bool]) -> None:
-        self.watch.begin_step(self.state.step + 1)
-        self.stepper.activity.begin("data")
-        wait_began_s = time.monotonic()
-        scenes = next(steps)
-        waited_s = time.monotonic() - wait_began_s
-        self.stepper.activity.begin("other")
         settings = self.settings
         step = self.state.step
+        self.watchdog.begin("step", step + 1)
+        self.profiler.begin_step(step + 1)
+        is_measured = self.dist_context.is_first and self._is_window_end(step + 1)
+        self.stepper.layers.expect_update(is_measured)
+        with self.activity.during("data"):
+            scenes = next(steps)
         with explain_out_of_memory(settings, step):
             batches = self.copies.send(scenes.batches)
             rate = learning_rate(step, settings)
@@ -291,13 +268,12 @@ class Trainer:
         self.num_reported_bad = len(messages)
         while self.stepper.remarks:
             self._note(self.stepper.remarks.pop(0))
-        self.window.views += settings.scenes_per_step * settings.views_per_scene
-        self.window.waited_s += waited_s
-        self.window.flops += sum(scene_flops(settings, count) for count in scenes.num_triangles)
+        self.window_steps += 1
+        self.window_flops += sum(scene_flops(settings, count) for count in scenes.num_triangles)
         self.state.step += 1
-        self.watch.end_step()
+        self.profiler.end_step()
         self.pending.append((self.state.step, scenes.keys, stats))
-        syncs = not self.stepper.defer_sync or self.watch.is_window_end(self.state.step)
+        syncs = not self.stepper.defer_sync or self._is_window_end(self.state.step)
         if syncs or len(self.pending) == MAX_PENDING:
             self._sync()
 
@@ -311,7 +287,7 @@ class Trainer:
         for (step, keys, _), report in zip(pending, reports, strict=True):
             self.state.reports.append(report)
             self.dead_start.add(step, report)
-            self.watch.add_report(step, report, keys)
+            self.found_spikes += self.spikes.add(step, report, keys)
             if report.applied:
                 self.state.skipped_in_a_row = 0
             else:
@@ -320,7 +296,7 @@ class Trainer:
             step=self.state.step,
             loss=reports[-1].loss,
             learning_rate=learning_rate(self.state.step - 1, self.settings),
-            views_per_s=self.window.views_per_s,
+            views_per_s=self._views_per_s(self.activity.working_seconds()),
         )
 
     def _skip(self, step: int, keys: Sequence[str]) -> None:
@@ -342,6 +318,22 @@ class Trainer:
                 "another folder, --branch."
             )
 
+    def _views_per_s(self, seconds: float) -> float:
+        """Return the views of all processes per second since the last row of the log."""
+        views = self.window_steps * self.settings.scenes_per_step * self.settings.views_per_scene
+        return views / seconds
+
+    def _is_window_end(self, step: int) -> bool:
+        """Return whether a row of the log is written after a step."""
+        return step == self.settings.num_steps or step % self.settings.log_every == 0
+
+    @contextmanager
+    def _pause(self, part: str) -> Iterator[None]:
+        """Time a block as `validation` or `saving`, in all processes, though one does the work."""
+        self.watchdog.begin(part, self.state.step)
+        with self.activity.during(part):
+            yield
+
     def _is_validation_due(self) -> bool:
         """Return whether the state's step is followed by a validation."""
         step = self.state.step
@@ -353,7 +345,7 @@ class Trainer:
             if asked_to_stop():
                 raise ValidationInterrupted
 
-        with self.window.pause(), self.watch.pause("validation"), suppress(ValidationInterrupted):
+        with self._pause("validation"), suppress(ValidationInterrupted):
             if self.recorder is not None:
                 self.recorder.validate(self.state, between)
 
@@ -361,7 +353,7 @@ class Trainer:
         """Log, validate and save if due; return whether the processes waited for each other."""
         settings = self.settings
         step = self.state.step
-        if self.watch.is_window_end(step):
+        if self._is_window_end(step):
             self._end_window()
         validates = self._is_validation_due()
         last = step == settings.num_steps
@@ -371,27 +363,63 @@ class Trainer:
         if validates:
             self._validate(asked_to_stop)
         if saves:
-            with self.window.pause(), self.watch.pause("saving"):
+            with self._pause("saving"):
                 self._save()
         return validates or saves
 
     def _end_window(self) -> None:
         """Exchange statistics with the other processes, and write the row of the log."""
-        seen, spikes = self.watch.end_window()
+        working_s = self.activity.working_seconds()
+        taken_s = self.activity.pop_seconds()
+        ours = {
+            "own_s": round(own_seconds(taken_s, self.window_steps), 4),
+            "spikes": [asdict(spike) for spike in self.found_spikes],
+        }
+        with self.activity.during("exchange"):
+            texts = self.dist_context.gather_text(json.dumps(ours))
+        by_rank = [json.loads(text) for text in texts]
+        own_s = [said["own_s"] for said in by_rank] if len(by_rank) > 1 else []
+        self._note_slow_rank(own_s)
         if self.recorder is not None:
-            for spike in spikes:
+            for spike in merge_spikes([said["spikes"] for said in by_rank]):
                 self.recorder.row(spike)
-            peak = device_peak(self.dist_context.device, PRODUCTS[self.settings.precision])
+            device = self.dist_context.device
+            flops_per_s = self.window_flops / working_s
+            reports = self.state.reports
             row = {
                 "step": self.state.step,
                 "learning_rate": learning_rate(self.state.step - 1, self.settings),
                 "skipped_steps": self.state.skipped_steps,
-                **self.window.row(peak),
+                "loss": _finite_mean(report.loss for report in reports),
+                "l1": _finite_mean(report.l1 for report in reports),
+                "grad_norm": _finite_mean(report.grad_norm for report in reports),
+                "views_per_s": self._views_per_s(working_s),
+                "data_wait_share": taken_s["data"] / working_s,
+                "flops_per_s": flops_per_s,
+                "peak_share": flops_per_s / device_peak(device, PRODUCTS[self.settings.precision]),
             }
             assert all(value is None or math.isfinite(value) for value in row.values())
+            seen = {
+                "time_s": {part: round(seconds, 4) for part, seconds in taken_s.items()},
+                "memory_mb": memory_mb(device),
+                "layers": self.stepper.layers.pop_row(),
+                **({"own_s": own_s} if own_s else {}),
+            }
             self.recorder.row({**row, **seen})
         self.state.reports = []
-        self.window = Window(self.state.reports)
+        self.found_spikes = []
+        self.window_steps = 0
+        self.window_flops = 0.0
+
+    def _note_slow_rank(self, own_s: Sequence[float]) -> None:
+        """Report a process that the others wait for, once until another one is the slowest."""
+        rank = slowest_rank(own_s)
+        if rank is not None and rank != self.slow_rank:
+            self._note(
+                f"process {rank} of {len(own_s)} is the slow one: {own_s[rank]:.2g} s of its own "
+                f"in each of the last steps, the fastest {min(own_s):.2g} s; all wait for it"
+            )
+        self.slow_rank = rank
 
     def _note(self, text: str, step: int | None = None) -> None:
         """Report a note in the first process; by default about the last step."""

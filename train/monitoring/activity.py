@@ -66,6 +66,12 @@ class Activity:
         finally:
             self.begin(before)
 
+    def working_seconds(self) -> float:
+        """Return the seconds, above 0, since `pop_seconds` without validations and checkpoints."""
+        self.begin(self.now.phase)
+        pauses_s = self._taken_s["validation"] + self._taken_s["saving"]
+        return max(sum(self._taken_s.values()) - pauses_s, 1e-9)
+
     def pop_seconds(self) -> dict[str, float]:
         """Return the seconds of each phase since the last call, and reset them."""
         self.begin(self.now.phase)
