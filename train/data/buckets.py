@@ -18,7 +18,7 @@ from torch import Tensor
 
 from model.scene_tensors import SceneBatch, batch_scenes, map_tensors
 from train.data.loader import prefetch
-from train.data.scenes import TrainingScene, with_target
+from train.data.scenes import TrainingScene
 
 MOST_WASTE = 0.05
 """Maximum extra cost by padding, as a fraction of the cost of the scenes without it."""
@@ -31,36 +31,21 @@ class TrainingBatch:
     scenes: SceneBatch
     """Input of the network, padded to the longest scene."""
     target_BVRR3: Tensor
-    """log10(1 + radiance); with `levels_BL`, int16 rows of it."""
+    """log10(1 + radiance)."""
     noise_BV: Tensor
     """Root mean square noise of the targets in log10(1 + radiance)."""
-    levels_BL: Tensor | None = None
-    """Lookup table of each scene, or [1, L] of all, as in TrainingScene; None if targets are
-    looked up already."""
     arrived: torch.cuda.Event | None = None
     """Event at the end of the copy to the GPU; None if no copy was started."""
 
     def to(self, device: torch.device) -> "TrainingBatch":
-        """Return the batch on a device, with its targets; waits for a copy that was started."""
+        """Return the batch on a device; waits for a copy that was started."""
         if self.arrived is not None:
             stream = torch.cuda.current_stream(device)
             stream.wait_event(self.arrived)
             # the memory belongs to another stream, which must not reuse it too early
             map_tensors(self, lambda tensor: _record_use(tensor, stream))
-            return dataclasses.replace(self, arrived=None)._with_targets()
-        if device.type == "cpu":
-            return self._with_targets()
-        moved = map_tensors(self, lambda tensor: tensor.to(device, non_blocking=True))
-        return moved._with_targets()
-
-    def _with_targets(self) -> "TrainingBatch":
-        """Look targets up if not done yet; the numbers equal those of `with_target`."""
-        if self.levels_BL is None:
-            return self
-        rows_BN = self.target_BVRR3.flatten(1).long()
-        target_BN = self.levels_BL.expand(len(rows_BN), -1).gather(1, rows_BN)
-        target_BVRR3 = target_BN.view(self.target_BVRR3.shape)
-        return dataclasses.replace(self, target_BVRR3=target_BVRR3, levels_BL=None)
+            return dataclasses.replace(self, arrived=None)
+        return map_tensors(self, lambda tensor: tensor.to(device, non_blocking=True))
 
 
 def _record_use(tensor: Tensor, stream: torch.cuda.Stream) -> Tensor:
@@ -95,18 +80,11 @@ def bucket_scenes(
 
 
 def collate_batch(scenes: Sequence[TrainingScene]) -> TrainingBatch:
-    """Collate scenes of equal view count; targets stay lookup rows if all of them are."""
-    levels = [scene.levels_L for scene in scenes if scene.levels_L is not None]
-    if len(levels) < len(scenes):
-        scenes = [with_target(scene) for scene in scenes]
-        levels = []
-    if levels and all(each is levels[0] for each in levels):
-        levels = levels[:1]
+    """Collate scenes of equal view count, whose targets are looked up."""
     return TrainingBatch(
         scenes=batch_scenes([scene.tensors for scene in scenes]),
         target_BVRR3=torch.stack([scene.target_VRR3 for scene in scenes]),
         noise_BV=torch.stack([scene.noise_V for scene in scenes]),
-        levels_BL=torch.stack(levels) if levels else None,
     )
 
 

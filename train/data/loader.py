@@ -11,7 +11,7 @@ import os
 import threading
 from collections import Counter, deque
 from collections.abc import Callable, Generator, Iterable, Iterator, Sequence
-from concurrent.futures import Executor, Future, ThreadPoolExecutor
+from concurrent.futures import Future, ThreadPoolExecutor
 from contextlib import closing, nullcontext
 from functools import partial
 from pathlib import Path
@@ -35,7 +35,7 @@ from train.data.order import (
     shuffled_shards,
     visits_from,
 )
-from train.data.scenes import TrainingScene, require_few_triangles, scene_of_views
+from train.data.scenes import TrainingScene, require_few_triangles, scene_of_views, with_target
 
 if TYPE_CHECKING:
     from train.settings import TrainSettings
@@ -75,21 +75,25 @@ def load_batches(
             when the stream reaches it.
     """
     rank_slice.require_equal(settings.scenes_per_step)
-    pool = ThreadPoolExecutor(workers, "decode") if workers else _InlineExecutor()
-    with OpenShards(shards) as opened, pool as decoders:
+    with OpenShards(shards) as opened, ThreadPoolExecutor(max(workers, 1), "decode") as decoders:
         maker = _SceneMaker(shards, opened, settings, unusable)
         counts = [partial(_count_samples, shards, unusable, part) for part in shards.parts]
         plan = _plan_batches(shards, counts, settings, mixture, first, rank_slice, opened)
-        waiting: deque[tuple[list[Visit], list[Future[TrainingScene]]]] = deque()
+        waiting: deque[tuple[list[Visit], list[Callable[[], TrainingScene]]]] = deque()
+
+        def begin(visit: Visit) -> Callable[[], TrainingScene]:
+            make = partial(maker.scene, visit)
+            return decoders.submit(make).result if workers else make
+
         ahead = -(-PREFETCHED_SCENES * rank_slice.world_size // settings.scenes_per_step)
         depth = ahead if workers else 0
         try:
             with closing(prefetch(plan, _plan_ahead(shards, counts, settings, mixture))) as batches:
                 for mine in batches:
-                    waiting.append((mine, [decoders.submit(maker.scene, p) for p in mine]))
+                    waiting.append((mine, [begin(visit) for visit in mine]))
                     if len(waiting) > depth:
                         visits, scenes = waiting.popleft()
-                        ready = [scene.result() for scene in scenes]
+                        ready = [scene() for scene in scenes]
                         opened.mark_read(visit.shard for visit in visits)
                         yield ready
         finally:
@@ -147,20 +151,6 @@ class OpenShards:
 def _close(future: Future[OpenShard]) -> None:
     if not future.cancel() and future.exception() is None:
         future.result().close()
-
-
-class _InlineExecutor(Executor):
-    """Executor that runs each function at once in the caller's thread."""
-
-    def submit(
-        self, function: Callable[..., Item], /, *arguments: Any, **named: Any
-    ) -> Future[Item]:
-        done: Future[Item] = Future()
-        try:
-            done.set_result(function(*arguments, **named))
-        except Exception as error:
-            done.set_exception(error)
-        return done
 
 
 def _count_samples(shards: ShardSet, unusable: BadSampleCounter, part: range, number: int) -> int:
@@ -243,7 +233,8 @@ class _SceneMaker:
         noise = int(rng.integers(2**31))
         tensors = with_traced(seen.tensors, settings.resolution, settings.model, noise)
         withheld = settings.augmentation.withheld_inputs
-        return dataclasses.replace(seen, tensors=withhold_inputs(tensors, withheld, rng))
+        tensors = withhold_inputs(tensors, withheld, rng)
+        return with_target(dataclasses.replace(seen, tensors=tensors))
 
     def _usable_scene(self, visit: Visit) -> tuple[TrainingScene, np.random.Generator]:
         """Return the drawn views of a usable sample, and the random generator of the visit."""

@@ -1,8 +1,8 @@
 """Training scenes: the tensors of a sample for one step.
 
 Most targets are half floats at the resolution of the run, with 31,744 possible values. Functions of
-a value (log10(1 + x), scaled light) are computed once for each of these and looked up per pixel on
-the network's device: the same numbers for a tenth of the work.
+a value (log10(1 + x), scaled light) are computed once for each of these and looked up per pixel:
+the same numbers for a tenth of the work.
 """
 
 import dataclasses
