@@ -3,21 +3,24 @@
 import dataclasses
 import hashlib
 import json
-from collections.abc import Iterator, Mapping
-from contextlib import contextmanager
+from collections.abc import Mapping
 from dataclasses import asdict, dataclass
 from pathlib import Path
-from typing import Any
 
 import torch
-from safetensors import SafetensorError, safe_open
-from safetensors.torch import save
+from safetensors import SafetensorError
+from safetensors.torch import load_file, save
 from torch import Tensor
 
 from model.config import REMOVED, ModelConfig
 from model.renderformer import RenderFormer
 from storage.errors import TrilightError, without_removed
-from storage.records.safe_read import MAX_HEADER_BYTES, open_plain, read_safetensors
+from storage.records.safe_read import (
+    MAX_HEADER_BYTES,
+    open_plain,
+    read_safetensors,
+    safetensors_header,
+)
 from storage.typed_json import read_json
 
 RANGE_KEY = "trilight_trained_range"
@@ -124,39 +127,29 @@ def read_tensors(path: Path) -> tuple[dict[str, Tensor], dict[str, str]]:
     Raises:
         TrilightError: the file cannot be read, is damaged, or is pickled code, which is never run.
     """
-    with _open_tensors(path) as tensors:
-        arrays = {name: tensors.get_tensor(name) for name in tensors.keys()}
-        return arrays, tensors.metadata() or {}
-
-
-def read_metadata(path: Path) -> dict[str, str]:
-    """Return the metadata of a safetensors file without its tensors; raises as `read_tensors`."""
-    with _open_tensors(path) as tensors:
-        return tensors.metadata() or {}
-
-
-@contextmanager
-def _open_tensors(path: Path) -> Iterator[Any]:
+    metadata = read_metadata(path)
     try:
-        with open_plain(path) as file:
-            start = file.read(8)
-        if start[:2] in (b"PK", b"\x80\x02", b"\x80\x04"):
-            raise TrilightError(
-                f"{path}: pickled code, which a checkpoint could run; expected safetensors. "
-                "Convert it with the tool that wrote it."
-            )
-        length = int.from_bytes(start, "little")
-        if len(start) < 8 or length > min(MAX_HEADER_BYTES, path.stat().st_size - 8):
-            raise TrilightError(
-                f"{path}: the header claims {length} bytes; expected a safetensors file with at "
-                f"most {MAX_HEADER_BYTES}."
-            )
-        with safe_open(path, "pt") as tensors:
-            yield tensors
+        return load_file(path), metadata
     except OSError as error:
         raise TrilightError(f"{path}: cannot be read ({error.strerror}).") from error
     except (SafetensorError, KeyError) as error:
         raise TrilightError(f"{path}: unreadable ({error}).") from error
+
+
+def read_metadata(path: Path) -> dict[str, str]:
+    """Return the metadata of a safetensors file without its tensors; raises as `read_tensors`."""
+    try:
+        with open_plain(path) as file:
+            start = file.read(8 + MAX_HEADER_BYTES)
+    except OSError as error:
+        raise TrilightError(f"{path}: cannot be read ({error.strerror}).") from error
+    if start[:2] in (b"PK", b"\x80\x02", b"\x80\x04"):
+        raise TrilightError(
+            f"{path}: pickled code, which a checkpoint could run; expected safetensors. "
+            "Convert it with the tool that wrote it."
+        )
+    metadata: dict[str, str] = safetensors_header(start, name=str(path)).get("__metadata__") or {}
+    return metadata
 
 
 def network_of(config: ModelConfig, tensors: Mapping[str, Tensor]) -> RenderFormer:

@@ -2,7 +2,7 @@
 
 import dataclasses
 import platform
-from collections.abc import Mapping
+from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -31,7 +31,6 @@ from train.loop.checkpoints import (
 from train.loop.distributed import DistributedContext
 from train.loop.optimizer import choose_muon_precision
 from train.loop.train_state import TrainState, new_state
-from train.progress import TrainProgress
 from train.resume import Event, ResumePlan, StartOptions, event_records, plan_resume
 from train.settings import TrainSettings, stored_settings
 
@@ -59,7 +58,7 @@ def plan_start(
     data_digest: str,
     start: StartOptions,
     dist_context: DistributedContext,
-    progress: TrainProgress,
+    note: Callable[[str], None],
 ) -> StartPlan:
     """Read what the run starts or resumes with, without writing anything.
 
@@ -83,7 +82,7 @@ def plan_start(
     branch = None if start.resume or start.branch is None else Path(start.branch)
     if branch is None or branch.is_dir():
         checkpoints = (folder if branch is None else RunFolder(branch)).checkpoints
-        checkpoint = newest_checkpoint(checkpoints, dist_context, progress.note)
+        checkpoint = newest_checkpoint(checkpoints, dist_context, note)
     else:
         checkpoint = read_checkpoint(branch)
         # the first process soon writes into the folder that all have looked at
@@ -100,7 +99,7 @@ def init_or_resume_state(
     folder: RunFolder,
     data: TrainingData,
     dist_context: DistributedContext,
-    progress: TrainProgress,
+    note: Callable[[str], None],
 ) -> TrainState:
     """Create or restore the state before the run's next step, and record it on disk.
 
@@ -109,38 +108,35 @@ def init_or_resume_state(
     Raises:
         TrilightError: `data_weights` has another length than the list of datasets.
     """
+    device = dist_context.device
     precision = choose_muon_precision(dist_context)
     header = None if plan.checkpoint is None else plan.checkpoint.header
     mixture = plan_mixture(data, plan.settings, header)
     if mixture is not None:
-        progress.note(f"the stream mixes {mixture}")
-    if plan.checkpoint is None:
-        state = new_state(plan.settings, dist_context.device, plan.network, precision)
-        state.mixture = mixture
-        state.data_digest = data.digest
-        digest = None
+        note(f"the stream mixes {mixture}")
+    digest = None
+    if plan.checkpoint is None or header is None:
+        state = new_state(plan.settings, device, plan.network, precision)
         if plan.network is not None:
             digest = sha256_hex(encode_weights(plan.network))
             source = find_checkpoint(Path(plan.network_source))
-            header = {**(read_header(source) if source else {}), "sha256": digest}
-            state.history = (_origin(0, "weights", header),)
-        if dist_context.is_first:
-            _write_settings(folder, state, dist_context, {"begun_with_sha256": digest})
-        return state
-    state = restore_state(plan.checkpoint, plan, dist_context.device, precision)
+            before = {**(read_header(source) if source else {}), "sha256": digest}
+            state.history = (_origin(0, "weights", before),)
+    else:
+        state = restore_state(plan.checkpoint, plan, device, precision)
+        if plan.branch is not None:
+            state.history += (_origin(state.step, "checkpoint", header),)
+        for text in plan.notes:
+            note(text)
+        state.history += tuple(_execution_changes(header, dist_context, state, note))
     state.mixture = mixture
     state.data_digest = data.digest
-    if plan.branch is not None:
-        state.history += (_origin(state.step, "checkpoint", plan.checkpoint.header),)
-    for note in plan.notes:
-        progress.note(note)
-    _record_execution_changes(plan.checkpoint, dist_context, state, progress)
     if dist_context.is_first:  # on disk, so that a kill before the next checkpoint loses nothing
         if plan.branch is not None:
             root = plan.branch if plan.branch.is_dir() else plan.branch.parent.parent
             copy_rows(RunFolder(root).metrics, folder.metrics, state.step)
-        _write_settings(folder, state, dist_context)
-        if plan.branch is not None or plan.changes_meaning:
+        _write_settings(folder, state, dist_context, digest)
+        if plan.branch is not None or (header is not None and plan.changes_meaning):
             save_checkpoint(folder.checkpoints, state, world_size=dist_context.world_size)
     return state
 
@@ -160,17 +156,16 @@ def _write_settings(
     folder: RunFolder,
     state: TrainState,
     dist_context: DistributedContext,
-    more: Mapping[str, Any] | None = None,
+    begun_with: str | None,
 ) -> None:
     """Write settings.json: current settings, their history, and how the run started."""
     origin = {
-        "begun_with_sha256": None,
+        "begun_with_sha256": begun_with,
         **({"extensions": extensions} if (extensions := extension_digests("weights")) else {}),
         "versions": {"torch": torch.__version__, "python": platform.python_version()},
         "threads": torch.get_num_threads(),
         "processes": dist_context.world_size,
         "muon_precision": state.optimizer.muon_precision,
-        **(more or {}),
     }
     now = {
         "settings": stored_settings(state.settings),
@@ -189,14 +184,13 @@ def _read_settings(folder: RunFolder) -> dict[str, Any]:
         return {}
 
 
-def _record_execution_changes(
-    checkpoint: Checkpoint,
+def _execution_changes(
+    header: Mapping[str, Any],
     dist_context: DistributedContext,
     state: TrainState,
-    progress: TrainProgress,
-) -> None:
-    """Report and record changed processes, threads and Muon precision."""
-    header = checkpoint.header
+    note: Callable[[str], None],
+) -> Iterator[Event]:
+    """Report and yield changed processes, threads and Muon precision."""
     now: dict[str, tuple[Any, Any]] = {
         "processes": (header["world_size"], dist_context.world_size),
         "threads": (header.get("threads"), torch.get_num_threads()),
@@ -215,6 +209,5 @@ def _record_execution_changes(
                 f"Muon's products in {after} instead of {before}, which suits the processors here: "
                 "the same to the rounding of bfloat16, not to the bit"
             )
-        progress.note(f"the run goes on with {text}")
-        event = Event(step=state.step, kind="execution", name=name, before=before, after=after)
-        state.history += (event,)
+        note(f"the run goes on with {text}")
+        yield Event(step=state.step, kind="execution", name=name, before=before, after=after)

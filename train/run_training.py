@@ -187,20 +187,25 @@ def _train(
     # file system shows a new file to one machine before another
     has_checkpoint = dist_context.any(start.restartable and bool(saved_steps(folder.checkpoints)))
     start = dataclasses.replace(start, resume=start.resume or has_checkpoint, restartable=False)
-    early_notes = _NoteBuffer(progress)
-    for note in (*dataset.notes, *(() if VALIDATION in dataset.splits else (UNJUDGED,))):
-        early_notes.note(note)
+    notes: list[str] = []
+
+    def note(text: str) -> None:
+        progress.note(text)
+        notes.append(text)  # until the run's folder may be written
+
+    for text in (*dataset.notes, *(() if VALIDATION in dataset.splits else (UNJUDGED,))):
+        note(text)
     if workers is None:
         on_gpu = dist_context.device.type == "cuda"
         threads = torch.get_num_threads()
         workers, reason = choose_workers(settings, on_gpu=on_gpu, busy_threads=threads)
-        early_notes.note(reason)
-    plan = plan_start(settings, folder, dataset.digest, start, dist_context, early_notes)
+        note(reason)
+    plan = plan_start(settings, folder, dataset.digest, start, dist_context, note)
     settings = plan.settings
     lpips = dist_context.run_once_per_machine(partial(load_lpips, start.lpips))
     objective = TrainingLoss(settings.loss, lpips).to(dist_context.device)
     _check_data(dataset, settings)
-    state = init_or_resume_state(plan, folder, dataset, dist_context, early_notes)
+    state = init_or_resume_state(plan, folder, dataset, dist_context, note)
     judge = recorder = None
     if dist_context.is_first:
         judge = _make_judge(dataset, settings, state.bad_samples)
@@ -208,7 +213,7 @@ def _train(
         how = "went on" if start.resume else "began"
         many = "process" if dist_context.world_size == 1 else "processes"
         where = f"{how} on {dist_context.device}, {dist_context.world_size} {many}"
-        for text in (where, *early_notes.texts):
+        for text in (where, *notes):
             add_note(folder.notes, state.step, text)
     trainer = Trainer(state, objective, dist_context, folder, recorder, watched)
     stream = load_batches(
@@ -229,18 +234,6 @@ def _train(
         return None
     recorder.close()
     return finish_run(state, folder, dataset, judge, time.monotonic() - began)
-
-
-class _NoteBuffer(TrainProgress):
-    """Forwards notes, and keeps them until the run's folder may be written."""
-
-    def __init__(self, progress: TrainProgress) -> None:
-        self._progress = progress
-        self.texts: list[str] = []
-
-    def note(self, text: str) -> None:
-        self._progress.note(text)
-        self.texts.append(text)
 
 
 def _check_data(data: TrainingData, settings: TrainSettings) -> None:

@@ -57,18 +57,9 @@ class DistributedContext(RankSlice):
         """Return the text of each process, by rank, equal on each; all must call it."""
         if self.world_size == 1:
             return [text]
-        encoded = torch.frombuffer(bytearray(text.encode()), dtype=torch.uint8)
-        length = torch.tensor([len(encoded)], device=self.device)
-        lengths = [torch.zeros_like(length) for _ in range(self.world_size)]
-        dist.all_gather(lengths, length)
-        padded = torch.zeros(max(map(int, lengths)), dtype=torch.uint8, device=self.device)
-        padded[: len(encoded)] = encoded.to(self.device)
-        texts = [torch.zeros_like(padded) for _ in range(self.world_size)]
-        dist.all_gather(texts, padded)
-        return [
-            bytes(said[: int(count)].tolist()).decode()
-            for said, count in zip(texts, lengths, strict=True)
-        ]
+        texts = [""] * self.world_size
+        dist.all_gather_object(texts, text)
+        return texts
 
     def run_once_per_machine(self, make: Callable[[], Made]) -> Made:
         """Call `make` in every process, in the first of each machine before the others.

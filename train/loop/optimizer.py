@@ -274,11 +274,11 @@ def orthogonal(
     return x.mT if tall else x
 
 
-ADAMW_KEEPS = ("exp_avg", "exp_avg_sq")
-"""Names of AdamW's state tensors for each weight, without its count of updates."""
-
-MUON_KEEPS = ("momentum_buffer",)
-"""Names of Muon's state tensors for each weight; it counts no updates."""
+_KEPT: dict[type, tuple[str, ...]] = {
+    torch.optim.AdamW: ("exp_avg", "exp_avg_sq"),
+    StackedMuon: ("momentum_buffer",),
+}
+"""Names of the state tensors for each weight, without AdamW's count of updates."""
 
 _SCALE = "width_scale"
 """Key of an optimizer's parameter group that holds the factor of its rate."""
@@ -371,7 +371,7 @@ class Optimizer:
             f"{kind}/{self._names[weight]}": memory[kind]
             for optimizer, _ in self._optimizers
             for weight, memory in optimizer.state.items()
-            for kind in _state_names(optimizer)
+            for kind in _KEPT[type(optimizer)]
         }
 
     def load_optimizer_state(self, tensors: Mapping[str, Tensor], updates: int) -> None:
@@ -381,7 +381,7 @@ class Optimizer:
                 name = self._names[weight]
                 state = {
                     kind: tensors[f"{kind}/{name}"].to(weight.device, copy=True)
-                    for kind in _state_names(optimizer)
+                    for kind in _KEPT[type(optimizer)]
                 }
                 if isinstance(optimizer, torch.optim.AdamW):
                     fused = optimizer.defaults["fused"]  # it counts on the GPU
@@ -398,7 +398,3 @@ _LAYERS = ".layers."
 _QKV = ".qkv.weight"
 """Parts of weight names: all layers, and the stacked query, key and value matrices, which `hidden`
 takes as separate ones, as Muon's authors do."""
-
-
-def _state_names(optimizer: torch.optim.Optimizer) -> tuple[str, ...]:
-    return ADAMW_KEEPS if isinstance(optimizer, torch.optim.AdamW) else MUON_KEEPS
