@@ -5,6 +5,7 @@ block. `SIZES` has the named configurations.
 """
 
 import dataclasses
+import functools
 from collections.abc import Callable, Mapping
 from dataclasses import fields
 from typing import Annotated, Any, ClassVar, Literal, NoReturn
@@ -188,132 +189,71 @@ class ModelConfig:
             )
 
 
-def smoke() -> ModelConfig:
-    """Return the size that two CPU cores train in minutes (128 wide, linear head)."""
-    return ModelConfig(
-        width=128,
-        num_heads=2,
-        encoder_layers=2,
-        decoder_layers=4,
-        hidden_width=384,
-        num_registers=4,
-        rope_num_freqs=3,
-        rope_max_freq=5.0,
-        head="linear",
-    )
+_NUMBERS = (
+    "width", "num_heads", "encoder_layers", "decoder_layers", "hidden_width", "num_registers",
+    "rope_num_freqs", "rope_max_freq",
+)  # fmt: skip
+_SIZES: Mapping[str, tuple[float, ...]] = {
+    "smoke": (128, 2, 2, 4, 384, 4, 3, 5.0),
+    "hits-smoke": (128, 2, 2, 3, 384, 4, 3, 12.0),
+    "tiny": (192, 3, 4, 4, 576, 8, 3, 5.0),
+    "small": (512, 4, 8, 6, 2048, 16, 6, 5.0),
+    "base": (768, 6, 12, 6, 3072, 16, 6, 5.0),
+    "hits-base": (768, 6, 12, 6, 3072, 16, 6, 12.0),
+    "large": (1024, 8, 12, 12, 4096, 32, 6, 11.0),
+}
+"""_NUMBERS of each size.
+
+- smoke: two CPU cores train it in minutes; hits-smoke: the same with traced hits.
+- tiny: 5 M parameters with every part of the large ones: hours on a CPU, minutes on a GPU.
+- small: 71 M parameters: a third of the paper's, at two thirds of its width.
+- base: V1-Base (Zeng et al. 2025), 205 M with its texture encoder, 195 M without; hits-base: the
+  same with the view stage `hits`, for a GPU.
+- large: V1.1-Large: 483 M parameters, Swin windows in the view stage.
+"""
+
+_DPT: Mapping[str, tuple[int, tuple[int, ...], tuple[int, ...]]] = {
+    "tiny": (32, (24, 48, 96, 192), (0, 1, 2, 3)),
+    "small": (112, (64, 128, 256, 512), (2, 3, 4, 5)),
+    "base": (128, (96, 192, 384, 768), (2, 3, 4, 5)),
+    "large": (256, (256, 512, 1024, 1024), (2, 5, 8, 11)),
+}
+"""Features, channels and taps of the sizes with a DPT head; others have a linear one."""
+
+_HITS = {
+    "hits-smoke": {"hit_anchors": 16, "gather_rays": 32, "pixel_width": 64, "filter_width": 32},
+    "hits-base": {"hit_anchors": 32, "gather_rays": 64, "pixel_width": 128, "filter_width": 0},
+}
 
 
-def hits_smoke() -> ModelConfig:
-    """Return the small size with traced hits, which two CPU cores train."""
-    return dataclasses.replace(
-        smoke(),
-        decoder_layers=3,
-        rope_max_freq=12.0,
-        view_stage="hits",
-        hit_rays=2,
-        hit_anchors=16,
-        gather_rays=32,
-        pixel_width=64,
-        filter_width=32,
-        sky_rays=8,
-        denoise_from_px=128,
-    )
-
-
-def hits_base() -> ModelConfig:
-    """Return V1-Base with the view stage `hits`, for a GPU."""
-    return dataclasses.replace(
-        hits_smoke(),
-        width=768,
-        num_heads=6,
-        encoder_layers=12,
-        decoder_layers=6,
-        hidden_width=3072,
-        num_registers=16,
-        rope_num_freqs=6,
-        hit_anchors=32,
-        gather_rays=64,
-        pixel_width=128,
-        filter_width=0,
-    )
-
-
-def tiny() -> ModelConfig:
-    """Return 5 M parameters with every part of the large ones: hours on a CPU, minutes on a GPU."""
-    return dataclasses.replace(
-        base(),
-        width=192,
-        num_heads=3,
-        encoder_layers=4,
-        decoder_layers=4,
-        hidden_width=576,
-        num_registers=8,
-        rope_num_freqs=3,
-        dpt_features=32,
-        dpt_channels=(24, 48, 96, 192),
-        dpt_taps=(0, 1, 2, 3),
-    )
-
-
-def small() -> ModelConfig:
-    """Return 71 M parameters: a third of the paper's, at two thirds of its width."""
-    return dataclasses.replace(
-        base(),
-        width=512,
-        num_heads=4,
-        encoder_layers=8,
-        hidden_width=2048,
-        dpt_features=112,
-        dpt_channels=(64, 128, 256, 512),
-    )
-
-
-def base() -> ModelConfig:
-    """Return V1-Base (Zeng et al. 2025): 205 M with its texture encoder, 195 M without."""
-    return ModelConfig(
-        width=768,
-        num_heads=6,
-        encoder_layers=12,
-        decoder_layers=6,
-        hidden_width=3072,
-        num_registers=16,
-        rope_num_freqs=6,
-        rope_max_freq=5.0,
-        head="dpt",
-        dpt_features=128,
-        dpt_channels=(96, 192, 384, 768),
-        dpt_taps=(2, 3, 4, 5),
-    )
-
-
-def large() -> ModelConfig:
-    """Return V1.1-Large: 483 M parameters, Swin windows in the view stage."""
-    return dataclasses.replace(
-        base(),
-        width=1024,
-        num_heads=8,
-        decoder_layers=12,
-        hidden_width=4096,
-        num_registers=32,
-        rope_max_freq=11.0,
-        window_bundles=8,
-        dpt_features=256,
-        dpt_channels=(256, 512, 1024, 1024),
-        dpt_taps=(2, 5, 8, 11),
-    )
+def _sized(name: str) -> ModelConfig:
+    """Return the configuration of one of our sizes."""
+    fields: dict[str, Any] = dict(zip(_NUMBERS, _SIZES[name], strict=True))
+    fields |= {"head": "linear", "window_bundles": 8 if name == "large" else 0}
+    if name in _DPT:
+        dpt = zip(("dpt_features", "dpt_channels", "dpt_taps"), _DPT[name], strict=True)
+        fields |= {"head": "dpt", **dict(dpt)}
+    if name in _HITS:
+        fields |= {"view_stage": "hits", "hit_rays": 2, "sky_rays": 8, "denoise_from_px": 128}
+        fields |= _HITS[name]
+    return ModelConfig(**fields)
 
 
 SIZES: Registry[Callable[[], ModelConfig]] = Registry(
     "size",
     Callable,
-    {
-        size.__name__.replace("_", "-"): size
-        for size in (smoke, hits_smoke, tiny, small, base, hits_base, large)
-    },
+    {name: functools.partial(_sized, name) for name in _SIZES},
     decides=("weights",),
 )
 """Named sizes, ours first and smallest first. A checkpoint stores all numbers of its configuration
 and no name, so that it opens without its size being registered."""
+
+smoke = SIZES["smoke"]
+hits_smoke = SIZES["hits-smoke"]
+tiny = SIZES["tiny"]
+base = SIZES["base"]
+hits_base = SIZES["hits-base"]
+large = SIZES["large"]
 
 ModelConfig.PRESETS = SIZES
 
