@@ -105,38 +105,27 @@ def supports_packed(x: Tensor, head_width: int) -> bool:
     return device == "cuda" and reduced and head_width % 8 == 0 and head_width <= MOST_HEAD_WIDTH
 
 
-class _Pack(torch.autograd.Function):
+class _Repack(torch.autograd.Function):
+    """Packed tokens of padded ones, or padded ones of packed; the backward pass is the other."""
+
     @staticmethod
-    def forward(
-        ctx: Any, x_MK: Tensor, index_P: Tensor, back_M: Tensor, exists_M: Tensor
-    ) -> Tensor:
-        ctx.save_for_backward(index_P, back_M, exists_M)
-        return x_MK.index_select(0, index_P)
+    def forward(ctx: Any, x: Tensor, packs: bool, *maps: Tensor) -> Tensor:
+        ctx.save_for_backward(*maps)
+        ctx.packs = packs
+        index_P, back_M, exists_M = maps
+        if packs:
+            return x.index_select(0, index_P)
+        exists = exists_M.reshape(-1, *[1] * (x.ndim - 1))
+        return torch.where(exists, x.index_select(0, back_M), 0)
 
     @staticmethod
     def backward(ctx: Any, *grads: Tensor) -> tuple[Tensor | None, ...]:
-        index_P, back_M, exists_M = ctx.saved_tensors
-        return _Unpack.apply(grads[0], index_P, back_M, exists_M), None, None, None
-
-
-class _Unpack(torch.autograd.Function):
-    @staticmethod
-    def forward(
-        ctx: Any, x_PK: Tensor, index_P: Tensor, back_M: Tensor, exists_M: Tensor
-    ) -> Tensor:
-        ctx.save_for_backward(index_P, back_M, exists_M)
-        exists = exists_M.reshape(-1, *[1] * (x_PK.ndim - 1))
-        return torch.where(exists, x_PK.index_select(0, back_M), 0)
-
-    @staticmethod
-    def backward(ctx: Any, *grads: Tensor) -> tuple[Tensor | None, ...]:
-        index_P, back_M, exists_M = ctx.saved_tensors
-        return _Pack.apply(grads[0], index_P, back_M, exists_M), None, None, None
+        return _Repack.apply(grads[0], not ctx.packs, *ctx.saved_tensors), None, None, None, None
 
 
 def pack_tokens(x_SNK: Tensor, packing: Packing) -> Tensor:
     """Return the valid tokens: [S, N, ...] -> [P, ...]."""
-    return _Pack.apply(x_SNK.flatten(0, 1), *packing[:3])
+    return _Repack.apply(x_SNK.flatten(0, 1), True, *packing[:3])
 
 
 Keys = Tensor | Sequences | None

@@ -38,16 +38,9 @@ from storage.machine import free_memory
 from storage.records.material import EMISSION, unread_columns
 from storage.records.scene import Scene
 
-
-@dataclass(frozen=True, kw_only=True, eq=False)
-class LightGroup:
-    """Scene with some of its lights, and the fraction of the light that they are."""
-
-    scene: Scene
-    """Scene with these lights only, scaled to the power of all lights: a tenth of the light would
-    be darker than any training scene."""
-    fraction: float
-    """Factor of the group's picture in the sum, 0 to 1."""
+LightGroup = tuple[Scene, float]
+"""Scene with some of its lights, scaled to the power of all lights, and the factor of its picture
+in the sum: a tenth of the light would be darker than any training scene."""
 
 
 def light_groups(scene: Scene, most: int) -> list[LightGroup]:
@@ -67,7 +60,7 @@ def light_groups(scene: Scene, most: int) -> list[LightGroup]:
     """
     emitting_E = np.flatnonzero(scene.triangle_emits)
     if not len(emitting_E):
-        return [LightGroup(scene=scene, fraction=1.0)]
+        return [(scene, 1.0)]
     corners_E33 = scene.vertex_positions[scene.faces[emitting_E]].astype(np.float64)
     lamp_E = _lamps(corners_E33)
     groups = _pack_lamps(lamp_E, _is_inside(scene, corners_E33, lamp_E), most)
@@ -77,7 +70,7 @@ def light_groups(scene: Scene, most: int) -> list[LightGroup]:
     power_E = area_E * emission_E3.mean(axis=1, dtype=np.float64)  # up to a constant factor
     powers = [float(power_E[np.isin(lamp_E, lamps)].sum()) for lamps in groups]
     if len(groups) == 1 or not any(powers):
-        return [LightGroup(scene=scene, fraction=1.0)]
+        return [(scene, 1.0)]
     lit_groups = [
         (lamps, power / sum(powers)) for lamps, power in zip(groups, powers, strict=True) if power
     ]
@@ -150,7 +143,7 @@ def _group(scene: Scene, removed_faces: NDArray[np.int64], fraction: float) -> L
         object_index=np.delete(scene.object_index, removed_faces),
         materials=materials,
     )
-    return LightGroup(scene=alone, fraction=fraction)
+    return alone, fraction
 
 
 _FLOAT_BYTES = 4
@@ -271,12 +264,10 @@ class NeuralRenderer:
             knows_sky = self.config.sky_rays
             sky = dataclasses.replace(sky, is_seen=False) if knows_sky else None
             scene = dataclasses.replace(scene, environment=sky)
-        all_lights = [LightGroup(scene=scene, fraction=1.0)]
-        traces_hits = self.config.traces_hits
-        groups = [
-            (_encode(self._model, group.scene, self.device), group.fraction)
-            for group in (all_lights if traces_hits else light_groups(scene, lights_per_pass))
-        ]
+        lights = [(scene, 1.0)]
+        if not self.config.traces_hits:
+            lights = light_groups(scene, lights_per_pass)
+        groups = [(_encode(self._model, group, self.device), share) for group, share in lights]
         return PreparedScene(groups=tuple(groups), notes=self._notes(below_sky, len(groups)))
 
     @torch.inference_mode()

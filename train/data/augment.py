@@ -189,10 +189,8 @@ def scale_light(scene: TrainingScene, factor: float) -> TrainingScene:
     """Return the scene with all light scaled. Drops the pictures of single lights."""
     factor_T = torch.full((scene.tensors.num_triangles,), factor)
     tensors = _scale_emission(scene.tensors, factor_T, factor)
-    lit = dataclasses.replace(scene, tensors=tensors, lights_VLRR3=None)
-    if scene.levels_L is not None:
-        return dataclasses.replace(lit, levels_L=_log10(factor * _linear(scene.levels_L)))
-    return dataclasses.replace(lit, target_VRR3=_log10(factor * _linear(scene.target_VRR3)))
+    target_VRR3 = _log10(factor * _linear(scene.target_VRR3))
+    return dataclasses.replace(scene, tensors=tensors, target_VRR3=target_VRR3, lights_VLRR3=None)
 
 
 def mix_lights(scene: TrainingScene, factor_L: Tensor) -> TrainingScene:
@@ -209,7 +207,6 @@ def mix_lights(scene: TrainingScene, factor_L: Tensor) -> TrainingScene:
         tensors=tensors,
         target_VRR3=_log10(mixed_VRR3),
         lights_VLRR3=None,
-        levels_L=None,
     )
 
 

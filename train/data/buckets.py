@@ -80,7 +80,7 @@ def bucket_scenes(
 
 
 def collate_batch(scenes: Sequence[TrainingScene]) -> TrainingBatch:
-    """Collate scenes of equal view count, whose targets are looked up."""
+    """Collate scenes of equal view count."""
     return TrainingBatch(
         scenes=batch_scenes([scene.tensors for scene in scenes]),
         target_BVRR3=torch.stack([scene.target_VRR3 for scene in scenes]),

@@ -35,7 +35,7 @@ from train.data.order import (
     shuffled_shards,
     visits_from,
 )
-from train.data.scenes import TrainingScene, require_few_triangles, scene_of_views, with_target
+from train.data.scenes import TrainingScene, require_few_triangles, scene_of_views
 
 if TYPE_CHECKING:
     from train.settings import TrainSettings
@@ -233,8 +233,7 @@ class _SceneMaker:
         noise = int(rng.integers(2**31))
         tensors = with_traced(seen.tensors, settings.resolution, settings.model, noise)
         withheld = settings.augmentation.withheld_inputs
-        tensors = withhold_inputs(tensors, withheld, rng)
-        return with_target(dataclasses.replace(seen, tensors=tensors))
+        return dataclasses.replace(seen, tensors=withhold_inputs(tensors, withheld, rng))
 
     def _usable_scene(self, visit: Visit) -> tuple[TrainingScene, np.random.Generator]:
         """Return the drawn views of a usable sample, and the random generator of the visit."""

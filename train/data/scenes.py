@@ -1,8 +1,7 @@
 """Training scenes: the tensors of a sample for one step.
 
-Most targets are half floats at the resolution of the run, with 31,744 possible values. Functions of
-a value (log10(1 + x), scaled light) are computed once for each of these and looked up per pixel:
-the same numbers for a tenth of the work.
+Most targets are half floats at the resolution of the run, with 31,744 possible values, whose
+logarithms are computed once and looked up per pixel.
 """
 
 import dataclasses
@@ -33,8 +32,7 @@ class TrainingScene:
     tensors: SceneTensors
     """Input of the network for this scene."""
     target_VRR3: Tensor
-    """float32 log10(1 + radiance), one picture per camera in `tensors`; with `levels_L`, int16 rows
-    of it."""
+    """float32 log10(1 + radiance), one picture per camera in `tensors`."""
     noise_V: Tensor
     """float32 root mean square noise of the stored pictures in log10(1 + radiance); downsampled
     pictures have less."""
@@ -43,9 +41,6 @@ class TrainingScene:
     lights_VLRR3: Tensor | None = None
     """float32 linear radiance of each light alone, if requested, the sky's last; their sum is the
     picture."""
-    levels_L: Tensor | None = None
-    """float32 log10(1 + radiance) of every valid half float, if the target is not looked up yet
-    (`with_target`); None otherwise."""
 
 
 def training_scene(sample: Sample, resolution: int, *, lights_apart: bool = False) -> TrainingScene:
@@ -71,8 +66,6 @@ def scene_of_views(
 ) -> TrainingScene:
     """Return some views of a sample; its other pictures are not unpacked.
 
-    If pictures are half floats of the right resolution, the target is not looked up yet.
-
     Args:
         views: indices of its cameras, at least one.
 
@@ -92,15 +85,6 @@ def scene_of_views(
     return _with_lights(training, lights_rgb, resolution)
 
 
-def with_target(scene: TrainingScene) -> TrainingScene:
-    """Return a scene whose target is log10(1 + radiance), looked up if necessary."""
-    if scene.levels_L is None:
-        return scene
-    # the bits were validated: mode "clip" avoids another range check, which would copy
-    target = np.take(scene.levels_L.numpy(), scene.target_VRR3.numpy(), mode="clip")
-    return dataclasses.replace(scene, target_VRR3=torch.from_numpy(target), levels_L=None)
-
-
 def require_few_triangles(key: str, scene: Scene, most: int) -> None:
     """Raise TrilightError if a scene has more than `most` triangles; 0 sets no limit."""
     if 0 < most < scene.num_triangles:
@@ -111,9 +95,10 @@ def require_few_triangles(key: str, scene: Scene, most: int) -> None:
 
 
 @cache
-def stored_levels() -> Tensor:
-    """Return the table float32 [31744] of log10(1 + x) by the bits of a half float x."""
-    return torch.from_numpy(log10_radiance(HALF_FLOATS[:FIRST_ILLEGAL]).astype(np.float32))
+def stored_levels() -> NDArray[np.float32]:
+    """Return the table [31744] of log10(1 + x) by the bits of a half float x."""
+    levels: NDArray[np.float32] = log10_radiance(HALF_FLOATS[:FIRST_ILLEGAL]).astype(np.float32)
+    return levels
 
 
 def _scene_of(
@@ -121,13 +106,12 @@ def _scene_of(
 ) -> TrainingScene:
     """Return a scene with the pictures of all of its cameras."""
     require_divisor(resolution, pictures.shape[1])
-    levels_L = None
     if pictures.dtype == np.uint16 and pictures.shape[1] == resolution:
-        target_VRR3 = torch.from_numpy(pictures.view(np.int16))
-        levels_L = stored_levels()
+        # the bits were validated: mode "clip" avoids another range check, which would copy
+        target_VRR3 = np.take(stored_levels(), pictures.view(np.uint16), mode="clip")
     else:
         radiance_VRR3 = block_mean(to_float32(pictures), resolution)
-        target_VRR3 = torch.from_numpy(log10_radiance(radiance_VRR3).astype(np.float32))
+        target_VRR3 = log10_radiance(radiance_VRR3).astype(np.float32)
     light_of_object = np.full(len(scene.objects), -1, np.int64)
     rows = list(light_rows(scene))
     light_of_object[rows] = np.arange(len(rows))
@@ -135,10 +119,9 @@ def _scene_of(
     return TrainingScene(
         key=key,
         tensors=scene_tensors(scene),
-        target_VRR3=target_VRR3,
+        target_VRR3=torch.from_numpy(target_VRR3),
         noise_V=torch.from_numpy(10 ** (-floors_db / 20)),
         light_T=torch.from_numpy(light_of_object[scene.object_index]),
-        levels_L=levels_L,
     )
 
 

@@ -233,11 +233,9 @@ def test_many_lights_are_judged_in_one_pass_and_in_groups(dataset: Dataset) -> N
     assert grouped is not None and grouped.shape == (2, 16, 16, 3)
     # by hand: every group's picture times its share, the same sums in another order
     expected = sum(
-        group.fraction
-        * predict(
-            network, training_scene(dataclasses.replace(toy_sample(0), scene=group.scene), 16)
-        )
-        for group in light_groups(many, 8)
+        fraction
+        * predict(network, training_scene(dataclasses.replace(toy_sample(0), scene=alone), 16))
+        for alone, fraction in light_groups(many, 8)
     )
     np.testing.assert_allclose(grouped, expected, rtol=1e-5, atol=1e-6)
     alone, both = row(0), row(1, scores={NETWORK: SCORES, GROUPED: SCORES | {"ssim": 0.5}})
