@@ -101,16 +101,12 @@ def _is_inside(
     middle_E3 = np.zeros((len(lamp_E), 3))
     np.add.at(middle_E3, lamp_E, corners_E33.mean(axis=1))
     middle_E3 /= count_E[:, None]
-    rows = len(scene.objects)
-    low = np.full((rows, 3), np.inf)
-    high = np.full((rows, 3), -np.inf)
-    corners_T33 = scene.vertex_positions[scene.faces]
-    np.minimum.at(low, scene.object_index, corners_T33.min(axis=1))
-    np.maximum.at(high, scene.object_index, corners_T33.max(axis=1))
     is_inside = np.zeros(len(lamp_E), bool)
     for row, entry in enumerate(scene.objects):
-        if entry.kind == "object":
-            is_inside |= ((low[row] <= middle_E3) & (middle_E3 <= high[row])).all(axis=1)
+        corners = scene.vertex_positions[scene.faces[scene.object_index == row].ravel()]
+        if entry.kind == "object" and len(corners):
+            low, high = corners.min(axis=0), corners.max(axis=0)
+            is_inside |= ((low <= middle_E3) & (middle_E3 <= high)).all(axis=1)
     return is_inside
 
 

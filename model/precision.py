@@ -13,7 +13,7 @@ in a separate kernel, and its gradient in another one: hundreds of launches with
 layer's weights are rounded together; every number is exactly that of autocast.
 """
 
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterable, Iterator, Mapping
 from contextlib import AbstractContextManager, contextmanager, nullcontext
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
@@ -138,33 +138,31 @@ def rounded_call(module: nn.Module, weights: dict[str, Tensor], *inputs: Any) ->
     return functional_call(module, weights, inputs)
 
 
-def rounded_weights(module: nn.Module, device: torch.device) -> dict[str, Tensor]:
-    """Return a module's matrices rounded as by autocast; empty without autocast."""
-    return _round_weights(
-        device, ((name, w) for name, w in module.named_parameters() if w.ndim > 1)
-    )
-
-
-def rounded_parts_of(
-    module: nn.Module, parts: Iterable[nn.Module], device: torch.device
+def rounded_weights(
+    module: nn.Module, device: torch.device, parts: Iterable[nn.Module] | None = None
 ) -> dict[str, Tensor]:
-    """Return all weights of some submodules rounded as by autocast, by their names in `module`."""
-    inside = {id(weight) for part in parts for weight in part.parameters()}
-    named = module.named_parameters()
-    return _round_weights(
-        device, ((name, weight) for name, weight in named if id(weight) in inside)
-    )
+    """Return a module's matrices rounded as by autocast, by name; empty without autocast.
 
-
-def _round_weights(device: torch.device, named: Iterable[tuple[str, Tensor]]) -> dict[str, Tensor]:
+    Args:
+        parts: submodules of which all weights are rounded, in place of the matrices.
+    """
     kind = device.type
     if kind == "meta" or not torch.is_autocast_enabled(kind):
         return {}
-    to = torch.get_autocast_dtype(kind)
-    rounded = {name: weight for name, weight in named if weight.dtype == torch.float32}
-    if not rounded:
+    inside = {id(weight) for part in parts or () for weight in part.parameters()}
+    rounded = {
+        name: weight
+        for name, weight in module.named_parameters()
+        if weight.dtype == torch.float32
+        and (weight.ndim > 1 if parts is None else id(weight) in inside)
+    }
+    return _round_together(torch.get_autocast_dtype(kind), rounded)
+
+
+def _round_together(to: torch.dtype, weights: Mapping[str, Tensor]) -> dict[str, Tensor]:
+    if not weights:
         return {}
-    return dict(zip(rounded, _RoundTogether.apply(to, *rounded.values()), strict=True))
+    return dict(zip(weights, _RoundTogether.apply(to, *weights.values()), strict=True))
 
 
 class _RoundTogether(torch.autograd.Function):

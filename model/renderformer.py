@@ -156,9 +156,10 @@ class RenderFormer(nn.Module):
         traced = batch.traced
         if (traced if self.config.traces_hits else batch.albedo_BVRR6) is None:
             return self.decode(self.encode(batch), batch, resolution)
-        self.config.require_resolution(resolution)
         if traced is None or not self.config.traces_hits:
-            return self._bundles(self._encode_scenes(batch), batch, resolution, batch.albedo_BVRR6)
+            encoded = self._encode_scenes(batch)
+            return self.decode(encoded, batch, resolution, batch.albedo_BVRR6)
+        self.config.require_resolution(resolution)
         encoded = self._encode_scenes(batch, (), traced.sides_T12, traced.unit_3)
         return self.decode_traced(encoded, traced)
 
@@ -205,7 +206,13 @@ class RenderFormer(nn.Module):
             places=places, keys_values=keys_values, packing=packing, surfaces=surfaces
         )
 
-    def decode(self, scene: EncodedScene, cameras: Cameras, resolution: int) -> Tensor:
+    def decode(
+        self,
+        scene: EncodedScene,
+        cameras: Cameras,
+        resolution: int,
+        albedo_BVRR6: Tensor | None = None,
+    ) -> Tensor:
         """Return the pictures [B, V, R, R, 3] of any views of encoded scenes.
 
         On a CPU, decoding views one by one is as fast as together, in half the memory.
@@ -214,6 +221,7 @@ class RenderFormer(nn.Module):
             scene: result of `encode`.
             cameras: cameras of B scenes by V views.
             resolution: a multiple of `config.picture_px`.
+            albedo_BVRR6: of visible surfaces, for a demodulated network; None traces it.
 
         Raises:
             TrilightError: the resolution is no such multiple.
@@ -222,11 +230,15 @@ class RenderFormer(nn.Module):
         if self.config.traces_hits:
             traced = self.trace(scene, cameras, resolution)
             return self.decode_traced(scene, denoise_traced(traced, self.config))
-        albedo_BVRR6 = None
-        if rays := self.config.hit_rays:
+        rays = self.config.hit_rays
+        if rays and albedo_BVRR6 is None:
             albedo_BVRR6 = albedo_of_cameras(scene.surfaces, cameras, resolution, rays)
             albedo_BVRR6 = like(albedo_BVRR6, cameras.fov_deg_BV)
-        return self._bundles(scene, cameras, resolution, albedo_BVRR6)
+        with tf32(self.tf32):
+            picture_BVRRC: Tensor = self.decoder(scene, cameras, resolution)
+        if albedo_BVRR6 is None:
+            return picture_BVRRC
+        return compose_radiance(picture_BVRRC, albedo_BVRR6)
 
     def trace(self, scene: EncodedScene, cameras: Cameras, resolution: int) -> Traced:
         """Return the traced inputs of views, for `hits`; arguments are as of `decode`."""
@@ -238,20 +250,6 @@ class RenderFormer(nn.Module):
         with tf32(self.tf32):
             pictures: Tensor = self.decoder(scene, traced)
         return pictures
-
-    def _bundles(
-        self,
-        scene: EncodedScene,
-        cameras: Cameras,
-        resolution: int,
-        albedo_BVRR6: Tensor | None,
-    ) -> Tensor:
-        """Return the pictures of ray bundles; a demodulated network needs an albedo."""
-        with tf32(self.tf32):
-            picture_BVRRC: Tensor = self.decoder(scene, cameras, resolution)
-        if not self.config.demodulated or albedo_BVRR6 is None:
-            return picture_BVRRC
-        return compose_radiance(picture_BVRRC, albedo_BVRR6)
 
     def recompute_activations(self, enabled: bool) -> None:
         """Set whether activations are recomputed in the backward pass; by default they are kept."""

@@ -28,7 +28,7 @@ from model.positions import (
     camera_rotation,
     packed_camera_rotation,
 )
-from model.precision import rounded_call, rounded_parts_of, without_autocast
+from model.precision import rounded_call, rounded_weights, without_autocast
 from model.scene_tensors import Cameras
 
 
@@ -282,7 +282,7 @@ class ViewDecoder(nn.Module):
             x_BVQW = run_layer(layer, *inputs, recompute=self.recompute)
             if index in self.head.taps:
                 taps[index] = x_BVQW
-        weights = rounded_parts_of(self.head, self.head.rounded_parts(), x_BVQW.device)
+        weights = rounded_weights(self.head, x_BVQW.device, self.head.rounded_parts())
         tokens = [torch.flatten(taps[tap], 0, 1) for tap in self.head.taps]
         picture_MCRR = rounded_call(self.head, weights, tokens)
         picture_BVRRC = picture_MCRR.movedim(1, -1).unflatten(0, fov_deg_BV.shape)

@@ -22,6 +22,7 @@ no scales.
 import math
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
+from typing import Any
 
 import torch
 from torch import nn
@@ -100,17 +101,13 @@ def _of_matrix(fans: tuple[int, int], base_fans: tuple[int, int]) -> WidthScale:
     )
 
 
-def _query_scales(
-    model: RenderFormer, at_base: Mapping[str, nn.Module]
-) -> Iterator[tuple[str, float]]:
+def _query_scales(model: RenderFormer, at_base: Mapping[str, Any]) -> Iterator[tuple[str, float]]:
     """Yield the weights that scale the queries of an attention, each with its factor."""
     for name, module in model.named_modules():
         other = at_base[name]
         if isinstance(module, SelfAttention | CrossAttention):
-            assert isinstance(other, SelfAttention | CrossAttention)
             yield f"{name}.q_norm.weight", math.sqrt(_head_width(other) / _head_width(module))
         elif isinstance(module, PixelHead):
-            assert isinstance(other, PixelHead)
             factor = math.sqrt(other.query.out_features / module.query.out_features)
             yield from ((f"{name}.query.{part}", factor) for part in ("weight", "bias"))
 

@@ -330,30 +330,20 @@ class HitDecoder(nn.Module):
             radiance_MP3 = torch.zeros_like(every[2][block])
             # a graph of a GPU and a gradient need all parts; on a CPU, black ones cost nothing
             some = meets_M[block] if is_sparse else slice(None)
-            radiance_MP3[some] = self._some_parts(*(each[block][some] for each in (unit, *every)))
+            unit_M13, features_MPF, pixels_MPC, mirrored_MP3, *near = (
+                each[block][some] for each in (unit, *every)
+            )
+            nothing_M19 = torch.where(near[-1][..., 0] > 0, 0.0, -2 * FARTHEST)[:, None]
+            step = round(pixels_MPC.shape[1] ** 0.5)
+            window_MP9 = nothing_M19 + _log_window(step, unit_M13.device)
+            learned, mixed = head(features_MPF, pixels_MPC, *near, window_MP9)
+            radiance_MP3[some] = _compose_radiance(
+                learned, mixed, mirrored_MP3, pixels_MPC, unit_M13
+            )
             rows.append(radiance_MP3)
         pictures = _whole(torch.cat(rows).unflatten(0, (-1, parts)), side)
         log10 = torch.log1p(pictures) / math.log(10)
         return log10.reshape(*views, resolution, resolution, 3)
-
-    def _some_parts(
-        self,
-        unit_M13: Tensor,
-        features_MPF: Tensor,
-        pixels_MPC: Tensor,
-        mirrored_MP3: Tensor,
-        key_M9W: Tensor,
-        value_M9W: Tensor,
-        gathered_M93: Tensor,
-        place_M9C: Tensor,
-    ) -> Tensor:
-        """Return the radiance [M, P, 3] of some parts of pictures."""
-        nothing_M19 = torch.where(place_M9C[..., 0] > 0, 0.0, -2 * FARTHEST)[:, None]
-        window_MP9 = nothing_M19 + _log_window(round(pixels_MPC.shape[1] ** 0.5), unit_M13.device)
-        learned, mixed = self.head(
-            features_MPF, pixels_MPC, key_M9W, value_M9W, gathered_M93, place_M9C, window_MP9
-        )
-        return _compose_radiance(learned, mixed, mirrored_MP3, pixels_MPC, unit_M13)
 
 
 def _blocks(features: Tensor, parts: int) -> Iterator[slice]:

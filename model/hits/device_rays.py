@@ -14,7 +14,6 @@ from typing import Any
 import numpy as np
 import torch
 from numpy.typing import NDArray
-from torch import Tensor
 
 from model.hits.device_arrays import DeviceArray, DevicePlace
 from storage.raycast.caster import MISS, RayHits
@@ -274,39 +273,31 @@ class DeviceTriangles:
 
     def intersect(self, origins: DeviceArray, directions: DeviceArray) -> RayHits:
         """Return the first hits of rays [N, 3] from `origins` [N, 3], from either side."""
-        count = len(directions)
-        triangle = torch.empty(count, dtype=torch.long, device=self._place.device)
-        uv = torch.empty(2, count, device=self._place.device)
-        self._launch(origins, directions, uv, triangle, uv, triangle, 0)
-        return RayHits(triangle=DeviceArray(triangle, self._place), uv=DeviceArray(uv, self._place))
+        triangle, uv, _ = self._trace(origins, directions, None)
+        return RayHits(triangle=triangle, uv=uv)
 
     def is_free(
         self, origins: DeviceArray, directions: DeviceArray, distances_m: DeviceArray
     ) -> DeviceArray:
         """Return [N] whether rays meet nothing up to a distance [N], in lengths of directions."""
-        free = torch.empty(len(directions), dtype=torch.bool, device=self._place.device)
-        limits = distances_m.tensor.contiguous()
-        self._launch(origins, directions, limits, free, limits, free, 1)
-        return DeviceArray(free, self._place)
+        return self._trace(origins, directions, distances_m)[2]
 
-    def _launch(
-        self,
-        origins: DeviceArray,
-        directions: DeviceArray,
-        limits: Tensor,
-        triangle: Tensor,
-        uv: Tensor,
-        free: Tensor,
-        asks_free: int,
-    ) -> None:
+    def _trace(
+        self, origins: DeviceArray, directions: DeviceArray, limits: DeviceArray | None
+    ) -> tuple[DeviceArray, ...]:
+        """Return triangle and uv of each ray's hit; or, in third place, what limits leave free."""
         count = len(directions)
-        kernel = compiled_kernel(self._place.device)
+        device = self._place.device
+        triangle = torch.empty(count, dtype=torch.long, device=device)
+        uv = torch.empty(2, count, device=device)
+        free = torch.empty(count, dtype=torch.bool, device=device)
+        kernel = compiled_kernel(device)
         assert kernel is not None
         rays = [each.tensor.contiguous() for each in (origins, directions)]
+        rays.append(uv if limits is None else limits.tensor.contiguous())
         kernel(
             grid=(-(-count // THREADS), 1, 1),
             block=(THREADS, 1, 1),
-            args=[
-                *rays, limits, *self._tree, triangle, uv, free, count, asks_free,
-            ],
-        )  # fmt: skip
+            args=[*rays, *self._tree, triangle, uv, free, count, int(limits is not None)],
+        )
+        return tuple(DeviceArray(each, self._place) for each in (triangle, uv, free))

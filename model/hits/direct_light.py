@@ -66,8 +66,36 @@ def direct_light(
             are better at finding is left to them (the power heuristic, Veach and Guibas 1995).
     """
     light = no_light(points)
+    lit_points = points.only(None)  # arrays are [3, l, P] and [l, P]
+    gloss = None if gloss is None else gloss.only(None)
     for some in _some_lamps(scene, points):
-        _add(light, scene, points, gloss, some, on_lamps(some), lobe_rays)
+        lamps = scene.lamps[some]
+        place = _on_triangle(scene, lamps[:, None], on_lamps(some))
+        to_lamp = place - lit_points.position
+        square = np.maximum(dot(to_lamp, to_lamp), np.float32(1e-12))
+        to_lamp = to_lamp / np.sqrt(square)
+        cosine = dot(lit_points.normal, to_lamp)
+        if scene.place is None:  # one lamp; `dot` rounds otherwise, and pictures keep their bits
+            facing = np.abs(scene.plane[:, int(lamps[0])] @ to_lamp[:, 0])[None]
+        else:
+            facing = np.abs(dot(scene.plane[:, lamps][:, :, None], to_lamp))
+        solid = facing * scene.area[lamps][:, None] / square
+        diffuse = np.maximum(cosine, 0) * solid * _INV_PI
+        specular = None
+        if gloss is not None:
+            value, density = lobe(gloss, lit_points, to_lamp, cosine)
+            specular = value * solid / (1 + np.square(lobe_rays * density * solid))
+        useful = np.flatnonzero(diffuse if specular is None else (diffuse > 0) | (specular > 0))
+        is_free = np.zeros_like(diffuse).reshape(-1)
+        is_free[useful] = _is_free(scene, lit_points, place, to_lamp, useful)
+        is_free = is_free.reshape(diffuse.shape)
+        emission = scene.emission[:, lamps][:, :, None]
+        np.add(light.open_diffuse, _total(diffuse * emission), out=light.open_diffuse)
+        np.add(light.diffuse, _total(diffuse * is_free * emission), out=light.diffuse)
+        if specular is not None and gloss is not None:
+            colored = gloss.color * specular * emission
+            np.add(light.open_specular, _total(colored), out=light.open_specular)
+            np.add(light.specular, _total(colored * is_free), out=light.specular)
     return light
 
 
@@ -77,47 +105,6 @@ def _some_lamps(scene: LitScene, points: Points) -> Iterator[slice]:
     step = 1 if scene.place is None else max(1, TOGETHER // count)
     for first in range(0, len(scene.lamps), step):
         yield slice(first, min(first + step, len(scene.lamps)))
-
-
-def _add(
-    light: DirectLight,
-    scene: LitScene,
-    points: Points,
-    gloss: Gloss | None,
-    some: slice,
-    on_lamp: Floats,
-    lobe_rays: int,
-) -> None:
-    """Add the light of l lamps; arrays are [3, l, P] and [l, P]."""
-    lamps = scene.lamps[some]
-    lit_points = points.only(None)
-    gloss = None if gloss is None else gloss.only(None)
-    place = _on_triangle(scene, lamps[:, None], on_lamp)
-    to_lamp = place - lit_points.position
-    square = np.maximum(dot(to_lamp, to_lamp), np.float32(1e-12))
-    to_lamp = to_lamp / np.sqrt(square)
-    cosine = dot(lit_points.normal, to_lamp)
-    if scene.place is None:  # one lamp; `dot` rounds otherwise, and pictures keep their bits
-        facing = np.abs(scene.plane[:, int(lamps[0])] @ to_lamp[:, 0])[None]
-    else:
-        facing = np.abs(dot(scene.plane[:, lamps][:, :, None], to_lamp))
-    solid = facing * scene.area[lamps][:, None] / square
-    diffuse = np.maximum(cosine, 0) * solid * _INV_PI
-    specular = None
-    if gloss is not None:
-        value, density = lobe(gloss, lit_points, to_lamp, cosine)
-        specular = value * solid / (1 + np.square(lobe_rays * density * solid))
-    useful = np.flatnonzero(diffuse if specular is None else (diffuse > 0) | (specular > 0))
-    is_free = np.zeros_like(diffuse).reshape(-1)
-    is_free[useful] = _is_free(scene, lit_points, place, to_lamp, useful)
-    is_free = is_free.reshape(diffuse.shape)
-    emission = scene.emission[:, lamps][:, :, None]
-    np.add(light.open_diffuse, _total(diffuse * emission), out=light.open_diffuse)
-    np.add(light.diffuse, _total(diffuse * is_free * emission), out=light.diffuse)
-    if specular is not None and gloss is not None:
-        colored = gloss.color * specular * emission
-        np.add(light.open_specular, _total(colored), out=light.open_specular)
-        np.add(light.specular, _total(colored * is_free), out=light.specular)
 
 
 def _total(of_lamps: Floats) -> Floats:

@@ -42,54 +42,42 @@ def add_sky_light(
         ray_index: which of the rays of its pixel a point is ([P]), whose directions all differ.
         rays: towards the sky from each point, half of them, or one more, by the map.
     """
-    by_map = (rays + 1) // 2
     for number in range(rays):
         u = spread(shift, ray_index * rays + number)
-        if number < by_map:
+        if number < _by_map(rays):
             direction = scene.drawn_sky.sample_directions(u)
         else:
             direction = cosine_direction(u, points.normal, points.edge)
-        _add(light, scene, points, gloss, direction, by_map, rays - by_map, lobe_rays)
+        cosine = np.maximum(dot(points.normal, direction), 0)
+        density = sky_density(scene, direction, cosine, rays)
+        diffuse = cosine * _INV_PI / density
+        specular = None
+        if gloss is not None:
+            value, of_lobe = lobe(gloss, points, direction, dot(points.normal, direction))
+            specular = value / (density + lobe_rays * of_lobe)
+        useful = np.flatnonzero(diffuse if specular is None else (diffuse > 0) | (specular > 0))
+        if not len(useful):
+            continue
+        is_free = sees_sky(scene, points.only(useful), direction[:, useful])
+        radiance = scene.drawn_sky.radiance(direction[:, useful])
+        arrives = radiance * diffuse[useful]
+        light.open_diffuse[:, useful] += arrives
+        light.diffuse[:, useful] += arrives * is_free
+        if specular is not None and gloss is not None:
+            colored = gloss.color[:, useful] * specular[useful] * radiance
+            light.open_specular[:, useful] += colored
+            light.specular[:, useful] += colored * is_free
 
 
-def _add(
-    light: DirectLight,
-    scene: LitScene,
-    points: Points,
-    gloss: Gloss | None,
-    direction: Floats,
-    by_map: int,
-    by_surface: int,
-    lobe_rays: int,
-) -> None:
-    cosine = np.maximum(dot(points.normal, direction), 0)
-    density = sky_density(scene, direction, cosine, by_map, by_surface)
-    diffuse = cosine * _INV_PI / density
-    specular = None
-    if gloss is not None:
-        value, of_lobe = lobe(gloss, points, direction, dot(points.normal, direction))
-        specular = value / (density + lobe_rays * of_lobe)
-    useful = np.flatnonzero(diffuse if specular is None else (diffuse > 0) | (specular > 0))
-    if not len(useful):
-        return
-    lit_points = points.only(useful)
-    is_free = sees_sky(scene, lit_points, direction[:, useful])
-    radiance = scene.drawn_sky.radiance(direction[:, useful])
-    arrives = radiance * diffuse[useful]
-    light.open_diffuse[:, useful] += arrives
-    light.diffuse[:, useful] += arrives * is_free
-    if specular is not None and gloss is not None:
-        colored = gloss.color[:, useful] * specular[useful] * radiance
-        light.open_specular[:, useful] += colored
-        light.specular[:, useful] += colored * is_free
+def _by_map(rays: int) -> int:
+    """Return how many of the rays towards the sky the map draws."""
+    return (rays + 1) // 2
 
 
-def sky_density(
-    scene: LitScene, direction: Floats, cosine: Floats, by_map: int, by_surface: int
-) -> Floats:
+def sky_density(scene: LitScene, direction: Floats, cosine: Floats, rays: int) -> Floats:
     """Return the number of rays [P] that `add_sky_light` sends along directions, per steradian."""
-    density: Floats = by_map * scene.drawn_sky.pdf(direction)
-    density += by_surface * _INV_PI * np.maximum(cosine, 0)
+    density: Floats = _by_map(rays) * scene.drawn_sky.pdf(direction)
+    density += (rays - _by_map(rays)) * _INV_PI * np.maximum(cosine, 0)
     return np.maximum(density, _LEAST)
 
 
@@ -108,8 +96,7 @@ def escaped_light(
     """
     cosine = dot(points.normal, direction)
     _, of_lobe = lobe(gloss, points, direction, cosine)
-    by_map = (rays + 1) // 2
-    sky_rays = sky_density(scene, direction, cosine, by_map, rays - by_map)
+    sky_rays = sky_density(scene, direction, cosine, rays)
     share = of_lobe / (of_lobe + sky_rays)
     escaped: Floats = gloss.color * (weight * share) * scene.drawn_sky.radiance(direction)
     return escaped

@@ -15,7 +15,6 @@ from torch.nn.attention import SDPBackend, sdpa_kernel
 from torch.utils.flop_counter import FlopCounterMode
 
 from model import positions, precision
-from model.attention import pack_lengths, pack_tokens
 from model.config import SIZES, BaseWidths, ModelConfig, base, hits_smoke, smoke
 from model.costs import Workload, costs, flops
 from model.precision import rounded_parts, set_precision, tf32
@@ -355,17 +354,11 @@ def test_rounding_together_changes_no_bit(
     found = results()
     layers = len(model.encoder.layers) + len(model.decoder.layers) + (family == "dpt")
     assert len(rounded) == 2 * layers, "once forth and once back for each layer, and the head"
-    monkeypatch.setattr(precision, "_round_weights", lambda *_: {})
+    monkeypatch.setattr(precision, "_round_together", lambda *_: {})
     alone = results()
     assert found.keys() == alone.keys()
     for name, value in found.items():
         assert torch.equal(value, alone[name]), name
-
-
-def test_without_autocast_nothing_is_rounded() -> None:
-    layer = torch.nn.Linear(3, 3)
-    assert precision.rounded_weights(layer, torch.device("cpu")) == {}
-    assert precision.rounded_weights(layer, torch.device("meta")) == {}
 
 
 def test_every_triangle_carries_its_own_vertices_normals_and_material() -> None:
@@ -440,17 +433,3 @@ def test_a_packed_batch_is_the_padded_one(family: str, monkeypatch: pytest.Monke
 def _forbid_masks(q: Tensor, k: Tensor, v: Tensor, attn_mask: Tensor | None = None) -> Tensor:
     assert attn_mask is None, "nothing that is padded is attended with a mask"
     return torch.nn.functional.scaled_dot_product_attention(q, k, v)
-
-
-def test_packing_keeps_what_exists_and_gradients_go_back_there() -> None:
-    packing = pack_lengths(LENGTHS, 9, torch.device("cpu"))
-    x = torch.arange(27.0).reshape(3, 9, 1).requires_grad_()
-    exists = torch.arange(9) < torch.tensor(LENGTHS)[:, None]
-    there = pack_tokens(x, packing)
-    assert torch.equal(there.detach(), x.detach()[exists])
-    starts_S1, longest = packing.sequences
-    assert starts_S1.tolist() == [0, 5, 14, 15] and longest >= 9
-    assert packing.of_views(2).starts_S1.tolist() == [0, 5, 14, 15, 20, 29, 30]
-    (there * there.detach()).sum().backward()
-    assert x.grad is not None
-    assert torch.equal(x.grad[..., 0], x.detach()[..., 0] * exists)

@@ -42,7 +42,6 @@ from model.published import (
     export_published_weights,
     fold,
     load_published_weights,
-    unfold,
 )
 from model.renderformer import RenderFormer, count_parameters
 from model.weights import (
@@ -396,16 +395,6 @@ def test_a_folded_layer_is_the_unfolded_one(patch: int, cells: int) -> None:
     # float64 sums of 559 x 13 products of size 1
     expected = pictures @ weight.T + bias
     torch.testing.assert_close(material @ ten.T + folded_bias, expected, rtol=0, atol=1e-11)
-
-
-@for_each("patch", [1, 8, 32])
-def test_folding_undoes_unfolding_bit_by_bit(patch: int) -> None:
-    ten = torch.randn(WIDTH, 10, generator=torch.Generator().manual_seed(1))
-    bias = torch.randn(WIDTH, generator=torch.Generator().manual_seed(2))
-    weight, same_bias = unfold(ten, bias, patch)
-    assert weight.shape == (WIDTH, TEXTURE_CHANNELS * patch**2)
-    again, again_bias = fold(weight, same_bias, patch)
-    assert torch.equal(again, ten) and torch.equal(again_bias, bias)
 
 
 def test_folding_sums_in_float64() -> None:

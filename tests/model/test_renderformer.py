@@ -6,25 +6,19 @@ rays are the conventions', and rotary products see differences of positions only
 """
 
 import dataclasses
-import math
 from functools import partial
 
 import numpy as np
-import pytest
 import torch
 from torch import Tensor, nn
 from torch.func import functional_call
 
 from model.attention import attend, attend_in_windows, cut_windows
-from model.layers import CrossAttention, SelfAttention, merge_heads, split_heads
 from model.positions import (
     Rotation,
     TriangleRotary,
     camera_rotation,
-    encode_normals,
-    encoded_normal_width,
     rotate,
-    to_camera,
     token_positions,
     world_rotation,
 )
@@ -32,7 +26,6 @@ from model.renderformer import RenderFormer, radiance
 from model.scene_tensors import SceneTensors, batch_scenes
 from model.view_decoder import bundle_rays, ray_directions, unbundle
 from storage.conventions import camera_rays
-from storage.errors import TrilightError
 from tests.for_each import for_each
 from tests.model.kit import (
     FAMILIES,
@@ -65,17 +58,6 @@ def test_company_and_padding_do_not_change_a_picture(family: str) -> None:
     assert together.shape == (2, 2, RESOLUTION, RESOLUTION, 3)
     close(together[0], render(model, short)[0])
     close(together[1], render(model, long)[0])
-
-
-@for_each("family", FAMILIES)
-def test_finite_garbage_in_the_padding_changes_nothing(family: str) -> None:
-    model = model_for(family)
-    batch = batch_scenes([random_scene(3, seed=1), random_scene(6, seed=2)])
-    triangles, normals = batch.triangles_BT33.clone(), batch.normals_BT33.clone()
-    triangles[0, 3:], normals[0, 3:] = 1e3, 7.0
-    dirty = dataclasses.replace(batch, triangles_BT33=triangles, normals_BT33=normals)
-    with torch.no_grad():
-        close(model(dirty, RESOLUTION), model(batch, RESOLUTION))
 
 
 @for_each("family", FAMILIES)
@@ -185,18 +167,6 @@ def test_radiance_undoes_the_logarithm_and_bounds_the_dark() -> None:
     assert -2.31e-3 < darkest < -2.29e-3  # 10^-0.001 - 1
 
 
-@for_each(
-    ("family", "resolution", "multiple"),
-    [*(("linear", px, 8) for px in (0, 4, 12, -8)), *(("swin", px, 16) for px in (0, 8, 24))],
-)
-def test_a_resolution_that_bundles_or_windows_do_not_fill_is_refused(
-    family: str, resolution: int, multiple: int
-) -> None:
-    message = f"resolution is {resolution}; expected a positive multiple of {multiple}"
-    with pytest.raises(TrilightError, match=message):
-        render(model_for(family), random_scene(2), resolution=resolution)
-
-
 @for_each("family", FAMILIES)
 def test_rotation_and_vertex_order_do_change_the_picture(family: str) -> None:
     """Guards: a network without positions would pass every law above."""
@@ -237,31 +207,6 @@ def test_one_encoding_serves_every_camera_in_any_order(family: str) -> None:
             got = model.decode(encoded, batch_scenes([alone]), RESOLUTION)
             close(got[0], render(model, alone)[0])
             close(got[0, 0], together[index])
-
-
-def test_cached_cross_attention_is_the_uncached_one() -> None:
-    """Against the published order: project, norm, split, rotate for this view, attend."""
-    layer = CrossAttention(48, 2).double()
-    generator = torch.Generator().manual_seed(0)
-    context = torch.randn(2, 9, 48, generator=generator, dtype=torch.float64)
-    bundles = torch.randn(2, 3, 5, 48, generator=generator, dtype=torch.float64)
-    angles = torch.randn(2, 3, 9, 12, generator=generator, dtype=torch.float64)
-    is_key = torch.arange(9) < torch.tensor([[9], [4]])
-    with torch.no_grad():
-        got = layer(bundles, layer.keys_values(context), (angles.cos(), angles.sin()), is_key)
-        for index in range(3):
-            rotation = (angles[:, index].cos(), angles[:, index].sin())
-            close(got[:, index], uncached(layer, bundles[:, index], context, rotation, is_key))
-
-
-def uncached(
-    layer: CrossAttention, x: Tensor, context: Tensor, rotation: Rotation, is_key: Tensor
-) -> Tensor:
-    normed = layer.context_norm(context)
-    q = split_heads(layer.q_norm(layer.q(x)), layer.num_heads)
-    k = rotate(split_heads(layer.k_norm(layer.k(normed)), layer.num_heads), *rotation)
-    v = split_heads(layer.v(normed), layer.num_heads)
-    return layer.out(merge_heads(attend_reference(q, k, v, is_key)))
 
 
 @for_each("eps", [0.0, 1e-5])
@@ -397,22 +342,6 @@ def test_a_shifted_cut_has_whole_windows_strips_and_corners_and_asks_no_device()
     assert torch.equal(windows.order_Q[windows.back_Q], torch.arange(24**2))
 
 
-@for_each("shifted", [False, True])
-def test_a_bundle_reaches_its_own_window_only(shifted: bool) -> None:
-    layer = SelfAttention(8, 2).double()
-    windows = cut_windows(8, 4, shifted=shifted, device=CPU)
-    x = torch.randn(1, 64, 8, generator=torch.Generator().manual_seed(0), dtype=torch.float64)
-    moved = x.clone()
-    moved[0, 0] += 1
-    with torch.no_grad():
-        change = (layer(moved, windows=windows) - layer(x, windows=windows)).abs().amax(dim=-1)
-    reached = change.unflatten(1, (8, 8))[0] > 0
-    width = 2 if shifted else 4
-    expected = torch.zeros(8, 8, dtype=torch.bool)
-    expected[:width, :width] = True
-    assert torch.equal(reached, expected)
-
-
 @for_each("resolution", [8, 24, 256])
 @for_each("fov_deg", [1.0, 30.0, 45.0, 60.0, 170.0])
 def test_rays_agree_with_the_conventions(resolution: int, fov_deg: float) -> None:
@@ -451,67 +380,3 @@ def test_products_of_rotated_vectors_depend_on_the_difference_of_positions(num_f
     # float64 sums of 128 products of size 1
     torch.testing.assert_close(product(shift), product(0 * shift), rtol=0, atol=1e-12)
     assert abs(product(shift) - (q * k).sum()) > 1e-3, "positions must matter at all"
-
-
-def test_angles_are_coordinate_times_frequency_coordinate_major() -> None:
-    rotary = TriangleRotary(num_freqs=2, max_freq=5.0, head_width=40)
-    cos, sin = rotary(torch.arange(1.0, 10.0).reshape(1, 1, 3, 3))
-    expected = [1, 5, 2, 10, 3, 15, 4, 20, 5, 25, 6, 30, 7, 35, 8, 40, 9, 45, 0, 0]
-    # float32 sine of angles up to 45 radians
-    torch.testing.assert_close(cos[0, 0], torch.tensor(expected).cos(), rtol=0, atol=1e-5)
-    torch.testing.assert_close(sin[0, 0], torch.tensor(expected).sin(), rtol=0, atol=1e-5)
-
-
-@for_each(
-    ("num_freqs", "max_freq", "expected"),
-    [
-        (1, 5.0, [1.0]),
-        (3, 5.0, [1.0, 5.0**0.5, 5.0]),
-        # both published sets, as the documents print them
-        (6, 5.0, [1, 1.38, 1.90, 2.63, 3.62, 5.0]),
-        (6, 11.0, [1, 1.62, 2.61, 4.22, 6.81, 11.0]),
-    ],
-)
-def test_frequencies_are_log_spaced(num_freqs: int, max_freq: float, expected: list[float]) -> None:
-    rotary = TriangleRotary(num_freqs=num_freqs, max_freq=max_freq, head_width=128)
-    # two printed decimals
-    torch.testing.assert_close(rotary.freqs_F, torch.tensor(expected), rtol=0, atol=6e-3)
-
-
-def test_rotation_pairs_channel_i_with_channel_i_plus_half() -> None:
-    x = torch.eye(4).reshape(1, 4, 1, 4)
-    angle = torch.tensor([0.3, 0.7])
-    turned = rotate(x, angle.cos().reshape(1, 1, 2), angle.sin().reshape(1, 1, 2))[0, :, 0]
-    a, b = 0.3, 0.7
-    expected = torch.tensor(
-        [
-            [math.cos(a), 0, math.sin(a), 0],
-            [0, math.cos(b), 0, math.sin(b)],
-            [-math.sin(a), 0, math.cos(a), 0],
-            [0, -math.sin(b), 0, math.cos(b)],
-        ]
-    )
-    torch.testing.assert_close(turned, expected)
-
-
-def test_normal_encoding_of_known_numbers() -> None:
-    normals = torch.linspace(-1, 1, 9, dtype=torch.float64).reshape(1, 1, 3, 3)
-    encoded = encode_normals(normals, octaves=3)[0, 0]
-    flat = normals.flatten()
-    phases = [c * 2**k for c in flat.tolist() for k in range(3)]
-    sines = [math.sin(p) for p in phases]
-    cosines = [math.cos(p) for p in phases]
-    expected = torch.tensor([*flat.tolist(), *sines, *cosines], dtype=torch.float64)
-    assert len(encoded) == encoded_normal_width(3)
-    # sin(x + pi / 2) for cos(x), in float64
-    torch.testing.assert_close(encoded, expected, rtol=0, atol=1e-14)
-
-
-def test_camera_space_is_the_inverse_pose() -> None:
-    scene = random_scene(5, num_views=3)
-    inside = to_camera(scene.triangles_T33[None], scene.c2w_V44[None])[0]
-    homogeneous = torch.cat([inside, torch.ones_like(inside[..., :1])], dim=-1)
-    outside = homogeneous @ scene.c2w_V44[:, None].transpose(-1, -2)
-    expected = scene.triangles_T33.expand(3, -1, -1, -1)
-    # float64, coordinates of size 10
-    torch.testing.assert_close(outside[..., :3], expected, rtol=0, atol=1e-13)

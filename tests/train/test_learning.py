@@ -11,7 +11,6 @@ in a process of their own.
 
 import dataclasses
 import json
-import re
 from collections.abc import Iterator
 from concurrent.futures import ProcessPoolExecutor
 from pathlib import Path
@@ -152,18 +151,6 @@ def hits_run(**changes: object) -> TrainSettings:
     return dataclasses.replace(run, **changes)  # type: ignore[arg-type]
 
 
-def test_what_is_traced_depends_on_no_thread_and_no_rank(dataset: Dataset) -> None:
-    alone = {scene.key: scene.tensors.traced for scene in take(dataset, hits_run(), 1, first=3)[0]}
-    for rank in range(3):
-        part = {"workers": 3, "rank": rank, "world_size": 3}
-        ((other,),) = take(dataset, hits_run(), 1, first=3, **part)
-        a, b = alone.pop(other.key), other.tensors.traced
-        assert a is not None
-        assert b is not None
-        for name, value in vars(a).items():
-            assert torch.equal(value, getattr(b, name)), name
-
-
 def test_views_are_traced_after_the_symmetries_and_lack_inputs_by_chance(dataset: Dataset) -> None:
     scenes = take(dataset, hits_run(), 1, first=3)[0]
     given = torch.cat([s.tensors.traced.given_VI for s in scenes if s.tensors.traced])
@@ -266,17 +253,6 @@ def test_a_run_goes_on_and_a_second_one_begins_on_a_card(
     card.submit(resume, data, lpips, tmp_path).result()
 
 
-@pytest.mark.slow("gpu")
-def test_the_card_forgives_nothing(card: ProcessPoolExecutor) -> None:
-    for mistake, message in {
-        "processor": "Expected all tensors to be on the same device|two devices",
-        "numpy": "can't convert cuda:0",
-        "unique": "unique",
-    }.items():
-        error = card.submit(mixed_on_the_card, mistake).exception()
-        assert error is not None and re.search(message, str(error)), mistake
-
-
 RESOLUTION = 64
 """One window of the large network's."""
 
@@ -342,15 +318,3 @@ def resume(data: str, lpips: str, out: Path) -> None:
     for name in ("first", "second"):
         record = json.loads((out / name / "settings.json").read_text())
         assert record["muon_precision"] == "bfloat16"
-
-
-def mixed_on_the_card(name: str) -> None:
-    """Make a mistake that a card would not forgive."""
-    with fake_card():
-        on_card = torch.zeros(4, 3, 16, 16, device=CARD)
-        mistakes = {
-            "processor": lambda: on_card + torch.zeros(4, 1, 1, 1),
-            "numpy": lambda: on_card.numpy(),
-            "unique": lambda: on_card.unique(),
-        }
-        mistakes[name]()

@@ -40,7 +40,7 @@ from train.evaluation import validation
 from train.folder import read_rows
 from train.loop import trainer
 from train.loop.checkpoints import read_checkpoint
-from train.loop.interrupts import Stopped
+from train.loop.interrupts import SIGNALS, Stopped
 from train.progress import TrainProgress
 from train.resume import StartOptions
 from train.run_training import TrainResult
@@ -101,20 +101,6 @@ def same_as_uninterrupted(out: Path, whole: TrainResult) -> None:
 def curve(out: Path) -> list[dict]:
     rows = read_rows(out / "metrics.jsonl")
     return [{k: v for k, v in row.items() if k not in TIMINGS} for row in rows]
-
-
-def test_stopped_and_resumed_is_uninterrupted_to_the_bit(
-    dataset: Dataset, whole: TrainResult, tmp_path: Path
-) -> None:
-    """By each signal in turn, in the middle of rows of the log."""
-    handlers = signal.getsignal(signal.SIGINT), signal.getsignal(signal.SIGTERM)
-    for step, number in ((1, signal.SIGINT), (7, signal.SIGTERM), (11, signal.SIGUSR1)):
-        with pytest.raises(TrilightError, match=f"stopped at step {step} .* --resume"):
-            trained(tiny_run(), dataset, tmp_path, resume=step > 1, progress=SignalAt(step, number))
-        assert (signal.getsignal(signal.SIGINT), signal.getsignal(signal.SIGTERM)) == handlers
-    trained(tiny_run(), dataset, tmp_path, resume=True)
-    same_as_uninterrupted(tmp_path, whole)
-    assert curve(tmp_path) == curve(whole.folder.root), "a row half full is filled"
 
 
 class SignalIn:
@@ -348,31 +334,34 @@ def have_bfloat16(patch: pytest.MonkeyPatch, quick: bool) -> None:
 
 
 @for_each("muon_rate, quick", [(0.0, True), (3.0, True), (3.0, False)])
-def test_resumed_after_every_step_is_uninterrupted(
+def test_stopped_by_each_signal_and_resumed_is_uninterrupted_to_the_bit(
     dataset: Dataset,
     tmp_path: Path,
     monkeypatch: pytest.MonkeyPatch,
     muon_rate: float,
     quick: bool,
 ) -> None:
-    """With a running mean, every symmetry that toy scenes have, and a perceptual term."""
+    """After every step, also within rows of the log.
+
+    With a running mean, every symmetry that toy scenes have, and a perceptual term.
+    """
     have_bfloat16(monkeypatch, quick)
     settings = tiny_run(
         num_steps=4,
         ema_decay=0.9,
         muon_rate=muon_rate,
         loss=LossSettings(perceptual="ms_ssim", noise_half=0.01),
-        log_every=1,
-        validate_every=4,
     )
     out = tmp_path / "stopped"
     whole = trained(settings, dataset, tmp_path / "whole")
-    for step in (1, 2, 3):
-        with pytest.raises(TrilightError, match=f"stopped at step {step} "):
-            stop = SignalAt(step, signal.SIGTERM)
-            trained(settings, dataset, out, resume=step > 1, progress=stop)
-    again = trained(settings, dataset, out, resume=True)
-    assert again.folder.weights.read_bytes() == whole.folder.weights.read_bytes()
+    handlers = [signal.getsignal(number) for number in SIGNALS]
+    for step, number in enumerate(SIGNALS, 1):
+        with pytest.raises(TrilightError, match=f"stopped at step {step} .* --resume"):
+            trained(settings, dataset, out, resume=step > 1, progress=SignalAt(step, number))
+        assert [signal.getsignal(number) for number in SIGNALS] == handlers
+    trained(settings, dataset, out, resume=True)
+    same_as_uninterrupted(out, whole)
+    assert curve(out) == curve(whole.folder.root), "a row half full is filled"
 
 
 def test_muon_goes_on_in_another_precision_on_another_processor(

@@ -92,7 +92,11 @@ def move_scene(scene: TrainingScene, rotation_33: Tensor, shift_3: Tensor) -> Tr
         triangles_T33=(old.triangles_T33.double() @ rotation_33.T + shift_3).float(),
         normals_T33=(old.normals_T33.double() @ rotation_33.T).float(),
         c2w_V44=(motion_44 @ old.c2w_V44.double()).float(),
-        sky=old.sky and rotate_sky(old.sky, rotation_33.numpy()),
+        sky=old.sky
+        and dataclasses.replace(
+            old.sky,
+            rotation=(rotation_33.numpy() @ old.sky.rotation.astype(np.float64)).astype(np.float32),
+        ),
     )
     return dataclasses.replace(scene, tensors=tensors)
 
@@ -115,10 +119,25 @@ def mirror_scene(scene: TrainingScene) -> TrainingScene:
         # the reflection before and after: row and column of x change their signs
         c2w_V44=_tensor(sides_4[:, None] * old.c2w_V44.numpy() * sides_4),
         textures=old.textures and old.textures.with_vertices(reversed_T3),
-        sky=old.sky and mirror_sky(old.sky, sides_3),
+        sky=old.sky and _mirror_sky(old.sky, sides_3),
     )
     target_VRR3 = torch.from_numpy(_flip_columns(scene.target_VRR3.numpy()))
     return dataclasses.replace(scene, tensors=tensors, target_VRR3=target_VRR3, lights_VLRR3=None)
+
+
+def _mirror_sky(sky: Environment, sides_3: NDArray[np.float32]) -> Environment:
+    """Return the mirrored sky; the one coordinate whose `sides` is -1 is negated.
+
+    A mirror reverses the order of columns, which puts texels exactly where the reflection does, and
+    then is a rotation.
+    """
+    reversed_columns = np.diag([1.0, -1.0, 1.0])  # which negate azimuths
+    rotation = np.diag(sides_3.astype(np.float64)) @ sky.rotation.astype(np.float64)
+    return dataclasses.replace(
+        sky,
+        radiance_rgb=np.ascontiguousarray(sky.radiance_rgb[:, ::-1]),
+        rotation=(rotation @ reversed_columns).astype(np.float32),
+    )
 
 
 def permute_channels(scene: TrainingScene, order: np.ndarray) -> TrainingScene:
@@ -132,7 +151,10 @@ def permute_channels(scene: TrainingScene, order: np.ndarray) -> TrainingScene:
         old,
         material_TM=_tensor(old.material_TM.numpy()[:, numbers]),
         textures=old.textures and old.textures.with_channels(order),
-        sky=old.sky and permute_sky_channels(old.sky, order),
+        sky=old.sky
+        and dataclasses.replace(
+            old.sky, radiance_rgb=np.ascontiguousarray(old.sky.radiance_rgb[..., order])
+        ),
     )
     return dataclasses.replace(
         scene,
@@ -218,7 +240,9 @@ def _scale_emission(tensors: SceneTensors, factor_T: Tensor, sky_factor: float) 
             material_TM[:, part] = _log10(factor_T[:, None] * _linear(material_TM[:, part]))
         elif column.is_radiance:
             material_TM[:, part] *= factor_T[:, None]
-    sky = tensors.sky and scale_sky(tensors.sky, sky_factor)
+    sky = tensors.sky
+    if sky is not None:
+        sky = dataclasses.replace(sky, radiance_rgb=sky.radiance_rgb * np.float32(sky_factor))
     return dataclasses.replace(tensors, material_TM=material_TM, sky=sky)
 
 
@@ -228,34 +252,3 @@ def _linear(log10: Tensor) -> Tensor:
 
 def _log10(linear: Tensor) -> Tensor:
     return torch.log1p(linear) / LN_10
-
-
-def rotate_sky(sky: Environment, rotation_33: NDArray[np.float64]) -> Environment:
-    """Return the sky after a rotation of the world space."""
-    rotation = rotation_33 @ sky.rotation.astype(np.float64)
-    return dataclasses.replace(sky, rotation=rotation.astype(np.float32))
-
-
-def mirror_sky(sky: Environment, sides_3: NDArray[np.float32]) -> Environment:
-    """Return the mirrored sky; the one coordinate whose `sides` is -1 is negated.
-
-    A mirror reverses the order of columns, which puts texels exactly where the reflection does, and
-    then is a rotation.
-    """
-    reversed_columns = np.diag([1.0, -1.0, 1.0])  # which negate azimuths
-    rotation = np.diag(sides_3.astype(np.float64)) @ sky.rotation.astype(np.float64)
-    return dataclasses.replace(
-        sky,
-        radiance_rgb=np.ascontiguousarray(sky.radiance_rgb[:, ::-1]),
-        rotation=(rotation @ reversed_columns).astype(np.float32),
-    )
-
-
-def permute_sky_channels(sky: Environment, order: NDArray[np.integer]) -> Environment:
-    """Return the sky with permuted color channels."""
-    return dataclasses.replace(sky, radiance_rgb=np.ascontiguousarray(sky.radiance_rgb[..., order]))
-
-
-def scale_sky(sky: Environment, factor: float) -> Environment:
-    """Return the sky with its radiance multiplied by `factor`."""
-    return dataclasses.replace(sky, radiance_rgb=sky.radiance_rgb * np.float32(factor))

@@ -55,8 +55,9 @@ class BadSampleCounter:
         Raises:
             TrilightError: the text of `error` if the limit is 0, or that the limit is exceeded.
         """
+        text = " ".join(filter(None, [str(error), self._advice]))
         if not self.limit:
-            raise TrilightError(" ".join(filter(None, [str(error), self._advice]))) from error
+            raise TrilightError(text) from error
         with self._lock:
             self._counts.setdefault(sha256_hex(name.encode())[:16], num_samples)
             self._messages.setdefault(name, str(error))
@@ -64,7 +65,7 @@ class BadSampleCounter:
         if count > self.limit:
             raise TrilightError(
                 f"data: {count} samples are unusable; expected at most {self.limit}. The last: "
-                + " ".join(filter(None, [str(error), self._advice]))
+                f"{text}"
             ) from error
 
 

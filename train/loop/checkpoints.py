@@ -194,8 +194,7 @@ def newest_checkpoint(
         )
     if damaged:
         note(f"{' '.join(damaged)} The run goes on from that of step {step}")
-    # bit by bit: a float32 mean of large numbers is rounded, and all processes must agree
-    if any(0 < share < 1 for share in dist_context.mean([step >> bit & 1 for bit in range(32)])):
+    if len(set(dist_context.gather_text(str(step)))) > 1:
         raise TrilightError(
             f"{folder.parent}: the processes do not read the same checkpoint; this one reads that "
             f"of step {step}. Check that the folder is the same on every machine, and resume "

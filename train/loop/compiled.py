@@ -48,7 +48,7 @@ def compile_parts(
         # backward pass of `smoke` and `pretrain` (pytorch/pytorch issues 181563 and 197077); the
         # second is open in later versions too.
         inductor.triton.coalesce_tiling_analysis = False
-    for _, module, method in compiled_parts(model, objective):
+    for module, method in compiled_parts(model, objective):
         if method == "forward":
             module.compile(dynamic=True)
         else:
@@ -58,7 +58,7 @@ def compile_parts(
 
 def undo_compiling(model: RenderFormer, objective: TrainingLoss) -> None:
     """Disable the compilation that `compile_parts` enabled."""
-    for _, module, method in compiled_parts(model, objective):
+    for module, method in compiled_parts(model, objective):
         if method == "forward":
             module._compiled_call_impl = None
         elif method in vars(module):
@@ -73,22 +73,16 @@ def is_compiler_error(error: Exception) -> bool:
     return isinstance(error, TorchDynamoException | InductorError)
 
 
-def compiled_parts(
-    model: RenderFormer, objective: TrainingLoss
-) -> Iterator[tuple[str, nn.Module, str]]:
-    """Yield what is compiled: a display name, the module, and the method that is called."""
+def compiled_parts(model: RenderFormer, objective: TrainingLoss) -> Iterator[tuple[nn.Module, str]]:
+    """Yield what is compiled: the module, and the method that is called."""
     if model.encoder is not None:
-        for layer in model.encoder.layers:
-            yield "encoder layers", layer, "forward"
-        yield "keys and values", model.decoder, "keys_values"
-    for layer in model.decoder.layers:
-        yield "decoder layers", layer, "forward"
+        yield from ((layer, "forward") for layer in model.encoder.layers)
+        yield model.decoder, "keys_values"
+    yield from ((layer, "forward") for layer in model.decoder.layers)
     if isinstance(model.decoder, HitDecoder) and model.decoder.filter is not None:
-        yield "filter", model.decoder.filter, "mix_level"
-    yield "head", model.decoder.head, "forward"
-    for module in objective.modules():
-        if isinstance(module, Lpips):
-            yield "LPIPS", module, "forward"
+        yield model.decoder.filter, "mix_level"
+    yield model.decoder.head, "forward"
+    yield from ((each, "forward") for each in objective.modules() if isinstance(each, Lpips))
 
 
 def _is_worthwhile(device: torch.device) -> bool:

@@ -9,7 +9,6 @@ import math
 import time
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import closing, contextmanager, suppress
-from dataclasses import asdict
 from functools import lru_cache
 
 import torch
@@ -373,7 +372,7 @@ class Trainer:
         taken_s = self.activity.pop_seconds()
         ours = {
             "own_s": round(own_seconds(taken_s, self.window_steps), 4),
-            "spikes": [asdict(spike) for spike in self.found_spikes],
+            "spikes": self.found_spikes,
         }
         with self.activity.during("exchange"):
             texts = self.dist_context.gather_text(json.dumps(ours))

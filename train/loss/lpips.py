@@ -176,38 +176,34 @@ def load_lpips(source: str | None) -> Lpips | None:
     source = source or os.environ.get(VARIABLE) or None
     if source is None:
         return None
-    if source == HUB:
-        return Lpips(_download(VGG16_URL, check_hash=True), _download(LINEAR_URL))
-    return Lpips(_read(Path(source) / VGG16_FILE), _read(Path(source) / LINEAR_FILE))
+    return Lpips(_state(source, VGG16_URL), _state(source, LINEAR_URL))
 
 
-def _read(path: Path) -> dict[str, Tensor]:
-    if not path.is_file():
+def _state(source: str, url: str) -> dict[str, Tensor]:
+    """Return the state dict of a published file, from its URL or from the folder `source`."""
+    is_hub = source == HUB
+    path = Path(source) / url.rpartition("/")[2]
+    if not is_hub and not path.is_file():
         raise TrilightError(
             f"LPIPS: {path} does not exist; expected {VGG16_FILE} (torchvision) and {LINEAR_FILE} "
             f"(LPIPS 0.1) in that folder, or `{HUB}` in its place to download them."
         )
+    where = url if is_hub else str(path)
+    loads: dict[str, Any] = {"map_location": "cpu", "weights_only": True}
+    load: Any = torch.load
+    if is_hub:
+        load = torch.hub.load_state_dict_from_url
+        loads |= {"check_hash": url == VGG16_URL, "progress": False}
     try:
-        state: Any = torch.load(path, map_location="cpu", weights_only=True)
-    except Exception as error:  # torch raises whatever the damage leads to
-        raise TrilightError(f"LPIPS: {path} is not readable ({type(error).__name__}).") from error
-    return _check_state(state, str(path))
-
-
-def _download(url: str, *, check_hash: bool = False) -> dict[str, Tensor]:
-    try:
-        state = torch.hub.load_state_dict_from_url(
-            url, map_location="cpu", weights_only=True, check_hash=check_hash, progress=False
-        )
-    except Exception as error:  # no network, a proxy's page, a wrong hash: torch has no one class
-        raise TrilightError(
-            f"LPIPS: {url} could not be downloaded ({error}); name a folder that holds "
-            f"{VGG16_FILE} and {LINEAR_FILE} instead."
-        ) from error
-    return _check_state(state, url)
-
-
-def _check_state(state: Any, where: str) -> dict[str, Tensor]:
+        state: Any = load(where, **loads)
+    except Exception as error:  # torch raises whatever the damage or the network leads to
+        problem = f"is not readable ({type(error).__name__})"
+        if is_hub:
+            problem = (
+                f"could not be downloaded ({error}); name a folder that holds {VGG16_FILE} and "
+                f"{LINEAR_FILE} instead"
+            )
+        raise TrilightError(f"LPIPS: {where} {problem}.") from error
     if not isinstance(state, dict) or not all(isinstance(t, Tensor) for t in state.values()):
         raise TrilightError(f"LPIPS: {where} holds no state dict; expected tensors by name.")
     return state

@@ -9,7 +9,6 @@ import os
 import statistics
 from collections import deque
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -31,19 +30,9 @@ _MAD_TO_DEVIATION = 1.4826
 """Ratio of standard deviation to median absolute deviation of normal numbers."""
 
 
-@dataclass(frozen=True, kw_only=True)
-class Spike:
-    """Loss or gradient norm of a step above its bound."""
-
-    step: int
-    """Number of the step, from 1."""
-    what: str
-    """Name of the value, `loss` or `grad_norm`."""
-    value: float
-    bound: float
-    """Upper bound that the value exceeds."""
-    keys: tuple[str, ...]
-    """Sample keys of this process's scenes in the step."""
+Spike = dict[str, Any]
+"""Loss or gradient norm of a step above its bound: the `step`, from 1; `what`, `loss` or
+`grad_norm`; its `value` and upper `bound`; and `keys`, of this process's samples in the step."""
 
 
 class SpikeDetector:
@@ -59,15 +48,15 @@ class SpikeDetector:
 
     def add(self, step: int, report: StepReport, keys: Sequence[str]) -> list[Spike]:
         """Add a step, counted from 1, and return its spikes."""
-        spikes = []
+        spikes = list[Spike]()
         for what, recent in self._recent.items():
             value = getattr(report, what)
             if not math.isfinite(value):
                 continue
             bound = spike_bound(recent, self._deviations)
             if bound is not None and value > bound:
-                spike = Spike(step=step, what=what, value=value, bound=bound, keys=tuple(keys))
-                spikes.append(spike)
+                spike = {"step": step, "what": what, "value": value, "bound": bound}
+                spikes.append({**spike, "keys": list(keys)})
             recent.append(value)
         return spikes
 

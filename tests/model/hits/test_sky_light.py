@@ -32,7 +32,9 @@ from tests.model.hits.kit import FLOOR, corner, direct, lit_scene, traced
 from tests.model.kit import awake, hits_config, render, tiny_config
 from tests.pipeline.renders.scene_kit import join, material, quad, sphere
 from tests.sky_maps import as_sky, constant, night, one_sun, six_poles, smooth
-from train.data.augment import mirror_sky, permute_sky_channels, rotate_sky, scale_sky
+from tests.train.kit import bare_scene
+from train.data.augment import mirror_scene, move_scene, permute_channels, scale_light
+from train.data.scenes import TrainingScene
 
 
 def _floor(sky: Environment) -> Scene:
@@ -223,22 +225,30 @@ DIRECTIONS = np.random.default_rng(0).normal(size=(500, 3))
 HERE = environment_values(SKY, DIRECTIONS)
 
 
-def test_light_comes_from_where_a_symmetry_puts_it() -> None:
+def test_light_comes_from_where_a_symmetry_of_training_puts_it() -> None:
     """Rotations are kept in float32, by which this sky changes by less than 1e-6."""
+
+    def sky_of(training: TrainingScene) -> Environment:
+        sky = training.tensors.sky
+        assert sky is not None
+        sky.check()
+        return sky
+
+    below = bare_scene(scene_tensors(corner(sky=SKY)))
     rotation, sides = uniform_rotation(np.random.default_rng(9)), np.array([-1, 1, 1], np.float32)
-    there = environment_values(rotate_sky(SKY, rotation), DIRECTIONS @ rotation.T)
+    moved = move_scene(below, torch.from_numpy(rotation), torch.tensor([0.4, -0.1, 0.2]))
+    there = environment_values(sky_of(moved), DIRECTIONS @ rotation.T)
     assert np.abs(there - HERE).max() < 3e-6
-    mirrored = mirror_sky(SKY, sides)
-    mirrored.check()
-    assert np.abs(environment_values(mirrored, DIRECTIONS * sides) - HERE).max() < 3e-6
-    twice = mirror_sky(mirrored, sides)
+    mirrored = mirror_scene(below)
+    assert np.abs(environment_values(sky_of(mirrored), DIRECTIONS * sides) - HERE).max() < 3e-6
+    twice = sky_of(mirror_scene(mirrored))
     assert np.array_equal(twice.radiance_rgb, SKY.radiance_rgb)
     assert np.array_equal(twice.rotation, SKY.rotation)
     order = np.array([1, 2, 0])
-    assert np.array_equal(
-        environment_values(permute_sky_channels(SKY, order), DIRECTIONS), HERE[:, order]
-    )
-    assert np.abs(environment_values(scale_sky(SKY, 3.0), DIRECTIONS) - 3 * HERE).max() < 1e-6
+    permuted = sky_of(permute_channels(below, order))
+    assert np.array_equal(environment_values(permuted, DIRECTIONS), HERE[:, order])
+    scaled = sky_of(scale_light(below, 3.0))
+    assert np.abs(environment_values(scaled, DIRECTIONS) - 3 * HERE).max() < 1e-6
 
 
 @for_each("config", [tiny_config(), hits_config()])

@@ -23,11 +23,10 @@ from model.config import BaseWidths, ModelConfig
 from model.costs import Workload, training_flops
 from model.renderformer import RenderFormer
 from model.width_scales import width_scales
-from storage.seeds import rng_for
 from tests.for_each import for_each
 from tests.train.kit import TINY_MODEL, tiny_run
 from tests.train.toy import toy_sample
-from train.data.buckets import MOST_WASTE, TrainingBatch, bucket_scenes, collate_batch
+from train.data.buckets import TrainingBatch, collate_batch
 from train.data.scenes import TrainingScene, training_scene
 from train.loop import optimizer as muon_file
 from train.loop.distributed import DistributedContext
@@ -217,18 +216,6 @@ def test_the_formula_says_what_any_scene_needs(boxes: int) -> None:
     found = counted(DEEPER, collate_batch([with_triangles(12 * boxes)]))
     # a first layer needs no gradient of its inputs, which our factor of 3 counts: below 10 %
     assert flops(12 * boxes) == pytest.approx(found, rel=0.1)
-
-
-def test_batching_wastes_less_than_it_may() -> None:
-    """Counted by torch, against the sum of single scenes, over lengths as they are drawn."""
-    lengths = rng_for(0, "lengths").integers(10, 300, 7)
-    scenes = [with_triangles(int(length)) for length in lengths]
-    batches = bucket_scenes(scenes, flops, 16)
-    together = sum(counted(DEEPER, batch) for batch in batches)
-    alone = sum(counted(DEEPER, collate_batch([scene])) for scene in scenes)
-    assert 1 < together / alone < 1 + MOST_WASTE
-    assert len(batches) < len(scenes)
-    assert np.ptp(lengths) > 200
 
 
 JORDAN = (3.4445, -4.7750, 2.0315)

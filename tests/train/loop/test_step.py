@@ -402,7 +402,7 @@ def test_a_part_is_one_graph(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(torch.amp, "is_autocast_available", cut)
     layers = {"encoder_layers": 1, "decoder_layers": 1}
     model = awake(tiny_config("linear", **layers), dtype=torch.float32)
-    for _, module, method in compiled_parts(model, OBJECTIVE):
+    for module, method in compiled_parts(model, OBJECTIVE):
         assert method in ("forward", "keys_values")
         whole = torch.compile(
             getattr(module, method), backend="eager", dynamic=True, fullgraph=True
