@@ -57,7 +57,7 @@ REDUCED = (torch.bfloat16, torch.float16)
 def rounded_parts(model: "RenderFormer") -> list[nn.Module]:
     """Return the modules that a precision rounds; the others stay float32."""
     scene = [] if model.encoder is None else [model.encoder.layers]
-    return [*scene, model.decoder.layers, *model.decoder.head.rounded_parts()]
+    return [*scene, model.decoder.layers, *model.decoder.head.rounded_parts]
 
 
 def set_precision(model: "RenderFormer", name: str) -> "RenderFormer":

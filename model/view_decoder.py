@@ -81,6 +81,8 @@ def picture_channels(config: ModelConfig) -> int:
 class LinearHead(nn.Module):
     """Linear map of the last layer's tokens to P x P pixels each."""
 
+    rounded_parts: Sequence[nn.Module] = ()  # rounding of the last layer would be visible
+
     def __init__(self, config: ModelConfig) -> None:
         super().__init__()
         self.patch_px = config.patch_px
@@ -93,10 +95,6 @@ class LinearHead(nn.Module):
         tokens_MQW = taps_MQW[0].to(self.last.weight.dtype)
         with without_autocast(tokens_MQW.device):
             return unbundle(self.last(self.norm(tokens_MQW)), self.patch_px)
-
-    def rounded_parts(self) -> list[nn.Module]:
-        """Return no module, since rounding of the last layer would be visible."""
-        return []
 
 
 class ResidualConv(nn.Module):
@@ -210,8 +208,9 @@ class DptHead(nn.Module):
         with without_autocast(halved.device):
             return self.last(silu(self.widen(halved)))
 
-    def rounded_parts(self) -> list[nn.Module]:
-        """Return all modules but the last two layers, whose rounding would be visible."""
+    @property
+    def rounded_parts(self) -> Sequence[nn.Module]:
+        """All modules but the last two layers, whose rounding would be visible."""
         return [self.project, self.resize, self.reassemble, self.fuse, self.halve]
 
     def _grid(self, level: int, tokens_MQW: Tensor) -> Tensor:
@@ -264,16 +263,10 @@ class ViewDecoder(nn.Module):
         if scene.packing is not None:
             rotation = packed_camera_rotation(rotation, scene.packing)
         cuts: list[Windows | None] = [None, None]
-        if self.window_bundles:
-            cuts = [
-                cut_windows(
-                    resolution // self.patch_px,
-                    self.window_bundles,
-                    shifted=shifted,
-                    device=x_BVQW.device,
-                )
-                for shifted in (False, True)
-            ]
+        if width := self.window_bundles:
+            side = resolution // self.patch_px
+            device = x_BVQW.device
+            cuts = [cut_windows(side, width, shifted=each, device=device) for each in (False, True)]
         x_BVQW = x_BVQW.to(dtype_of(self.layers))
         keys = scene.keys(views=rotation[0].shape[1])
         taps = {}
@@ -282,7 +275,7 @@ class ViewDecoder(nn.Module):
             x_BVQW = run_layer(layer, *inputs, recompute=self.recompute)
             if index in self.head.taps:
                 taps[index] = x_BVQW
-        weights = rounded_weights(self.head, x_BVQW.device, self.head.rounded_parts())
+        weights = rounded_weights(self.head, x_BVQW.device, self.head.rounded_parts)
         tokens = [torch.flatten(taps[tap], 0, 1) for tap in self.head.taps]
         picture_MCRR = rounded_call(self.head, weights, tokens)
         picture_BVRRC = picture_MCRR.movedim(1, -1).unflatten(0, fov_deg_BV.shape)

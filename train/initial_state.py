@@ -39,9 +39,6 @@ from train.settings import TrainSettings, stored_settings
 class StartPlan(ResumePlan):
     """Everything that a run starts or resumes with; nothing is written yet."""
 
-    history: tuple[Event, ...] = ()
-    notes: tuple[str, ...] = ()
-    changes_meaning: bool = True
     network: RenderFormer | None = None
     """Network whose weights are copied; None for random weights or a checkpoint."""
     network_source: str = ""
@@ -170,7 +167,7 @@ def _write_settings(
     now = {
         "settings": stored_settings(state.settings),
         "data_digest": state.data_digest,
-        **({RECORD: state.mixture.record()} if state.mixture else {}),
+        **({RECORD: dataclasses.asdict(state.mixture)} if state.mixture else {}),
         "history": event_records(state.history),
     }
     write_atomically(folder.settings, pretty_json(origin | _read_settings(folder) | now))

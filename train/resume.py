@@ -114,11 +114,11 @@ class ResumePlan:
 
     settings: TrainSettings
     """Settings of the next step."""
-    history: tuple[Event, ...]
+    history: tuple[Event, ...] = ()
     """All events so far, oldest first, including those of this resume."""
-    notes: tuple[str, ...]
+    notes: tuple[str, ...] = ()
     """Messages for the user, one per change."""
-    changes_meaning: bool
+    changes_meaning: bool = True
     """True if this resume changes a setting or the data that decide the weights."""
 
 

@@ -18,12 +18,12 @@ from pipeline.flows.prefect_server import GPU_LIMIT, run_to_end
 from pipeline.renders.mitsuba_variant import visible_gpus
 from storage.aliases import PRESET_ALIASES
 from storage.errors import TrilightError
-from train.presets import TRAINING_PRESETS, smoke
+from train.presets import TRAINING_PRESETS, training_preset
 from train.settings import TrainSettings
 
 TrainingPresetName = Literal[(*PRESET_ALIASES, *TRAINING_PRESETS)]  # type: ignore[valid-type]
 """Names of the training presets, a list of choices in the form."""
-RunChanges = overrides_form(TrainSettings, smoke())
+RunChanges = overrides_form(TrainSettings, training_preset("smoke"))
 """Form of every setting; an empty one keeps the preset's value."""
 
 

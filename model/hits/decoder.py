@@ -143,6 +143,8 @@ class AnchorLayer(nn.Module):
 class PixelHead(nn.Module):
     """Pixels and the anchors around them -> what is learned of each pixel's light."""
 
+    rounded_parts = ()  # of a precision: steps would show in the sum
+
     def __init__(self, config: ModelConfig) -> None:
         super().__init__()
         width = config.pixel_width
@@ -155,10 +157,6 @@ class PixelHead(nn.Module):
         self.first = nn.Linear(2 * width + 3, 2 * width)
         self.second = nn.Linear(2 * width, width)
         self.last = nn.Linear(width, 3 * (_GAINED + 2))
-
-    def rounded_parts(self) -> list[nn.Module]:
-        """Return the modules that a precision rounds: none, since steps would show in the sum."""
-        return []
 
     def forward(
         self,

@@ -71,9 +71,24 @@ class LightFilter(nn.Module):
             both = self.mix_level(alike(at_level).movedim(-1, 1), near, both, step)
         return _without_albedo(both).movedim(1, -1) * albedo_VRR3
 
-    def mix_level(self, alike_VCRR: Tensor, near_9: Tensor, both_V6RR: Tensor, step: int) -> Tensor:
-        """Return one level's light and albedo [V, 6, R, R]; a hundred kernels, or one compiled."""
-        return _mix_pixels(alike_VCRR, near_9, both_V6RR, step)
+    @staticmethod
+    def mix_level(alike_VCRR: Tensor, near_9: Tensor, both_V6RR: Tensor, step: int) -> Tensor:
+        """Return one level's light and albedo [V, 6, R, R], mixed with the same weights.
+
+        It is a hundred kernels, or one compiled.
+        """
+        height = both_V6RR.shape[2]
+        frame = (step, step, step, step)
+        trust = torch.exp(-softplus(-alike_VCRR[:, _ALIKE:]).clamp(max=_MOST_DOUBT))
+        around = pad(torch.cat([alike_VCRR[:, :_ALIKE], trust, both_V6RR], dim=1), frame)
+        rows = _ROWS if around.device.type == "cpu" and not torch.is_grad_enabled() else height
+        return torch.cat(
+            [
+                _mix_rows(around[:, :, first : first + rows + 2 * step], near_9, step)
+                for first in range(0, height, rows)
+            ],
+            dim=2,
+        )
 
 
 def _without_albedo(both_V6RR: Tensor) -> Tensor:
@@ -93,22 +108,6 @@ def _mean_around(both_V6RR: Tensor, width: int) -> Tensor:
     half = width // 2
     rows = avg_pool2d(both_V6RR, (1, width), 1, (0, half), count_include_pad=False)
     return avg_pool2d(rows, (width, 1), 1, (half, 0), count_include_pad=False)
-
-
-def _mix_pixels(alike_VCRR: Tensor, near_9: Tensor, both_V6RR: Tensor, step: int) -> Tensor:
-    """Return light and albedo [V, 6, R, R], mixed with the same weights."""
-    height = both_V6RR.shape[2]
-    frame = (step, step, step, step)
-    trust = torch.exp(-softplus(-alike_VCRR[:, _ALIKE:]).clamp(max=_MOST_DOUBT))
-    around = pad(torch.cat([alike_VCRR[:, :_ALIKE], trust, both_V6RR], dim=1), frame)
-    rows = _ROWS if around.device.type == "cpu" and not torch.is_grad_enabled() else height
-    return torch.cat(
-        [
-            _mix_rows(around[:, :, first : first + rows + 2 * step], near_9, step)
-            for first in range(0, height, rows)
-        ],
-        dim=2,
-    )
 
 
 def _mix_rows(around_VCRR: Tensor, near_9: Tensor, step: int) -> Tensor:

@@ -4,7 +4,7 @@ One number a side of a triangle, which a scene's tokens and gathering rays read.
 """
 
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 
 import numpy as np
@@ -162,12 +162,6 @@ def _points(scene: LitScene, sides: NDArray[np.intp], u: Floats) -> Points:
     root = np.sqrt(u[0])
     points = scene.points(triangle, np.stack([root * (1 - u[1]), root * u[1]]), down)
     # the side of the triangle decides, not the shading normal, which may lean over its rim
-    return Points(
-        triangle=triangle,
-        position=points.position,
-        normal=-down,
-        geometric_normal=-down,
-        to_viewer=-down,
-        edge=points.edge,
-        back=sides >= scene.num_triangles,
-    )
+    back = sides >= scene.num_triangles
+    seen = {"normal": -down, "geometric_normal": -down, "to_viewer": -down, "back": back}
+    return replace(points, **seen, reflectance=None)

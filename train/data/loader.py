@@ -33,6 +33,7 @@ from train.data.order import (
     Visit,
     mix_visits,
     shuffled_shards,
+    single_dataset,
     visits_from,
 )
 from train.data.scenes import TrainingScene, require_few_triangles, scene_of_views
@@ -75,6 +76,7 @@ def load_batches(
             when the stream reaches it.
     """
     rank_slice.require_equal(settings.scenes_per_step)
+    mixture = mixture or single_dataset("", settings.scenes_per_step)
     with OpenShards(shards) as opened, ThreadPoolExecutor(max(workers, 1), "decode") as decoders:
         maker = _SceneMaker(shards, opened, settings, unusable)
         counts = [partial(_count_samples, shards, unusable, part) for part in shards.parts]
@@ -167,21 +169,19 @@ def _plan_batches(
     shards: ShardSet,
     counts: Sequence[Callable[[int], int]],
     settings: "TrainSettings",
-    mixture: Mixture | None,
+    mixture: Mixture,
     first: int,
     rank_slice: RankSlice,
     opened: OpenShards,
 ) -> Iterator[list[Visit]]:
     """Yield this process's visits batch by batch, and start to open their shards."""
     position = first * settings.scenes_per_step
-    begin = (position,) if mixture is None else mixture.counts_before(position)
+    begin = mixture.counts_before(position)
     streams = [
         visits_from(len(part), count, start, seed=settings.seed, window=settings.shuffle_shards)
         for part, count, start in zip(shards.parts, counts, begin, strict=True)
     ]
-    visits = streams[0]
-    if mixture is not None:
-        visits = mix_visits(mixture, streams, shards.parts, position)
+    visits = mix_visits(mixture, streams, shards.parts, position)
     while True:
         mine = rank_slice.of_batch(tuple(itertools.islice(visits, settings.scenes_per_step)))
         opened.plan(visit.shard for visit in mine)
@@ -192,17 +192,16 @@ def _plan_ahead(
     shards: ShardSet,
     counts: Sequence[Callable[[int], int]],
     settings: "TrainSettings",
-    mixture: Mixture | None,
+    mixture: Mixture,
 ) -> int:
     """Return the number of batches to plan ahead: about a window, to open its shards in time.
 
     With several datasets it is the window that ends first.
     """
-    weights = (1.0,) if mixture is None else mixture.weights
     ahead = []
-    for part, count, weight in zip(shards.parts, counts, weights, strict=True):
+    for part, count, weight in zip(shards.parts, counts, mixture.weights, strict=True):
         window = count(shuffled_shards(len(part), settings.seed, 0)[0]) * settings.shuffle_shards
-        ahead.append(int(window * sum(weights) / weight) // settings.scenes_per_step)
+        ahead.append(int(window * sum(mixture.weights) / weight) // settings.scenes_per_step)
     return max(min(ahead), 1)
 
 

@@ -189,10 +189,6 @@ class Mixture:
             for name, digest, weight in shares
         )
 
-    def record(self) -> dict[str, Any]:
-        """Return the mixture as JSON values."""
-        return dataclasses.asdict(self)
-
 
 def mix_visits(
     mixture: Mixture, visits: Sequence[Iterator[Visit]], parts: Sequence[range], first: int
@@ -264,10 +260,15 @@ def _mixture_of_header(header: Mapping[str, Any]) -> Mixture:
             for name, value in header[RECORD].items()
         }
         return Mixture(**record)
+    return single_dataset(header["data_digest"], header["settings"]["scenes_per_step"])
+
+
+def single_dataset(digest: str, scenes_per_step: int) -> Mixture:
+    """Return the mixture of one dataset alone."""
     return Mixture(
-        digests=(header["data_digest"],),
+        digests=(digest,),
         names=("",),
         weights=(1.0,),
         before=(0,),
-        scenes_per_step=header["settings"]["scenes_per_step"],
+        scenes_per_step=scenes_per_step,
     )

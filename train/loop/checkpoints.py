@@ -93,7 +93,7 @@ def _encode_checkpoint(state: TrainState, world_size: int) -> bytes:
         "settings": stored_settings(state.settings),
         "model": encode_config(state.settings.model),
         "data_digest": state.data_digest,
-        **({RECORD: state.mixture.record()} if state.mixture else {}),
+        **({RECORD: dataclasses.asdict(state.mixture)} if state.mixture else {}),
         "history": event_records(state.history),
         "world_size": world_size,
         "threads": torch.get_num_threads(),

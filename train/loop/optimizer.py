@@ -109,10 +109,6 @@ def _run_fused_sgd(
     decision: Decision,
 ) -> None:
     """Subtract rate * (operand + decay * tensor) from each tensor, unless the step is skipped."""
-    off: dict[str, Any] = {
-        "momentum": 0.0, "dampening": 0.0, "nesterov": False, "maximize": False,
-        "is_first_step": False,
-    }  # fmt: skip
     torch._fused_sgd_(
         list(tensors),
         [_with_strides_of(tensor, other) for tensor, other in zip(tensors, operands, strict=True)],
@@ -120,8 +116,8 @@ def _run_fused_sgd(
         weight_decay=decay,
         lr=rate,
         found_inf=decision.skip_flag,
-        **off,
-    )
+        momentum=0.0, dampening=0.0, nesterov=False, maximize=False, is_first_step=False,
+    )  # fmt: skip
 
 
 def _with_strides_of(tensor: Tensor, other: Tensor) -> Tensor:

@@ -169,7 +169,17 @@ class Stepper:
         self.activity.begin("device")
         rows = torch.stack([*steps]).tolist()
         self.activity.begin("other")
-        return [_report(row) for row in rows], any(row[-1] > 0 for row in rows)
+        reports = [
+            StepReport(
+                loss=loss,
+                l1=l1,
+                brightness=predicted_mean / target_mean if target_mean > 0 else 1.0,
+                grad_norm=grad_norm,
+                applied=bool(applied),
+            )
+            for loss, l1, predicted_mean, target_mean, grad_norm, applied, _ in rows
+        ]
+        return reports, any(row[-1] > 0 for row in rows)
 
     def _add_gradient(self, batch: TrainingBatch, num_views: int, *, last: bool) -> Tensor:
         """Add one batch's gradient; return its sums of loss, L1, and both brightnesses."""
@@ -198,17 +208,6 @@ class Stepper:
         """
         queue = torch.autograd.Variable._execution_engine.queue_callback
         queue(lambda: self.activity.begin("exchange"))
-
-
-def _report(figures: Sequence[float]) -> StepReport:
-    loss, l1, predicted_mean, target_mean, grad_norm, applied, _ = figures
-    return StepReport(
-        loss=loss,
-        l1=l1,
-        brightness=predicted_mean / target_mean if target_mean > 0 else 1.0,
-        grad_norm=grad_norm,
-        applied=bool(applied),
-    )
 
 
 def predict_log10(

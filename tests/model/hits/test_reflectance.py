@@ -13,7 +13,6 @@ from model.hits.light_filter import (
     TAPS,
     LightFilter,
     _mean_around,
-    _mix_pixels,
 )
 from model.hits.lit_scene import LitScene, Points
 from model.hits.radiosity import BOUNCES, scene_light
@@ -251,9 +250,9 @@ def test_a_level_is_its_slow_twin(step: int) -> None:
                 expected[0, :, row, column] += share * both[0, :, y, x]
                 total += share
             expected[0, :, row, column] /= total
-    torch.testing.assert_close(_mix_pixels(alike, near, both, step), expected)
+    torch.testing.assert_close(LightFilter.mix_level(alike, near, both, step), expected)
     with torch.inference_mode():  # by rows, in parts
-        torch.testing.assert_close(_mix_pixels(alike, near, both, step), expected)
+        torch.testing.assert_close(LightFilter.mix_level(alike, near, both, step), expected)
 
 
 @for_each("px", [8, 40, 72])

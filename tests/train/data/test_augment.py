@@ -115,18 +115,6 @@ def test_winding_still_agrees_with_the_normals(name: str) -> None:
     assert torch.all(facing.sum(-1) > 0)
 
 
-def test_a_turned_vertex_takes_its_normal_along() -> None:
-    scene = training_scene(toy_sample(1), 8)
-    count = scene.tensors.num_triangles
-    numbered = torch.arange(9.0 * count).reshape(count, 3, 3)
-    tensors = dataclasses.replace(scene.tensors, triangles_T33=numbered, normals_T33=-numbered)
-    scene = dataclasses.replace(scene, tensors=tensors)
-    turned = rotate_vertex_order(scene, np.arange(count) % 3).tensors
-    assert torch.equal(turned.triangles_T33, -turned.normals_T33)
-    for row in range(count):
-        assert torch.equal(turned.triangles_T33[row], numbered[row].roll(-(row % 3), dims=0))
-
-
 def test_mixed_lights_the_sky_last_and_their_pictures_are_as_much_stronger() -> None:
     """A picture is the sum of what each light gives alone, in proportion to its emission."""
     lamps = [light([[x, 0, 2], [x + 1, 0, 2], [x, 1, 2]], 3.0 + x) for x in (0, 1)]

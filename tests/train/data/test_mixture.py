@@ -154,7 +154,7 @@ def test_a_dataset_that_is_known_goes_on_where_it_was(roots: list[str], data: Tr
     two = plan_mixture(data, run, header | {"step": 5})
     assert two is not None and two.weights == (7.0, 3.0), "shares as their numbers of scenes"
     assert (two.first, two.before) == (20, (20, 0))
-    later = header | {"step": 10, RECORD: two.record(), "data_digest": data.digest}
+    later = header | {"step": 10, RECORD: dataclasses.asdict(two), "data_digest": data.digest}
     assert plan_mixture(data, run, later) == two
     weighed = dataclasses.replace(run, data_weights=(1, 1))
     other = plan_mixture(data, weighed, later)

@@ -20,7 +20,6 @@ from storage.dataset.dataset import Dataset
 from storage.seeds import rng_for
 from tests.conftest import ROOT
 from tests.infra.slurm.test_jobs import commands_in
-from tests.train.toy import write_toy_dataset
 from train.folder import read_rows
 
 SMALL = {
@@ -44,11 +43,6 @@ SMALL = {
 
 CURVE = ("step", "loss", "l1", "grad_norm", "learning_rate", "validation", "layers", "spike")
 """What a row of the log says of the training itself."""
-
-
-@pytest.fixture(scope="module")
-def dataset(tmp_path_factory: pytest.TempPathFactory) -> Dataset:
-    return write_toy_dataset(tmp_path_factory.mktemp("toy"), train=9, validation=2, per_shard=3)
 
 
 def command(dataset: Dataset, out: Path, processes: int, *rest: str, **changes: object) -> list:
