@@ -226,7 +226,7 @@ _HITS = {
 }
 
 
-def _sized(name: str) -> ModelConfig:
+def _config_of_size(name: str) -> ModelConfig:
     """Return the configuration of one of our sizes."""
     fields: dict[str, Any] = dict(zip(_NUMBERS, _SIZES[name], strict=True))
     fields |= {"head": "linear", "window_bundles": 8 if name == "large" else 0}
@@ -242,7 +242,7 @@ def _sized(name: str) -> ModelConfig:
 SIZES: Registry[Callable[[], ModelConfig]] = Registry(
     "size",
     Callable,
-    {name: functools.partial(_sized, name) for name in _SIZES},
+    {name: functools.partial(_config_of_size, name) for name in _SIZES},
     decides=("weights",),
 )
 """Named sizes, ours first and smallest first. A checkpoint stores all numbers of its configuration

@@ -105,8 +105,8 @@ def _is_inside(
     for row, entry in enumerate(scene.objects):
         corners = scene.vertex_positions[scene.faces[scene.object_index == row].ravel()]
         if entry.kind == "object" and len(corners):
-            low, high = corners.min(axis=0), corners.max(axis=0)
-            is_inside |= ((low <= middle_E3) & (middle_E3 <= high)).all(axis=1)
+            is_between = (corners.min(axis=0) <= middle_E3) & (middle_E3 <= corners.max(axis=0))
+            is_inside |= is_between.all(axis=1)
     return is_inside
 
 

@@ -63,6 +63,10 @@ def plan_start(
         TrilightError: the folder holds a run already, or has none to resume; the checkpoint is
             damaged; or settings or data differ from the run's without a recorded decision.
     """
+    # alike in all processes: torchrun counts restarts for each machine separately, and a network
+    # file system shows a new file to one machine before another
+    has_checkpoint = dist_context.any(start.restartable and bool(saved_steps(folder.checkpoints)))
+    start = dataclasses.replace(start, resume=start.resume or has_checkpoint, restartable=False)
     if not start.resume and saved_steps(folder.checkpoints):
         raise TrilightError(
             f"{folder.root}: holds a run already; add --resume to go on with it, or choose "

@@ -10,7 +10,6 @@ from pathlib import Path
 
 import torch
 
-from model.checkpoint_format import saved_steps
 from model.renderformer import count_parameters
 from model.scene_tensors import lit_sky, require_known_sky
 from model.weights import TrainedRange, encode_weights
@@ -183,10 +182,6 @@ def _train(
     """Train and evaluate in a folder that is locked; arguments as in `run_training`."""
     began = time.monotonic()
     dataset = open_mixture(data)
-    # alike in all processes: torchrun counts restarts for each machine separately, and a network
-    # file system shows a new file to one machine before another
-    has_checkpoint = dist_context.any(start.restartable and bool(saved_steps(folder.checkpoints)))
-    start = dataclasses.replace(start, resume=start.resume or has_checkpoint, restartable=False)
     notes: list[str] = []
 
     def note(text: str) -> None:
@@ -210,7 +205,8 @@ def _train(
     if dist_context.is_first:
         judge = _make_judge(dataset, settings, state.bad_samples)
         recorder = Recorder(folder, judge, progress, state, wandb=watched.wandb)
-        how = "went on" if start.resume else "began"
+        resumes = plan.checkpoint is not None and plan.branch is None
+        how = "went on" if resumes else "began"
         many = "process" if dist_context.world_size == 1 else "processes"
         where = f"{how} on {dist_context.device}, {dist_context.world_size} {many}"
         for text in (where, *notes):

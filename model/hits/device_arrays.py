@@ -44,7 +44,7 @@ class DevicePlace:
             self._held[key] = torch.from_numpy(copy).to(self.device)
         return self._held[key]
 
-    def moved(self, holder: Any, but: tuple[str, ...] = ()) -> Any:
+    def copy_here(self, holder: Any, but: tuple[str, ...] = ()) -> Any:
         """Return a copy of an object whose arrays, and those of its records, are here.
 
         Args:
@@ -54,7 +54,7 @@ class DevicePlace:
         moved = copy.copy(holder)
         for name, each in vars(holder).items():
             if name not in but and isinstance(each, np.ndarray | Environment):
-                new = self.array(each) if isinstance(each, np.ndarray) else self.moved(each)
+                new = self.array(each) if isinstance(each, np.ndarray) else self.copy_here(each)
                 object.__setattr__(moved, name, new)  # of a frozen record too
         return moved
 

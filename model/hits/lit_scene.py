@@ -182,13 +182,13 @@ class LitScene:
 
     def on(self, place: DevicePlace, caster: Callable[..., RayCaster]) -> "LitScene":
         """Return the scene and its light on a device, where `caster` prepares its rays."""
-        moved = place.moved(self, but=("lamps", "_corner_rows"))
+        moved = place.copy_here(self, but=("lamps", "_corner_rows"))
         moved.place = place
-        moved.light = place.moved(self.light)
+        moved.light = place.copy_here(self.light)
         if self.textures is not None:
             moved.textures = DeviceTextures(self.textures, place)
         if self.sky is not None:
-            moved.drawn_sky = place.moved(self.drawn_sky)
+            moved.drawn_sky = place.copy_here(self.drawn_sky)
         moved.seen = caster(self._corner_rows, np.flatnonzero(~self.emits), place)
         moved.everything = caster(self._corner_rows, np.arange(self.num_triangles), place)
         scene: LitScene = moved

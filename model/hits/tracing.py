@@ -117,12 +117,12 @@ def traced_views(
     place = scene.place
     views = []
     for c2w_44, fov_deg in zip(c2w_V44, fov_deg_V, strict=True):
-        c2w: Any = c2w_44.detach()
-        angle: Any = fov_deg
+        camera = c2w_44.detach(), fov_deg
         if place is None:
-            c2w, angle = c2w.cpu().numpy(), float(angle)
+            c2w: Any = camera[0].cpu().numpy()
+            angle: Any = float(fov_deg)
         else:
-            c2w, angle = (DeviceArray(each.to(place.device), place) for each in (c2w, angle))
+            c2w, angle = (DeviceArray(each.to(place.device), place) for each in camera)
         views.append(view_inputs(scene, c2w, angle, resolution, config, seed))
     given_VI = np.ones((len(views), len(INPUTS)), np.float32)
     return Traced(

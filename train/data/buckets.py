@@ -31,7 +31,7 @@ class TrainingBatch:
     scenes: SceneBatch
     """Input of the network, padded to the longest scene."""
     target_BVRR3: Tensor
-    """log10(1 + radiance)."""
+    """log10(1 + radiance) of the pictures of each view."""
     noise_BV: Tensor
     """Root mean square noise of the targets in log10(1 + radiance)."""
     arrived: torch.cuda.Event | None = None
