@@ -233,12 +233,6 @@ def test_the_card_is_of_these_weights(name: str) -> None:
     assert count_parameters(open_network(name)) == int(stated)
 
 
-def test_the_better_one_opens_without_a_name() -> None:
-    assert find_network(BUILTIN).path == find_network("builtin:hits").path
-    assert open_network(BUILTIN).config.view_stage == "hits"
-    assert open_network(BUILTIN_TOKENS).config.view_stage == "bundles"
-
-
 def test_a_name_that_does_not_come_along_is_said() -> None:
     with pytest.raises(TrilightError, match="builtin:token: no such network comes along.*tokens"):
         find_network("builtin:token")
