@@ -5,7 +5,7 @@ part is left to rays that the lobe draws (`lobe_ray_weight`).
 """
 
 from collections.abc import Callable, Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 
 import numpy as np
 from numpy.typing import NDArray
@@ -43,9 +43,8 @@ class DirectLight:
 
 def no_light(points: Points) -> DirectLight:
     """Return zeros, to which light may be added."""
-    zeros = [np.zeros_like(points.position) for _ in range(4)]
     return DirectLight(
-        open_diffuse=zeros[0], open_specular=zeros[1], diffuse=zeros[2], specular=zeros[3]
+        **{each.name: np.zeros_like(points.position) for each in fields(DirectLight)}
     )
 
 

@@ -112,22 +112,18 @@ def step_scenes(
 ) -> Generator[StepScenes, None, None]:
     """Yield the batches of each step, made ahead in a thread; closing it ends the thread."""
     pins = _has_streams(device)
-    return prefetch(
-        (_make_step_scenes(scenes, cost, max_scenes, pins) for scenes in scenes_per_step), _AHEAD
-    )
 
+    def make(scenes: list[TrainingScene]) -> StepScenes:
+        batches = bucket_scenes(scenes, cost, max_scenes)
+        if pins:
+            batches = [map_tensors(batch, Tensor.pin_memory) for batch in batches]
+        return StepScenes(
+            batches=batches,
+            keys=tuple(scene.key for scene in scenes),
+            num_triangles=tuple(scene.tensors.num_triangles for scene in scenes),
+        )
 
-def _make_step_scenes(
-    scenes: Sequence[TrainingScene], cost: Callable[[int], float], max_scenes: int, pins: bool
-) -> StepScenes:
-    batches = bucket_scenes(scenes, cost, max_scenes)
-    if pins:
-        batches = [map_tensors(batch, Tensor.pin_memory) for batch in batches]
-    return StepScenes(
-        batches=batches,
-        keys=tuple(scene.key for scene in scenes),
-        num_triangles=tuple(scene.tensors.num_triangles for scene in scenes),
-    )
+    return prefetch(map(make, scenes_per_step), _AHEAD)
 
 
 class CopyStream:
