@@ -182,7 +182,7 @@ class LitScene:
 
     def on(self, place: DevicePlace, caster: Callable[..., RayCaster]) -> "LitScene":
         """Return the scene and its light on a device, where `caster` prepares its rays."""
-        moved = place.copy_here(self, but=("lamps", "_corner_rows"))
+        moved = place.copy_here(self, but=("lamps", "sky", "_corner_rows"))
         moved.place = place
         moved.light = place.copy_here(self.light)
         if self.textures is not None:
