@@ -48,24 +48,8 @@ class AcceptedMaps:
     """Reasons why other files cannot be used, or not fully."""
 
 
-NO_MAPS = AcceptedMaps()
-
-
-@dataclass(frozen=True, kw_only=True)
-class MapFolders:
-    """Folders of the user's textures and environment maps."""
-
-    folders: tuple[tuple[str, str], ...] = ()
-    """Pairs of a kind (TEXTURE or SKY) and a folder."""
-    licence: str | None = None
-    """Licence that the user states for folders without a catalogue."""
-
-
-NO_FOLDERS = MapFolders()
-
-
-def map_folders(options: GenerateOptions, settings: DatasetSettings) -> MapFolders:
-    """Return the folders of textures and maps that the options name.
+def map_folders(options: GenerateOptions, settings: DatasetSettings) -> Mapping[str, str]:
+    """Return the folders of textures and maps that the options name, by kind.
 
     Raises:
         TrilightError: a folder is given that no scene would use, or scenes need a folder that is
@@ -89,18 +73,17 @@ def map_folders(options: GenerateOptions, settings: DatasetSettings) -> MapFolde
                 f"{own_share:g}; expected both above 0. Add --set scenes.{name}.share=0.5 "
                 f"--set scenes.{name}.own_share=1, or leave --{name} out."
             )
-    return MapFolders(
-        folders=tuple((kind, entry[0]) for kind, entry in shares.items() if entry[0] is not None),
-        licence=options.map_licence,
-    )
+    return {kind: entry[0] for kind, entry in shares.items() if entry[0] is not None}
 
 
 def accept_maps(
-    user_folders: MapFolders, settings: DatasetSettings, *, workers: int
+    folders: Mapping[str, str], licence: str | None, settings: DatasetSettings, *, workers: int
 ) -> AcceptedMaps:
     """Prepare the textures and maps of folders.
 
     Args:
+        folders: a folder by kind, TEXTURE or SKY.
+        licence: licence that the user states for folders without a catalogue.
         workers: number of files that are decoded at the same time.
 
     Raises:
@@ -109,9 +92,9 @@ def accept_maps(
     """
     rows: list[tuple[LockedObject, Path]] = []
     failures: list[Failure] = []
-    for kind, folder in user_folders.folders:
+    for kind, folder in folders.items():
         listing = find_maps(
-            kind, folder, licence=user_folders.licence, allowed_licences=settings.allowed_licences
+            kind, folder, licence=licence, allowed_licences=settings.allowed_licences
         )
         outcomes = _prepare_maps(kind, listing.maps, settings, workers)
         usable = [outcome for outcome in outcomes if not isinstance(outcome, Failure)]

@@ -1,5 +1,6 @@
 """Checks a folder of scene files and freezes the list of files that the dataset is made of."""
 
+import contextlib
 import dataclasses
 from collections.abc import Mapping
 from pathlib import Path
@@ -8,11 +9,13 @@ from pipeline.assets.settings import AssetSettings
 from pipeline.exchange.from_description import AlbedoOverOne, scaled_albedo_notes
 from pipeline.exchange.scene_files import SceneFiles, SceneFolder, build_scene, require_usable
 from pipeline.generation.dataset_writer import DatasetWriter
+from pipeline.generation.freeze_objects import require_same
 from pipeline.generation.prepare_isolated import asset_child
 from pipeline.generation.revisited_scenes import AcceptedObjects
 from pipeline.isolation import ChildFailed, IsolatedChild, call_with_retries, reach
-from pipeline.objects.licences import StatedLicence, stated_licence
+from pipeline.objects.licences import stated_licence
 from pipeline.presets.settings import DatasetSettings
+from storage.dataset.layout import DatasetFolder
 from storage.dataset.progress import announce_objects, count_object
 from storage.dataset.splits import JUDGED_SPLIT
 from storage.errors import EnvironmentFailure, TrilightError
@@ -20,17 +23,13 @@ from storage.records.objects import LockedObject
 
 
 def settings_for_files(
-    settings: DatasetSettings, folder: SceneFolder | None, views: int | None
+    settings: DatasetSettings, folder: SceneFolder, views: int | None
 ) -> DatasetSettings:
     """Return the preset's settings with the number of scenes and views of a folder.
 
-    Without a folder, the settings stay as they are.
-
     Raises:
-        TrilightError: a file has fewer cameras than `views`, or there are no files.
+        TrilightError: a file has fewer cameras than `views`.
     """
-    if folder is None:
-        return settings
     return dataclasses.replace(
         settings,
         scenes=dataclasses.replace(settings.scenes, num_views=folder.views(views)),
@@ -60,30 +59,39 @@ def accept_scene_files(
             f"--licence is {stated.licence}, which is not on the allow-list; if you may use the "
             f"scenes, add --allow-licence '{stated.licence}'."
         )
-    files = _build_all(folder, stated, settings, writer)
-    locked = [_lock_entry(uid, digest, stated) for uid, digest in sorted(files.sha256.items())]
-    frozen = writer.frozen_objects()
-    if frozen is None:
-        writer.lock_objects(locked)
-    else:
-        _require_same_files(frozen, locked)
-    return AcceptedObjects(
-        num_objects=len(locked),
-        num_found=len(locked),
-        origin=files,
-    )
+    with writer.hold_lock("objects"):
+        files = _build_all(folder, stated.licence, settings, writer.folder)
+        locked = [
+            LockedObject(
+                uid=uid,
+                asset_sha256=digest,
+                split=JUDGED_SPLIT,
+                licence=stated.licence,
+                licence_source=stated.licence_source,
+                title=uid,
+                attribution="",
+                source_url="",
+            )
+            for uid, digest in sorted(files.sha256.items())
+        ]
+        frozen = writer.frozen_objects()
+        if frozen is None:
+            writer.lock_objects(locked)
+        else:
+            require_same("scene files", frozen, locked)
+    return AcceptedObjects(num_objects=len(locked), num_found=len(locked), origin=files)
 
 
 def _build_all(
-    folder: SceneFolder, stated: StatedLicence, settings: DatasetSettings, writer: DatasetWriter
+    folder: SceneFolder, licence: str, settings: DatasetSettings, out: DatasetFolder
 ) -> SceneFiles:
     """Build every scene; return digests of the usable files, and errors of the others."""
-    announce_objects(writer.folder, len(folder.names))
+    announce_objects(out, len(folder.names))
+    num_views = settings.scenes.num_views
     sha256: dict[str, str] = {}
     notes: list[str] = []
     unusable = dict(folder.unusable)
-    child = asset_child(reach(files=[folder.root]))
-    try:
+    with contextlib.closing(asset_child(reach(files=[folder.root]))) as child:
         for name in folder.names:
             if name not in unusable:
                 try:
@@ -94,18 +102,17 @@ def _build_all(
                     raise
                 except TrilightError as mistake:
                     unusable[name] = str(mistake)
-            count_object(writer.folder)
-    finally:
-        child.close()
+            count_object(out)
     require_usable(folder.names, unusable)
+    left_out = (f"{name} is left out: {why.rstrip('.')}" for name, why in unusable.items())
     return SceneFiles(
         root=folder.root,
         names=folder.names,
         sha256=sha256,
         unusable=unusable,
-        licence=stated.licence,
+        licence=licence,
         albedo_over_one=folder.albedo_over_one,
-        notes=(*notes, *(f"{name} is left out: {unusable[name].rstrip('.')}" for name in unusable)),
+        notes=(*notes, *left_out, *folder.notes(num_views)),
     )
 
 
@@ -148,28 +155,3 @@ def _build_in_child(
             f"{name}: its meshes could not be read this time ({failure}). Run the same command "
             "again; if that does not help, see `trilight doctor`."
         ) from failure
-
-
-def _lock_entry(uid: str, sha256: str, stated: StatedLicence) -> LockedObject:
-    return LockedObject(
-        uid=uid,
-        asset_sha256=sha256,
-        split=JUDGED_SPLIT,
-        licence=stated.licence,
-        licence_source=stated.licence_source,
-        title=uid,
-        attribution="",
-        source_url="",
-    )
-
-
-def _require_same_files(frozen: Mapping[str, LockedObject], now: list[LockedObject]) -> None:
-    by_uid = {entry.uid: entry for entry in now}
-    for uid in sorted({*frozen, *by_uid}):
-        if frozen.get(uid) != by_uid.get(uid):
-            state = "has changed" if uid in frozen and uid in by_uid else "is new"
-            raise TrilightError(
-                f"scene file {uid}: {'is missing' if uid not in by_uid else state}; expected the "
-                "files that the dataset was begun with (objects.lock.jsonl). Restore them, or "
-                "choose another --out."
-            )

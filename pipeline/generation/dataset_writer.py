@@ -185,7 +185,7 @@ class DatasetWriter:
         lock = encode_objects_lock(objects)
         name = self.folder.objects_lock.name
         theirs = self.store.get(name)
-        with self._lock_manifest():
+        with self.hold_lock("manifest"):
             if theirs in (None, lock):
                 self._shards.merge_failures()
                 self.publish(self.folder.failures)
@@ -208,7 +208,7 @@ class DatasetWriter:
         head = self._shards.read_published_head()
         if head and head.objects_lock_sha256:
             self._shards.fetch_lock(head.objects_lock_sha256)
-            with self._lock_manifest():
+            with self.hold_lock("manifest"):
                 self._write(objects_lock_sha256=head.objects_lock_sha256)
 
     def add_shard(self, shard: ShardEntry) -> None:
@@ -302,7 +302,7 @@ class DatasetWriter:
             if not self._is_complete():
                 return None
             self._wait_for_lister()
-            with self._lock_manifest():
+            with self.hold_lock("manifest"):
                 if not self._is_complete():  # another run has planned more
                     return None
                 listed = self._list_shards()
@@ -390,7 +390,7 @@ class DatasetWriter:
         plans = {int(text) for text in names if text.isdecimal()}
         self.refresh()
         if max(plans, default=0) > self.manifest.num_scenes:
-            with self._lock_manifest():
+            with self.hold_lock("manifest"):
                 self.extend(max(*plans, self.manifest.num_scenes))
         splits = self.splits
         each = self._splits.scenes_per_shard
@@ -400,7 +400,7 @@ class DatasetWriter:
 
     def add_failures(self, failures: Iterable[Failure]) -> None:
         """Add rows to `failures.jsonl`, without duplicates."""
-        with self._lock_manifest():
+        with self.hold_lock("manifest"):
             self._add_failures(failures)
 
     def refresh(self) -> None:
@@ -418,8 +418,13 @@ class DatasetWriter:
         self.manifest = head
 
     @contextlib.contextmanager
-    def _lock_manifest(self) -> Iterator[None]:
-        with self.folder.mutex("manifest"):
+    def hold_lock(self, what: str) -> Iterator[None]:
+        """Hold the lock of a step that one worker does at a time, with the manifest as it is then.
+
+        Raises:
+            TrilightError: as `refresh`.
+        """
+        with self.folder.mutex(what):
             self.refresh()
             yield
 

@@ -6,7 +6,8 @@ from dataclasses import field
 from typing import Annotated, Any
 
 from pipeline.exchange.from_description import AlbedoOverOne
-from pipeline.presets.registry import DATASET_PRESETS
+from pipeline.presets.registry import DATASET_PRESETS, preset_settings
+from pipeline.presets.settings import DatasetSettings
 from pipeline.renders.mitsuba_variant import Device
 from pipeline.renders.settings import NoiseFloor, NoiseTargets, Resolution
 from storage.dataset.layout import dataset_folder
@@ -117,6 +118,25 @@ class GenerateOptions:
             log_db=self.noise_floor_db,
             linear_db=self.noise_floor_linear_db,
             objects_db=self.noise_floor_objects_db,
+        )
+
+    @property
+    def num_scenes(self) -> int:
+        return DATASET_PRESETS[self.build].num_scenes if self.scenes is None else self.scenes
+
+    def settings(self) -> DatasetSettings:
+        """Return the preset's settings with the changes of these options.
+
+        Raises:
+            TrilightError: values contradict each other.
+        """
+        return preset_settings(
+            self.build,
+            seed=self.seed,
+            resolution=self.resolution,
+            noise_targets=self.noise_targets,
+            allow_licences=self.allow_licences,
+            changes=self.changes,
         )
 
     @property

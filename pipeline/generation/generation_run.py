@@ -20,15 +20,18 @@ import time
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
+from functools import partial
 from typing import Any, Generic, TypeVar
 
-from pipeline.exchange.scene_files import SceneFiles, SceneFolder, find_scene_files
-from pipeline.generation.accept_scene_files import settings_for_files
+from pipeline.exchange.scene_files import SceneFiles, find_scene_files
+from pipeline.generation.accept_maps import map_folders
+from pipeline.generation.accept_scene_files import accept_scene_files, settings_for_files
 from pipeline.generation.dataset_writer import DatasetWriter
+from pipeline.generation.freeze_objects import ObjectLock
 from pipeline.generation.generate_options import GenerateOptions
-from pipeline.generation.revisited_scenes import AcceptedObjects, settings_for_revisit
+from pipeline.generation.revisited_scenes import Accept, AcceptedObjects, resolve_revisit
 from pipeline.objects.sources import check_source
-from pipeline.presets.registry import DATASET_PRESETS, frozen_note, object_source, preset_settings
+from pipeline.presets.registry import DATASET_PRESETS, frozen_note, object_source
 from pipeline.presets.settings import DatasetSettings
 from pipeline.renders.mitsuba_variant import (
     Device,
@@ -46,6 +49,7 @@ from storage.dataset.splits import keeps_scenes, lacks_validation, scenes_of_sha
 from storage.dataset.statistics import Statistics
 from storage.errors import EnvironmentFailure, TrilightError
 from storage.file_locks import WaitNotice
+from storage.machine import available_cores
 from storage.records.objects import Failure
 
 _MOST_CHILDREN = 4
@@ -69,8 +73,6 @@ class Run:
     options: GenerateOptions
     settings: DatasetSettings
     """The preset with the options' changes."""
-    scene_folder: SceneFolder | None
-    """The scene files, where scenes come from files."""
     publication: DatasetWriter
     """Writes the manifest and publishes finished shards."""
     accepted: AcceptedObjects
@@ -107,11 +109,10 @@ class Run:
     def outcome(self, finished: Manifest | None, statistics: Statistics | None) -> "Outcome":
         """Return the result of the run; a finished dataset adds its digest and statistics."""
         writer = self.publication
-        listed = self.scene_folder
         notes: tuple[str, ...] = ()
         origin = self.accepted.origin
-        if listed and isinstance(origin, SceneFiles):
-            notes = (*origin.notes, *listed.notes(self.settings.scenes.num_views))
+        if isinstance(origin, SceneFiles):
+            notes = origin.notes
         elif statistics and self.options.revisits is None:
             notes = frozen_note(self.options.build, statistics)
             splits = self.settings.splits
@@ -228,30 +229,39 @@ Watcher = Callable[[Run, TaskResult], None]
 """Called after each task."""
 
 
-def resolve_settings(
+def resolve_inputs(
     options: GenerateOptions, folder: DatasetFolder
-) -> tuple[DatasetSettings, SceneFolder | None]:
-    """Return the dataset's settings, and the scene files if scenes come from files.
+) -> tuple[DatasetSettings, Accept]:
+    """Return the dataset's settings, and what freezes the objects or files of its scenes.
 
     Raises:
         TrilightError: the settings contradict each other, or the source or files are unusable.
     """
-    settings = preset_settings(
-        options.build,
-        seed=options.seed,
-        resolution=options.resolution,
-        noise_targets=options.noise_targets,
-        allow_licences=options.allow_licences,
-        changes=options.changes,
-    )
+    settings = options.settings()
     if options.revisits is not None or settings.revisit is not None:
-        return settings_for_revisit(settings, options.revisits), None
+        return resolve_revisit(settings, options.revisits)
+    licence = options.licence
+    if options.scenes_from is not None:
+        files = find_scene_files(options.scenes_from, options.albedo_over_one)
+        settings = settings_for_files(settings, files, options.views)
+        return settings, partial(accept_scene_files, files, licence, settings)
     source = object_source(settings, options.objects)
-    files = options.scenes_from
-    listed = None if files is None else find_scene_files(files, options.albedo_over_one)
-    if listed is None and not folder.manifest.exists():
-        check_source(source, allowed_licences=settings.allowed_licences, licence=options.licence)
-    return settings_for_files(settings, listed, options.views), listed
+    if not folder.manifest.exists():
+        check_source(source, allowed_licences=settings.allowed_licences, licence=licence)
+    maps = map_folders(options, settings)
+
+    def accept(writer: DatasetWriter) -> AcceptedObjects:
+        return ObjectLock(
+            source=source,
+            licence=licence,
+            settings=settings,
+            writer=writer,
+            workers=available_cores(),
+            map_folders=maps,
+            map_licence=options.map_licence,
+        ).accept()
+
+    return settings, accept
 
 
 def choose_dataset_variant(options: GenerateOptions, folder: DatasetFolder) -> Variant:

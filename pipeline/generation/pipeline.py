@@ -33,10 +33,7 @@ from typing import Any
 
 from pipeline.documents.dataset_documents import write_documents
 from pipeline.documents.sheets import write_first_pictures
-from pipeline.generation.accept_maps import map_folders
-from pipeline.generation.accept_scene_files import accept_scene_files
 from pipeline.generation.dataset_writer import DatasetWriter, begin_or_resume_dataset
-from pipeline.generation.freeze_objects import ObjectLock
 from pipeline.generation.generate_options import GenerateOptions, generate_words
 from pipeline.generation.generation_run import (
     FIRST_PAUSE_S,
@@ -49,7 +46,7 @@ from pipeline.generation.generation_run import (
     TaskResult,
     Watcher,
     choose_dataset_variant,
-    resolve_settings,
+    resolve_inputs,
     wait_for_others,
 )
 from pipeline.generation.render_sample import failure_of
@@ -60,10 +57,8 @@ from pipeline.generation.render_workers import (
     restore_object,
     scene_reader,
 )
-from pipeline.generation.revisited_scenes import accept_revisited
 from pipeline.generation.scene_worker import MAX_ATTEMPTS, SceneAttempt, SceneWorker
 from pipeline.isolation import ChildFailed, IsolatedChild, with_retries
-from pipeline.presets.registry import DATASET_PRESETS, object_source
 from pipeline.presets.settings import DatasetSettings
 from pipeline.renders.mitsuba_variant import environment
 from pipeline.shards.pack_shards import UnfinishedShard, hold_dataset_lock
@@ -73,7 +68,6 @@ from storage.dataset.progress import write_asked
 from storage.dataset.splits import keeps_scenes
 from storage.dataset.statistics import Statistics
 from storage.errors import Rejected, TrilightError
-from storage.machine import available_cores
 from storage.records.objects import Failure
 from storage.records.sample import Sample, sample_key
 from storage.records.scene import Scene
@@ -113,17 +107,14 @@ def _begin_run(options: GenerateOptions) -> Iterator[Run]:
     """Join a dataset's workers and yield the run; the first worker freezes the objects."""
     folder = dataset_folder(options.place)
     folder = replace(folder, root=Path(os.path.realpath(folder.root)))
-    settings, listed = resolve_settings(
-        options, folder
-    )  # refuses options before anything is written
+    settings, accept = resolve_inputs(options, folder)  # refuses before anything is written
     with hold_dataset_lock(folder):
-        user_folders = map_folders(options, settings)
         variant = choose_dataset_variant(options, folder)
         writer = begin_or_resume_dataset(
             folder,
             settings,
             environment(variant),
-            DATASET_PRESETS[options.build].num_scenes if options.scenes is None else options.scenes,
+            options.num_scenes,
             accept_environment=options.accept_environment,
         )
         requested = options.shard_range()
@@ -134,28 +125,11 @@ def _begin_run(options: GenerateOptions) -> Iterator[Run]:
             )
         if not writer.manifest.objects_lock_sha256:  # else other objects may be refused yet
             _write_command(options, settings, writer)
-        if listed or options.revisits:
-            with folder.mutex("objects"):
-                writer.refresh()
-                accepted = (
-                    accept_scene_files(listed, options.licence, settings, writer)
-                    if listed
-                    else accept_revisited(options.revisits or "", settings, writer)
-                )
-        else:
-            accepted = ObjectLock(
-                source=object_source(settings, options.objects),
-                licence=options.licence,
-                settings=settings,
-                writer=writer,
-                workers=available_cores(),
-                user_folders=user_folders,
-            ).accept()
+        accepted = accept(writer)
         _write_command(options, settings, writer)
         yield Run(
             options=options,
             settings=settings,
-            scene_folder=listed,
             publication=writer,
             accepted=accepted,
             device=variant.device,

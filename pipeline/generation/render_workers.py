@@ -13,13 +13,12 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
-from pipeline.assets.settings import AssetSettings
 from pipeline.exchange.scene_files import SceneFiles
-from pipeline.generation.freeze_objects import object_changed_error, require_tried
+from pipeline.generation.freeze_objects import changed_error, require_tried
 from pipeline.generation.frozen_pool import ComposedScenes
 from pipeline.generation.generation_run import ShardJob
 from pipeline.generation.prepare_isolated import asset_child, asset_store, prepare_isolated
-from pipeline.generation.scene_worker import SceneRecipe, SceneWorker
+from pipeline.generation.scene_worker import SceneWorker
 from pipeline.isolation import ChildLimits, ChildPool, IsolatedChild, call_with_retries, reach
 from pipeline.objects.sources import ListedObjects, list_objects
 from pipeline.presets.settings import differences
@@ -77,6 +76,7 @@ def scene_reader(job: ShardJob) -> Iterator[Callable[[int], Scene] | None]:
         yield None
         return
     folder = reach(files=[files.root])
+    same = (settings.assets, settings.scenes.num_views, settings.seed)
 
     def new_pool(job: ShardJob) -> ChildPool:
         return ChildPool(lambda _: asset_child(folder), job.num_at_once)
@@ -84,21 +84,11 @@ def scene_reader(job: ShardJob) -> Iterator[Callable[[int], Scene] | None]:
     with _borrow_child(("files",), job, new_pool) as child:
 
         def read(index: int) -> Scene:
-            num_views = settings.scenes.num_views
-            seed = settings.seed
-            arguments = (files, index, settings.assets, num_views, seed)
-            scene = call_with_retries(child, scene_of_file, *arguments)
+            scene = call_with_retries(child, SceneFiles.scene, files, index, *same)
             scene.check()  # here: a compromised child may send anything
             return scene
 
         yield read
-
-
-def scene_of_file(
-    files: SceneFiles, scene_index: int, assets: AssetSettings, num_views: int, seed: int
-) -> Scene:
-    """Read a scene; runs only in child processes. Raises as `SceneFiles.scene`."""
-    return files.scene(scene_index, assets, num_views=num_views, seed=seed)
 
 
 @contextlib.contextmanager
@@ -128,18 +118,12 @@ def _render_pool(job: ShardJob) -> ChildPool:
         require_environment(job.environment, environment(variant))
     gpus = visible_gpus() if variant.device == "gpu" else ()
     memory_bytes = variant.address_space(_RENDER_LIMITS.memory_bytes)
+    limits = replace(_RENDER_LIMITS, memory_bytes=memory_bytes)
+    same = (job.settings, job.accepted.origin, asset_store(), variant, cores_of_child(job))
 
     def new_child(number: int) -> IsolatedChild:
-        recipe = SceneRecipe(
-            settings=job.settings,
-            variant=variant,
-            threads=cores_of_child(job),
-            gpu=gpus[number % len(gpus)] if gpus else None,
-            origin=job.accepted.origin,
-            folder=job.folder,
-        )
-        limits = replace(_RENDER_LIMITS, memory_bytes=memory_bytes)
-        return IsolatedChild(limits=limits, factory=SceneWorker, args=(recipe,))
+        gpu = gpus[number % len(gpus)] if gpus else None
+        return IsolatedChild(limits=limits, factory=SceneWorker, args=(*same, gpu, job.folder))
 
     return ChildPool(new_child, job.num_at_once)
 
@@ -172,7 +156,7 @@ def restore_object(job: ShardJob, uid: str, asset_name: str) -> None:
     frozen = job.accepted.origin
     assert isinstance(frozen, ComposedScenes), "only composed scenes draw objects"
     store = asset_store()
-    display_name = safe_url(frozen.source)
+    display_name = f"objects {safe_url(frozen.source)!r}"
     locked = LockRows(frozen.lock).find(uid)
     path = store.asset_path(asset_name)
     settings = job.settings
@@ -183,16 +167,14 @@ def restore_object(job: ShardJob, uid: str, asset_name: str) -> None:
     work_dir = job.folder.staged_objects
     record = find_object(frozen.source, frozen.licence, work_dir, settings.allowed_licences, uid)
     if record is None or locked is None:
-        raise object_changed_error(display_name, uid, "is missing or no longer usable")
+        raise changed_error(display_name, uid, "is missing or no longer usable")
     prepared, rejected = prepare_isolated(
         [record], settings.mesh_settings, workers=1, done=lambda: None
     )
     if rejected:
         require_tried(display_name, rejected[0])
     if not prepared or prepared[0].asset_sha256 != locked.asset_sha256:
-        raise object_changed_error(
-            display_name, uid, "has changed" if prepared else "is no longer usable"
-        )
+        raise changed_error(display_name, uid, "has changed" if prepared else "is no longer usable")
     if prepared[0].asset_name != asset_name:  # a later recipe gives it another name
         write_atomically(path, store.asset_path(prepared[0].asset_name).read_bytes())
 

@@ -4,8 +4,9 @@ A revisit takes scenes, objects and splits of a new dataset from the finished on
 """
 
 import dataclasses
+from collections.abc import Callable
 from dataclasses import dataclass
-from functools import cached_property
+from functools import cached_property, partial
 from pathlib import Path
 from typing import Any
 
@@ -157,18 +158,18 @@ class AcceptedObjects:
     origin: SceneOrigin
 
 
-def settings_for_revisit(settings: DatasetSettings, path: str | None) -> DatasetSettings:
-    """Return the settings of a dataset that has the views and shards of a finished one.
+Accept = Callable[[DatasetWriter], AcceptedObjects]
+"""Freezes the inputs of a dataset's scenes, or requires that they are those that were frozen."""
 
-    Without a path, the settings stay as they are.
+
+def resolve_revisit(settings: DatasetSettings, path: str | None) -> tuple[DatasetSettings, Accept]:
+    """Return the settings of a dataset that has the views and shards of a finished one.
 
     Raises:
         TrilightError: only one of path and `settings.revisit` is given, the dataset at the path is
             unfinished or another one, or its scenes have fewer cameras than `kept_cameras`.
     """
     revisit = settings.revisit
-    if path is None and revisit is None:
-        return settings
     if path is None or revisit is None:
         raise TrilightError(
             f"revisits is {path!r} and the settings of a revisit are "
@@ -198,27 +199,20 @@ def settings_for_revisit(settings: DatasetSettings, path: str | None) -> Dataset
         for shard in shards_with_scenes(source)
     )
     splits = dataclasses.replace(settings.splits, listed_shards=listed)
-    return dataclasses.replace(settings, scenes=scenes, splits=splits)
+    settings = dataclasses.replace(settings, scenes=scenes, splits=splits)
+    return settings, partial(_accept_objects, source)
 
 
-def accept_revisited(
-    path: str, settings: DatasetSettings, writer: DatasetWriter
-) -> AcceptedObjects:
-    """Freeze the objects of a finished dataset for the new one, with their licences and splits.
-
-    Raises:
-        TrilightError: it is not the dataset that the new one was begun with.
-    """
-    source = open_finished(path)
-    assert settings.revisit is not None
-    require_digest(source, settings.revisit.source_digest)
+def _accept_objects(source: FinishedDataset, writer: DatasetWriter) -> AcceptedObjects:
+    """Freeze the objects of a finished dataset for the new one, with their licences and splits."""
     locked = sorted(
         (entry for entries in source.objects.values() for entry in entries),
         key=lambda entry: canonical_json(dataclasses.asdict(entry)),
     )
-    if writer.frozen_objects() is None:
-        writer.add_failures(())
-        writer.lock_objects(locked)
+    with writer.hold_lock("objects"):
+        if writer.frozen_objects() is None:
+            writer.add_failures(())
+            writer.lock_objects(locked)
     root = source.folder.root.resolve()
     return AcceptedObjects(
         num_objects=sum(entry.kind == OBJECT for entry in locked),

@@ -11,6 +11,7 @@ import pytest
 
 from pipeline.assets.stage import PreparedObject
 from pipeline.generation import object_batches
+from pipeline.generation.accept_maps import AcceptedMaps
 from pipeline.generation.dataset_writer import DatasetWriter, begin_or_resume_dataset
 from pipeline.generation.freeze_objects import ObjectLock
 from pipeline.generation.prepare_isolated import asset_store
@@ -74,7 +75,7 @@ def asked(writer: DatasetWriter, source: str = SOURCE, licence: str | None = Non
 
 def frozen(writer: DatasetWriter, objects: Sequence[PreparedObject]) -> AcceptedObjects:
     """Freeze objects, as after the mesh stage."""
-    return asked(writer).freeze_prepared([*objects], [], len(objects))
+    return asked(writer).freeze_prepared([*objects], [], len(objects), AcceptedMaps())
 
 
 class Mesher:

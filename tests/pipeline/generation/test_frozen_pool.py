@@ -14,7 +14,7 @@ import pytest
 from pipeline.documents.rights import encode_attribution
 from pipeline.generation import accept_maps as accepting
 from pipeline.generation import freeze_objects, frozen_pool, pipeline, render_workers
-from pipeline.generation.accept_maps import AcceptedMaps, MapFolders, accept_maps, map_folders
+from pipeline.generation.accept_maps import AcceptedMaps, accept_maps, map_folders
 from pipeline.generation.dataset_writer import DatasetWriter
 from pipeline.generation.freeze_objects import require_same
 from pipeline.generation.frozen_pool import AssetMissing, ComposedScenes, SplitPool, user_maps
@@ -259,11 +259,11 @@ def accepted(settings: DatasetSettings, tmp_path_factory: pytest.TempPathFactory
     png(root / "textures" / "copy.bmp", noise(12))
     exr(root / "skies" / "copy.exr", sun_map(12))
     exr(root / "skies" / "bad.exr", np.full((2, 4, 3), np.nan, np.float32))
-    folders = ((TEXTURE, str(root / "textures")), (SKY, str(root / "skies")))
+    folders = {TEXTURE: str(root / "textures"), SKY: str(root / "skies")}
     with pytest.MonkeyPatch.context() as patch:
         patch.setenv("TRILIGHT_CACHE", str(root / "cache"))
         patch.setattr(accepting, "IsolatedChild", ChildHere)
-        return accept_maps(MapFolders(folders=folders), settings, workers=1)
+        return accept_maps(folders, None, settings, workers=1)
 
 
 def test_rows_have_splits_by_content_and_copies_stay_together(accepted: AcceptedMaps) -> None:

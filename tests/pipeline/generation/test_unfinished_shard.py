@@ -235,7 +235,6 @@ def _run(root: Path, scenes: int) -> Run:
     return Run(
         options=GenerateOptions(out=str(root), scenes=scenes),
         settings=_build(),
-        scene_folder=None,
         publication=begin_tiny(root, scenes),
         accepted=NO_OBJECTS,
     )
