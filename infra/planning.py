@@ -114,8 +114,8 @@ def measure_scenes(
     # prepared at its full size, so that a lack of objects is reported now and not by `generate`
     scenes = max(count, options.num_scenes)
     run = prepare_dataset(dataclasses.replace(options, out=str(place), scenes=scenes))
-    job = run.job(1)
-    splits = run.settings.splits
+    job = dataclasses.replace(run.job, num_at_once=1)
+    splits = job.settings.splits
     core_s = []
     sizes = []
     try:
@@ -128,7 +128,7 @@ def measure_scenes(
     finally:
         close_children()
     return MeasuredScenes(
-        core_s=tuple(core_s), num_bytes=tuple(sizes), num_views=run.settings.scenes.num_views
+        core_s=tuple(core_s), num_bytes=tuple(sizes), num_views=job.settings.scenes.num_views
     )
 
 

@@ -366,7 +366,7 @@ class DatasetWriter:
         folder.staged_given_up.unlink(missing_ok=True)
         return listed
 
-    def extend(self, num_scenes: int) -> None:
+    def _extend(self, num_scenes: int) -> None:
         """Plan more scenes; call while holding the mutex of the manifest.
 
         A last shard that is not full grows from now on. While the mutex is held, each shard of a
@@ -383,15 +383,15 @@ class DatasetWriter:
                 growing.add(name)
         self._write(num_scenes=num_scenes, growing=tuple(sorted(growing)), documents={})
 
-    def refresh_plan(self) -> bool:
-        """Read the plans of other workers; return True if more scenes are planned than before."""
+    def refresh_plan(self, requested: int = 0) -> bool:
+        """Plan as many scenes as other workers, or as requested; return True if they are more."""
         before = self.manifest.num_scenes
         names = (name.removeprefix(PLANNED) for name in self.store.list(PLANNED))
         plans = {int(text) for text in names if text.isdecimal()}
         self.refresh()
-        if max(plans, default=0) > self.manifest.num_scenes:
+        if (most := max(requested, *plans, 0)) > self.manifest.num_scenes:
             with self.hold_lock("manifest"):
-                self.extend(max(*plans, self.manifest.num_scenes))
+                self._extend(max(most, self.manifest.num_scenes))
         splits = self.splits
         each = self._splits.scenes_per_shard
         last = () if splits.listed_shards else {plan // each for plan in plans if plan % each}
@@ -502,12 +502,10 @@ def begin_or_resume_dataset(
         if is_new and not store.create_if_absent(folder.manifest.name, folder.manifest):
             PublishedShards(folder, store).adopt()  # another machine was first
         manifest = read_head(folder.manifest)
-        _require_same_dataset(folder, manifest, settings, environment, accept_environment)
-        writer = DatasetWriter(store, folder, manifest, settings.splits)
-        if num_planned > manifest.num_scenes:
-            writer.extend(num_planned)
-    publish_plan(store, writer.manifest.num_scenes)
-    writer.refresh_plan()
+    _require_same_dataset(folder, manifest, settings, environment, accept_environment)
+    publish_plan(store, max(num_planned, manifest.num_scenes))
+    writer = DatasetWriter(store, folder, manifest, settings.splits)
+    writer.refresh_plan(num_planned)
     return writer
 
 

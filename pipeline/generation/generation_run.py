@@ -21,6 +21,7 @@ from abc import ABC, abstractmethod
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from functools import partial
+from operator import itemgetter
 from typing import Any, Generic, TypeVar
 
 from pipeline.exchange.scene_files import SceneFiles, find_scene_files
@@ -71,40 +72,17 @@ class Run:
     """A dataset that has begun, with its objects frozen: the input of every later step."""
 
     options: GenerateOptions
-    settings: DatasetSettings
-    """The preset with the options' changes."""
     publication: DatasetWriter
     """Writes the manifest and publishes finished shards."""
-    accepted: AcceptedObjects
-    """The frozen objects, textures, skies or scene files that scenes are made of."""
-    device: Device = "cpu"
-    """Device that renders, `cpu` or `gpu`."""
+    job: "ShardJob"
+    """What all tasks of the run share; a runner may set another `num_at_once`."""
+
+    @property
+    def accepted(self) -> AcceptedObjects:
+        return self.job.accepted
 
     def unfinished_shards(self) -> list[int]:
         return self.publication.unfinished_shards(self.options.shard_range())
-
-    def num_workers(self) -> int:
-        """Return the number of parallel tasks of one process; an executor may set another."""
-        if self.options.workers is not None:
-            return self.options.workers
-        if self.device == "cpu":
-            return 1
-        num_gpus = max(1, len(visible_gpus()))
-        return num_gpus * children_of_gpu(self.settings.renders.resolution, gpu_memory_bytes())
-
-    def job(self, num_at_once: int) -> "ShardJob":
-        """Return the job that all tasks of this run share; one process runs `num_at_once` tasks."""
-        manifest = self.publication.manifest
-        return ShardJob(
-            folder=self.publication.folder,
-            settings=self.settings,
-            environment={} if self.options.accept_environment else manifest.environment,
-            accepted=self.accepted,
-            lock_sha256=manifest.objects_lock_sha256,
-            num_at_once=num_at_once,
-            extensions=manifest.extensions,
-            device=self.device,
-        )
 
     def outcome(self, finished: Manifest | None, statistics: Statistics | None) -> "Outcome":
         """Return the result of the run; a finished dataset adds its digest and statistics."""
@@ -115,7 +93,7 @@ class Run:
             notes = origin.notes
         elif statistics and self.options.revisits is None:
             notes = frozen_note(self.options.build, statistics)
-            splits = self.settings.splits
+            splits = self.job.settings.splits
             num_scenes = writer.manifest.num_scenes
             size_notes = (
                 keeps_scenes(num_scenes, self.options.scenes, splits),
@@ -152,6 +130,16 @@ class Run:
                 f"made, more than the failure budget of {budget:.0%}. The reasons are in "
                 f"{writer.folder.failures.name}; fix them, or raise --failure-budget."
             )
+
+
+def num_workers(options: GenerateOptions, settings: DatasetSettings, device: Device) -> int:
+    """Return the number of parallel tasks of one process; an executor may set another."""
+    if options.workers is not None:
+        return options.workers
+    if device == "cpu":
+        return 1
+    num_gpus = max(1, len(visible_gpus()))
+    return num_gpus * children_of_gpu(settings.renders.resolution, gpu_memory_bytes())
 
 
 def children_of_gpu(resolution: int, memory_bytes: int) -> int:
@@ -322,6 +310,8 @@ class TaskCutter:
     ) -> Iterator[tuple[Piece, ...]]:
         """Yield the tasks that make some shards, but save a tenth of the tasks for later rounds.
 
+        Each is sized when it is requested.
+
         Raises:
             EnvironmentFailure: no task is left of the maximum over all rounds.
         """
@@ -331,33 +321,18 @@ class TaskCutter:
                 "claims on the missing scenes. What was finished is safe: run the same command "
                 "again."
             )
-        for task in self.iter_tasks(shards, splits, most=self._tasks_left - self._tasks_left // 10):
-            self._tasks_left -= 1
-            yield task
-
-    def iter_tasks(
-        self, shards: Sequence[int], splits: SplitSettings, *, most: int = MAX_TASKS
-    ) -> Iterator[tuple[Piece, ...]]:
-        """Yield at most `most` tasks that make some shards; each is sized when it is requested."""
+        most = self._tasks_left - self._tasks_left // 10
         scenes_left = sum(len(scenes_of_shard(index, splits)) for index in shards)
-        pieces: list[Piece] = []
-        room = self._next_size(scenes_left, most)
-        for index in shards:
-            scenes = scenes_of_shard(index, splits)
-            at = scenes.start
-            while at < scenes.stop:
-                last = min(scenes.stop, at + room)
-                pieces.append(Piece(shard_index=index, first=at, last=last))
-                room -= last - at
-                scenes_left -= last - at
-                at = last
-                if room == 0:
-                    yield tuple(pieces)
-                    pieces = []
-                    most -= 1
-                    room = self._next_size(scenes_left, most)
-        if pieces:
-            yield tuple(pieces)
+        scenes = ((index, scene) for index in shards for scene in scenes_of_shard(index, splits))
+        while task := list(itertools.islice(scenes, self._next_size(scenes_left, most))):
+            most -= 1
+            self._tasks_left -= 1
+            scenes_left -= len(task)
+            of_shards = itertools.groupby(task, key=itemgetter(0))
+            rows = ((index, [scene for _, scene in group]) for index, group in of_shards)
+            yield tuple(
+                Piece(shard_index=index, first=row[0], last=row[-1] + 1) for index, row in rows
+            )
 
     def _next_size(self, scenes_left: int, tasks_left: int) -> int:
         """Return the number of scenes of the next task, at least 1.
@@ -385,7 +360,7 @@ def wait_for_others(run: Run, pause_s: float) -> float:
         time.sleep(pause_s)
         pause_s = min(2 * pause_s, _LONGEST_PAUSE_S)
         missing = run.unfinished_shards()
-        splits = run.settings.splits
+        splits = run.job.settings.splits
         shards = [UnfinishedShard(writer.folder, splits, index) for index in missing]
         if not missing or any(shard.is_free() for shard in shards):
             return pause_s

@@ -46,6 +46,7 @@ from pipeline.generation.generation_run import (
     TaskResult,
     Watcher,
     choose_dataset_variant,
+    num_workers,
     resolve_inputs,
     wait_for_others,
 )
@@ -127,13 +128,18 @@ def _begin_run(options: GenerateOptions) -> Iterator[Run]:
             _write_command(options, settings, writer)
         accepted = accept(writer)
         _write_command(options, settings, writer)
-        yield Run(
-            options=options,
+        manifest = writer.manifest
+        job = ShardJob(
+            folder=folder,
             settings=settings,
-            publication=writer,
+            environment={} if options.accept_environment else manifest.environment,
             accepted=accepted,
+            lock_sha256=manifest.objects_lock_sha256,
+            num_at_once=num_workers(options, settings, variant.device),
+            extensions=manifest.extensions,
             device=variant.device,
         )
+        yield Run(options=options, publication=writer, job=job)
 
 
 def _write_command(
@@ -157,7 +163,7 @@ def make_shards(run: Run, runner: Runner, watch: Watcher) -> None:
         EnvironmentFailure: the run has submitted its maximum number of tasks.
     """
     writer = run.publication
-    job = run.job(runner.num_at_once or run.num_workers())
+    job = replace(run.job, num_at_once=runner.num_at_once or run.job.num_at_once)
     cutter = TaskCutter(at_once=runner.window or job.num_at_once)
     pause_s = FIRST_PAUSE_S
     try:

@@ -40,7 +40,7 @@ from tests.pipeline.generation.test_dataset_writer import (
     begin_tiny,
     make_tiny_shard,
 )
-from tests.pipeline.generation.tiny_scenes_kit import NO_OBJECTS, shard_job
+from tests.pipeline.generation.tiny_scenes_kit import shard_job
 
 NAME = "train-000000.tar"
 
@@ -123,9 +123,8 @@ def test_who_waits_for_others_says_for_whom(
     monkeypatch.setattr(file_locks, "_SILENT_S", 0.0)
     folder, missing = DatasetFolder(tmp_path), [[0], [0], []]
     writer = SimpleNamespace(folder=folder)
-    settings = SimpleNamespace(splits=_build().splits)
     run: Any = SimpleNamespace(
-        publication=writer, settings=settings, unfinished_shards=lambda: missing.pop(0)
+        publication=writer, job=shard_job(tmp_path), unfinished_shards=lambda: missing.pop(0)
     )
     _make(tmp_path, 1, 4, Counter())
     with hold_lock(folder.staged_shard(NAME) / f"{sample_key(0)}.claim"):
@@ -234,9 +233,8 @@ class Idle(Runner[Any]):
 def _run(root: Path, scenes: int) -> Run:
     return Run(
         options=GenerateOptions(out=str(root), scenes=scenes),
-        settings=_build(),
         publication=begin_tiny(root, scenes),
-        accepted=NO_OBJECTS,
+        job=shard_job(root),
     )
 
 
@@ -319,7 +317,7 @@ def test_scenes_that_are_given_up_are_not_counted_as_made(tmp_path: Path) -> Non
     """While they wait, in a shard that is not listed, and in a finished dataset."""
     run = _run(tmp_path, 4)
     folder = run.publication.folder
-    shard = UnfinishedShard(folder, run.settings.splits, 0)
+    shard = UnfinishedShard(folder, run.job.settings.splits, 0)
     for scene in range(4):
         made = _sample(scene) if scene else None
         shard.stage(scene, made, [], "lossless", began=0.0, cores=1)
