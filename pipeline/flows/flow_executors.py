@@ -58,10 +58,10 @@ def _as_flow(options: GenerateOptions, runner: "PrefectRunner", **flow_options: 
     """Make a dataset as a flow run, with its artifacts; `flow_options` are Prefect's."""
     from prefect import flow
 
-    from pipeline.flows.prefect_runner import make_with_artifacts
+    from pipeline.flows.prefect_runner import make_with_page
 
     def generate() -> Outcome:
-        return make_with_artifacts(options, runner)
+        return make_with_page(options, runner)
 
     return flow(name="generate-scenes", persist_result=False, **flow_options)(generate)()
 

@@ -12,7 +12,6 @@ import dataclasses
 import shutil
 import time
 from collections.abc import Iterable, Iterator, Mapping
-from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -71,22 +70,6 @@ _MAX_LOOKS = 7
 """Looks for a shard that a worker has packed; network file systems may show it a minute later."""
 
 
-@dataclass(kw_only=True)
-class DatasetProgress:
-    """Progress of the requested shards."""
-
-    shards: int = 0
-    """Finished shards among the requested ones."""
-    scenes: int = 0
-    """Scenes of the finished shards, given-up ones included."""
-    shards_requested: int = 0
-    """Shards that this run requested."""
-    scenes_requested: int = 0
-    """Scenes of the requested shards."""
-    given_up: int = 0
-    """Scenes of this run that could not be made; of all runs once the dataset is finished."""
-
-
 class DatasetWriter:
     """Writes the published files of a dataset to its store, together with its other workers.
 
@@ -105,8 +88,8 @@ class DatasetWriter:
         self.folder = folder
         self.manifest = manifest
         """Manifest of the dataset; it lists shards only once the dataset is finished."""
-        self.progress = DatasetProgress()
-        """Progress of the requested shards, at this worker's last look."""
+        self.given_up = 0
+        """Scenes of this run that could not be made; of all runs once the dataset is finished."""
         self.failures: list[Failure] = []
         """Rejections of this run's scenes, until the manifest lists their shards."""
         self.left_to_others = False
@@ -222,11 +205,9 @@ class DatasetWriter:
         note = self._shards.publish(ShardNote(shard=shard, failures=tuple(failures)))
         if note is None:
             return
-        num_scenes = self._num_scenes([number_of_shard(note.shard)])
+        scenes = scenes_of_shard(number_of_shard(note.shard), self.splits)
         self.failures += note.failures
-        self.progress.shards += 1
-        self.progress.scenes += num_scenes
-        self.progress.given_up += num_scenes - note.shard.num_samples
+        self.given_up += len(scenes) - note.shard.num_samples
 
     def _require_visible(self, name: str) -> None:
         number = int(name.removesuffix(".tar").rpartition("-")[2])
@@ -251,21 +232,11 @@ class DatasetWriter:
         self.refresh_plan()
         every = range(self.num_shards)
         selected = every if requested is None else every[requested.start : requested.stop]
-        missing = self._missing_shards(selected)
-        progress = self.progress
-        progress.shards_requested = len(selected)
-        progress.scenes_requested = self._num_scenes(selected)
-        progress.shards = len(selected) - len(missing)
-        progress.scenes = progress.scenes_requested - self._num_scenes(missing)
-        return missing
+        return self._missing_shards(selected)
 
     def _missing_shards(self, shards: range) -> list[int]:
         finished = self._finished_shards(shards)
         return [index for index in shards if shard_name(index, self._splits) not in finished]
-
-    def _num_scenes(self, shards: Iterable[int]) -> int:
-        splits = self.splits
-        return sum(len(scenes_of_shard(index, splits)) for index in shards)
 
     def _finished_shards(self, shards: range) -> set[str]:
         """Return the names of finished shards: at least all finished ones of a range."""
@@ -313,8 +284,7 @@ class DatasetWriter:
             has_new_plan = self.refresh_plan()
         self.failures = []
         self.manifest = listed
-        every = self._num_scenes(range(self.num_shards))
-        self.progress.given_up = every - listed.num_samples
+        self.given_up = listed.num_scenes - listed.num_samples
         return listed
 
     def _wait_for_lister(self) -> None:

@@ -104,7 +104,7 @@ class Run:
             digest=finished.dataset_digest if finished else "",
             num_objects_found=self.accepted.num_found,
             num_objects_used=self.accepted.num_objects,
-            num_scenes_given_up=writer.progress.given_up,
+            num_scenes_given_up=writer.given_up,
             failures=tuple(writer.failures),
             num_shards=len(finished.shards) if finished else writer.num_finished_shards(),
             num_shards_planned=writer.num_shards,
@@ -122,7 +122,7 @@ class Run:
         num_unusable = len(origin.unusable) if isinstance(origin, SceneFiles) else 0
         num_scenes = writer.manifest.num_scenes
         budget = self.options.failure_budget
-        given_up = writer.progress.given_up
+        given_up = writer.given_up
         if given_up > budget * num_scenes + num_unusable:
             writer.add_failures(writer.failures)
             raise TrilightError(

@@ -38,14 +38,14 @@ from pipeline.flows.prefect_flows import (
 )
 from pipeline.flows.prefect_runner import (
     PrefectRunner,
-    RunArtifacts,
+    RunPage,
     is_retryable,
+    make_with_page,
     report_url,
     small_picture,
     usd_per_core_hour,
 )
 from pipeline.flows.prefect_server import GPU_LIMIT, run_to_end
-from pipeline.generation.dataset_writer import DatasetProgress
 from pipeline.generation.generate_options import GenerateOptions
 from pipeline.generation.generation_run import TaskResult, shard_ranges
 from pipeline.presets.settings import DatasetSettings
@@ -377,34 +377,17 @@ def shown(monkeypatch: pytest.MonkeyPatch) -> Shown:
     return _shown(monkeypatch)
 
 
-def _task(scenes: int, seconds: float) -> TaskResult:
-    return TaskResult(shards=(), scenes=scenes, seconds=seconds, core_s=seconds)
-
-
 def test_a_page_that_cannot_be_shown_does_not_end_the_run(
     tables: Any, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
 ) -> None:
     _cannot_show(monkeypatch)
-    watched = RunArtifacts(GenerateOptions(out=str(tmp_path)))
-    watched.record_task(None, _task(1, 1.0))  # type: ignore[arg-type]
-    watched.show_failure(ValueError("x"))
+    page = RunPage(str(tmp_path))
+    page.record_task(cast(Any, None), TaskResult(shards=(), scenes=1, seconds=1.0, core_s=1.0))
+    page.show_failure(ValueError("x"))
     assert [record.levelname for record in caplog.records] == ["WARNING"]
 
 
-def test_the_rate_begins_with_the_first_scene(
-    tables: Any, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    """An hour of preparing objects, then 4 scenes in 20 s."""
-    now = 0.0
-    monkeypatch.setattr(prefect_runner.time, "monotonic", lambda: now)
-    watched = RunArtifacts(GenerateOptions(out=str(tmp_path)))
-    assert watched.scenes_per_s() == 0
-    now = 3620.0
-    watched.record_task(None, _task(4, 20.0))  # type: ignore[arg-type]
-    assert watched.scenes_per_s() == 4 / 20
-
-
-def test_a_page_shows_the_scenes_and_where_their_report_is(
+def test_a_page_shows_the_progress_the_scenes_and_where_their_report_is(
     tables: Shown, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     pictures: list[str] = []
@@ -412,43 +395,27 @@ def test_a_page_shows_the_scenes_and_where_their_report_is(
         prefect_runner, "create_image_artifact", lambda url, **named: pictures.append(url)
     )
     monkeypatch.delenv("TRILIGHT_PUBLIC_URL", raising=False)
+    without_rendering(monkeypatch)
     out = tmp_path / "set"
-    out.mkdir()
+    make_with_page(tiny_order(out=str(out), scenes=8), Undocumented())
+    assert [key for key, _ in tables] == ["progress", "summary"]  # the second task: too soon
+    assert (tables[0][1]["shards"], tables[0][1]["scenes"]) == ("1 of 2", "4 of 8")
+    assert tables[1][1]["shards"] == "2 of 2"
+    assert "core-hours" in tables[1][1]["cost"]
+    (out / "README.md").write_text("# A set")  # the last document
     Image.effect_noise((1200, 800), 80).save(out / "contact_sheet.png")
-    statistics = SimpleNamespace(lines=lambda: [("views", "16")])
-    outcome: Any = SimpleNamespace(
-        num_shards=1, num_shards_planned=1, digest="d", statistics=statistics
-    )
-    RunArtifacts(GenerateOptions(out=str(out))).show_result(outcome)
-    ((_, rows),) = tables
+    statistics: Any = SimpleNamespace(lines=lambda: [("views", "16")])
+    RunPage(str(out)).show_result(statistics)
+    rows = tables[-1][1]
     assert (rows["report"], rows["views"]) == (f"{out}/report.html", "16")
-    (url,) = pictures
+    assert len(rows["dataset digest"]) > 8
+    url = pictures[-1]
     assert url == small_picture(out / "contact_sheet.png")
     kind, _, data = url.partition(",")
     with Image.open(io.BytesIO(base64.b64decode(data))) as shown:
         assert (kind, shown.format, shown.size) == (
             "data:image/jpeg;base64", "JPEG", (1024, 683)
         )  # fmt: skip
-
-
-def test_the_page_ends_with_how_far_everything_is(
-    tables: Shown, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.setattr(prefect_runner.time, "monotonic", lambda: 0.0)
-    watched = RunArtifacts(GenerateOptions(out=str(tmp_path)))
-    done = DatasetProgress(shards=1, scenes=4, shards_requested=2, scenes_requested=8)
-    publication = SimpleNamespace(progress=done, manifest=SimpleNamespace(num_views=2))
-    run: Any = SimpleNamespace(publication=publication)
-    watched.record_task(run, _task(4, 1.0))
-    publication.progress = DatasetProgress(
-        shards=2, scenes=8, shards_requested=2, scenes_requested=8, given_up=1
-    )
-    watched.record_task(run, _task(4, 1.0))  # too soon for another table
-    outcome: Any = SimpleNamespace(num_shards=2, num_shards_planned=2, digest="d", statistics=None)
-    watched.show_result(outcome)
-    assert [key for key, _ in tables] == ["progress", "progress", "summary"]
-    shown = [(rows["shards"], rows["scenes in shards"]) for _, rows in tables[:2]]
-    assert shown == [("1 of 2", "4 of 8"), ("2 of 2", "7 of 8")]
 
 
 def test_a_run_that_fails_says_so_in_its_summary(
@@ -459,12 +426,11 @@ def test_a_run_that_fails_says_so_in_its_summary(
 
     monkeypatch.setattr(prefect_runner, "make_dataset", full)
     with pytest.raises(TrilightError):
-        prefect_runner.make_with_artifacts(GenerateOptions(out=str(tmp_path)), PrefectRunner())
+        make_with_page(GenerateOptions(out=str(tmp_path)), PrefectRunner())
     ((key, rows),) = tables
     assert key == "summary"
     assert rows["failed"].startswith("TrilightError: the disk is full")
     assert "secret" not in rows["failed"]
-    assert "core-hours" in rows["cost of this run"]
 
 
 @for_each("text", ["cheap", "-1", "nan", "inf", ""])
@@ -475,7 +441,7 @@ def test_a_price_that_is_none_is_named_at_the_start(
     assert usd_per_core_hour() == 0.5
     monkeypatch.setenv("TRILIGHT_USD_PER_CORE_HOUR", text)
     with pytest.raises(TrilightError, match=rf"TRILIGHT_USD_PER_CORE_HOUR is '{text}'; expected"):
-        RunArtifacts(GenerateOptions())
+        RunPage("data/smoke")
 
 
 @pytest.fixture

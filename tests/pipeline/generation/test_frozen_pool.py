@@ -225,7 +225,9 @@ def test_an_object_that_is_there_again_is_found(tmp_path: Path) -> None:
 
 def test_a_frozen_row_that_is_gone_or_has_changed_is_named() -> None:
     row = locked("texture:cloth", kind=TEXTURE)
-    require_same("textures", {row.uid: row}, [row, locked("a")])
+    require_same("textures", {row.uid: row}, [row])
+    with pytest.raises(TrilightError, match="'a' is new"):
+        require_same("textures", {row.uid: row}, [row, locked("a")])
     with pytest.raises(TrilightError, match="'texture:cloth' is missing or no longer usable"):
         require_same("textures", {row.uid: row}, [])
     with pytest.raises(TrilightError, match="'texture:cloth' has changed"):
