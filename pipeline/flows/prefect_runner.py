@@ -178,7 +178,7 @@ class RunPage:
         remaining_s = status.remaining_s
         left = "unknown" if remaining_s is None else f"{remaining_s / 60:.0f} minutes"
         rows = [
-            ("scenes", f"{status.scenes_done} of {status.scenes_planned}"),
+            ("scenes in shards", f"{status.scenes_done} of {status.scenes_planned}"),
             ("views an hour", _number(status.views_per_hour)),
             ("left at that rate", left),
         ]

@@ -399,7 +399,7 @@ def test_a_page_shows_the_progress_the_scenes_and_where_their_report_is(
     out = tmp_path / "set"
     make_with_page(tiny_order(out=str(out), scenes=8), Undocumented())
     assert [key for key, _ in tables] == ["progress", "summary"]  # the second task: too soon
-    assert (tables[0][1]["shards"], tables[0][1]["scenes"]) == ("1 of 2", "4 of 8")
+    assert (tables[0][1]["shards"], tables[0][1]["scenes in shards"]) == ("1 of 2", "4 of 8")
     assert tables[1][1]["shards"] == "2 of 2"
     assert "core-hours" in tables[1][1]["cost"]
     (out / "README.md").write_text("# A set")  # the last document
