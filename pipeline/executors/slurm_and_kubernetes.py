@@ -126,6 +126,7 @@ def _is_begun(place: str) -> bool:
 
 
 SCRIPT = Path(__file__).parents[2] / "infra/slurm/generate.sbatch"
+_JOB = Path(__file__).parents[2] / "infra/kubernetes/array/job.yaml"
 
 
 def sbatch_command(job: ArrayJob, options: Sequence[str] = ()) -> list[str]:
@@ -179,8 +180,6 @@ def _submit(
 
 MACHINES = "TRILIGHT_MACHINES"
 """Variable with the path of a JSON file: options of machines, such as {"where": "a-namespace"}."""
-_KEPT_S = 86400
-"""Seconds that an ended job stays visible in the cluster."""
 
 
 @checked()
@@ -281,76 +280,27 @@ def job_manifest(job: ArrayJob, options: KubernetesOptions) -> dict[str, Any]:
         "HOME": "/tmp",
     }
     said = repr((words, environment, job.at_once, options))
-    return {
-        "apiVersion": "batch/v1",
-        "kind": "Job",
-        "metadata": {
-            "name": f"trilight-{sha256_hex(said.encode())[:12]}",
-            "namespace": options.where or "trilight",
-            "labels": {"app": "trilight-array"},
-        },
-        "spec": {
-            "completionMode": "Indexed",
-            "completions": len(job.tasks),
-            "parallelism": min(job.at_once or len(job.tasks), len(job.tasks)),
-            "backoffLimitPerIndex": options.tries - 1,
-            "podFailurePolicy": {
-                "rules": [
-                    {"action": "Ignore", "onPodConditions": [{"type": "DisruptionTarget"}]},
-                    {
-                        "action": "FailIndex",
-                        "onExitCodes": {"containerName": "task", "operator": "In", "values": [2]},
-                    },
-                ]
-            },
-            "ttlSecondsAfterFinished": _KEPT_S,
-            "template": {
-                "metadata": {"labels": {"app": "trilight-array"}},
-                "spec": _pod(words, environment, options),
-            },
-        },
-    }
-
-
-def _pod(
-    words: Sequence[str], environment: dict[str, str], options: KubernetesOptions
-) -> dict[str, Any]:
     amounts = {"cpu": str(options.cores), "memory": f"{options.memory_gib}Gi"}
-    mounts = {"tmp": "/tmp", "cache": "/cache", "data": "/data"}
-    pod: dict[str, Any] = {
-        "restartPolicy": "Never",
-        "activeDeadlineSeconds": round(3600 * options.task_hours),
-        "automountServiceAccountToken": False,
-        "securityContext": {
-            "runAsNonRoot": True, "runAsUser": 10001, "fsGroup": 10001,
-            "seccompProfile": {"type": "RuntimeDefault"},
-        },
-        "containers": [
-            {
-                "name": "task",
-                "image": _image(options),
-                "imagePullPolicy": "IfNotPresent",
-                "command": words,
-                "env": [{"name": name, "value": value} for name, value in environment.items()],
-                "envFrom": [{"secretRef": {"name": "trilight-bucket", "optional": True}}],
-                "resources": {"requests": amounts, "limits": dict(amounts)},
-                "securityContext": {
-                    "allowPrivilegeEscalation": False,
-                    "readOnlyRootFilesystem": True,
-                    "capabilities": {"drop": ["ALL"]},
-                },
-                "volumeMounts": [
-                    {"name": name, "mountPath": path} for name, path in mounts.items()
-                ],
-            }
-        ],
-        "volumes": [{"name": name, "emptyDir": {}} for name in mounts],
-    }  # fmt: skip
+    manifest: dict[str, Any] = yaml.safe_load(_JOB.read_bytes())
+    manifest["metadata"]["name"] = f"trilight-{sha256_hex(said.encode())[:12]}"
+    manifest["metadata"]["namespace"] = options.where or "trilight"
+    spec = manifest["spec"]
+    spec["completions"] = len(job.tasks)
+    spec["parallelism"] = min(job.at_once or len(job.tasks), len(job.tasks))
+    spec["backoffLimitPerIndex"] = options.tries - 1
+    pod = spec["template"]["spec"]
+    pod["activeDeadlineSeconds"] = round(3600 * options.task_hours)
     if options.account:
         pod["serviceAccountName"] = options.account
     if options.machine_type:
         pod["nodeSelector"] = {"node.kubernetes.io/instance-type": options.machine_type}
-    return pod
+    pod["containers"][0] |= {
+        "image": _image(options),
+        "command": words,
+        "env": [{"name": name, "value": value} for name, value in environment.items()],
+        "resources": {"requests": amounts, "limits": dict(amounts)},
+    }
+    return manifest
 
 
 def _image(options: KubernetesOptions) -> str:
