@@ -4,6 +4,7 @@ Each file is decoded once, in a child with limits; the result is in the user's c
 its content decides the split of a texture or map, by the rule of objects.
 """
 
+import contextlib
 import logging
 from collections.abc import Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
@@ -127,7 +128,6 @@ def _prepare_maps(
     scenes = settings.scenes
     size = scenes.textures.surfaces.size if kind == TEXTURE else scenes.skies.maps.height
     all_files = reach(files=(path for user_map in maps for path in user_map.files.values()))
-    pool = ChildPool(lambda _: IsolatedChild(limits=_LIMITS, confined_to=all_files), workers)
 
     def prepare(user_map: FoundMap) -> tuple[LockedObject, Path] | Failure:
         try:
@@ -137,11 +137,9 @@ def _prepare_maps(
         except Rejected as rejection:
             return failure_of("objects", user_map.record.uid, rejection)
 
-    try:
-        with ThreadPoolExecutor(workers) as threads:
-            return list(threads.map(prepare, maps))
-    finally:
-        pool.close()
+    children = ChildPool(lambda _: IsolatedChild(limits=_LIMITS, confined_to=all_files), workers)
+    with contextlib.closing(children) as pool, ThreadPoolExecutor(workers) as threads:
+        return list(threads.map(prepare, maps))
 
 
 def _notes(prepared: Path) -> Path:

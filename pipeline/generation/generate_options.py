@@ -20,6 +20,11 @@ from storage.settings.overrides import option_words
 from storage.settings.ranges import Seed, Share, Within
 
 _RANGE = re.compile(r"(\d+):(\d+)")
+_OF_COMPOSED = ("objects", "scenes", "textures", "skies")
+_EXCLUDED = {"scenes_from": _OF_COMPOSED, "revisits": (*_OF_COMPOSED, "scenes_from")}
+"""Options that cannot be given with an option, as that one says what scenes are made of."""
+_NEEDS = {"map_licence": ("textures", "skies"), "views": ("scenes_from",)}
+"""Options of which one must be given with an option."""
 _PER_MACHINE = ("build", "out", "shards", "workers")
 """Fields that differ from machine to machine: folder, range of shards, number of processes."""
 
@@ -95,20 +100,20 @@ class GenerateOptions:
 
     def __post_init__(self) -> None:
         DATASET_PRESETS.find(self.build)
-        objects_and_scenes = (self.objects, self.scenes)
-        if self.scenes_from is not None and objects_and_scenes != (None, None):
-            raise TrilightError(
-                f"--scenes-from {self.scenes_from} was given with --objects or --scenes; expected "
-                "neither: the files say both."
-            )
-        if self.revisits is not None and (*objects_and_scenes, self.scenes_from) != (None,) * 3:
-            raise TrilightError(
-                f"--revisits {self.revisits} was given with --objects, --scenes or --scenes-from; "
-                "expected none of them: the dataset says all."
-            )
-        _refuse_maps(self)
-        if self.scenes_from is None and self.views is not None:
-            raise TrilightError(f"--views is {self.views}; expected it only with --scenes-from.")
+        stated = [name for name, value in vars(self).items() if value is not None]
+        for name, others in _EXCLUDED.items():
+            if name in stated and (wrong := [other for other in others if other in stated]):
+                raise TrilightError(
+                    f"{_flag(name)} {getattr(self, name)} was given with "
+                    f"{' and '.join(map(_flag, wrong))}; expected it without: it says what scenes "
+                    "are made of. Leave one out."
+                )
+        for name, others in _NEEDS.items():
+            if name in stated and not {*others} & {*stated}:
+                raise TrilightError(
+                    f"{_flag(name)} is {getattr(self, name)!r}; expected it only with "
+                    f"{' or '.join(map(_flag, others))}."
+                )
         dataset_folder(self.place)
         self.shard_range()
 
@@ -160,19 +165,8 @@ class GenerateOptions:
         return range(int(match[1]), int(match[2]))
 
 
-def _refuse_maps(options: GenerateOptions) -> None:
-    """Raise if map folders are given for scenes that are not composed, or a licence without any."""
-    for name, value in (("--textures", options.textures), ("--skies", options.skies)):
-        if value is not None and (options.scenes_from or options.revisits):
-            raise TrilightError(
-                f"{name} was given with --scenes-from or --revisits; expected it only where scenes "
-                "are composed. Leave it out."
-            )
-    if options.map_licence is not None and options.textures is None and options.skies is None:
-        raise TrilightError(
-            f"--map-licence is {options.map_licence!r}; expected it only with --textures or "
-            "--skies."
-        )
+def _flag(name: str) -> str:
+    return f"--{name.replace('_', '-')}"
 
 
 def generate_words(options: GenerateOptions) -> list[str]:

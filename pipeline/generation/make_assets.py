@@ -25,7 +25,7 @@ from pipeline.generation.prepare_isolated import (
     UnreadNotes,
     asset_child,
     asset_store,
-    prepare_isolated,
+    mesh_stage,
     write_unread,
 )
 from pipeline.isolation import ChildFailed, call_with_retries, reach
@@ -131,9 +131,8 @@ def make_assets(
     )
     write_atomically(folder.summary, b"{}")  # from here on the folder is ours
     on_plan(len(listed.records))
-    prepared, rejected = prepare_isolated(
-        list(listed.records), settings, workers=workers, done=on_object
-    )
+    with mesh_stage(settings, workers) as prepare:
+        prepared, rejected = prepare(list(listed.records), on_object)
     store = asset_store()
     assets = [decode_asset(store.asset_path(each.asset_name).read_bytes()) for each in prepared]
     levels = [asset.levels[0] for asset in assets]

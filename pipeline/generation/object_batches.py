@@ -21,7 +21,7 @@ from pipeline.assets.settings import AssetSettings
 from pipeline.assets.stage import PreparedObject
 from pipeline.foreign.limits import SUFFIXES
 from pipeline.generation.dataset_writer import DatasetWriter
-from pipeline.generation.prepare_isolated import MeshWork
+from pipeline.generation.prepare_isolated import Prepare, mesh_stage
 from pipeline.isolation import is_transient
 from pipeline.objects.listing import Fetched
 from storage.atomic import write_atomically
@@ -123,7 +123,7 @@ class ObjectBatch:
             return self._read(self._cached) if self._cached else None
         return None
 
-    def make(self, meshes: MeshWork, done: Callable[[int], None]) -> bool:
+    def make(self, prepare: Prepare, done: Callable[[int], None]) -> bool:
         """Prepare the objects unless another worker does or has done so; return True if done here.
 
         Args:
@@ -138,7 +138,7 @@ class ObjectBatch:
             if result := self.result():
                 done(len(records))
             else:
-                assets, failures = meshes.prepare(records, lambda: done(1))
+                assets, failures = prepare(records, lambda: done(1))
                 result = assets, [*failures, *lost]
             is_final = not _may_change(result[1])
             data = _encode(result)
@@ -231,14 +231,14 @@ def prepare_in_batches(
     ours: set[int] = set()
 
     def make(number: int) -> bool:
-        return not should_stop() and batches[number].make(meshes, done)
+        return not should_stop() and batches[number].make(prepare, done)
 
     # from a random first one: to find a claimed batch costs a look
     first = uuid.uuid4().int % max(len(batches), 1)
     order = [*range(first, len(batches)), *range(first)]
     at_once = 1 + -(-workers // _NUM_OBJECTS)  # no child waits for the last object of a batch
     # children end first: after Ctrl-C no thread waits for the objects that it has in hand
-    with ThreadPoolExecutor(at_once) as threads, MeshWork(work.settings, workers) as meshes:
+    with ThreadPoolExecutor(at_once) as threads, mesh_stage(work.settings, workers) as prepare:
         pause_s = _PAUSES_S[0]
         notice = WaitNotice()
         while True:

@@ -17,7 +17,7 @@ from pipeline.exchange.scene_files import SceneFiles
 from pipeline.generation.freeze_objects import changed_error, require_tried
 from pipeline.generation.frozen_pool import ComposedScenes
 from pipeline.generation.generation_run import ShardJob
-from pipeline.generation.prepare_isolated import asset_child, asset_store, prepare_isolated
+from pipeline.generation.prepare_isolated import asset_child, asset_store, mesh_stage
 from pipeline.generation.scene_worker import SceneWorker
 from pipeline.isolation import ChildLimits, ChildPool, IsolatedChild, call_with_retries, reach
 from pipeline.objects.sources import ListedObjects, list_objects
@@ -168,9 +168,8 @@ def restore_object(job: ShardJob, uid: str, asset_name: str) -> None:
     record = find_object(frozen.source, frozen.licence, work_dir, settings.allowed_licences, uid)
     if record is None or locked is None:
         raise changed_error(display_name, uid, "is missing or no longer usable")
-    prepared, rejected = prepare_isolated(
-        [record], settings.mesh_settings, workers=1, done=lambda: None
-    )
+    with mesh_stage(settings.mesh_settings, workers=1) as prepare:
+        prepared, rejected = prepare([record], lambda: None)
     if rejected:
         require_tried(display_name, rejected[0])
     if not prepared or prepared[0].asset_sha256 != locked.asset_sha256:

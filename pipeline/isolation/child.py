@@ -24,7 +24,7 @@ from typing import Any
 
 from pipeline.isolation.answers import CallTime, TooLong, decode_answer, receive, send
 from pipeline.isolation.call_failures import ChildFailed, Result, with_retries
-from pipeline.isolation.child_main import CallKind, serve
+from pipeline.isolation.child_main import call_held, hold, serve
 from pipeline.isolation.confinement import Reach, code_of, confine, should_confine
 from storage.errors import EnvironmentFailure
 from storage.extensions import load_same, loaded_files
@@ -115,25 +115,28 @@ class IsolatedChild:
             TrilightError: also where a new child cannot be set up.
             ChildClosed: `close` was called, perhaps by another thread.
         """
-        return self._call("function", function, args)
+        return self._call(function, function, args)
 
     def call_method(self, method: Callable[..., Result], *args: Any) -> Result:
         """Run a function whose first argument is the object that the child holds; as `call`."""
-        return self._call("method", method, args)
+        return self._call(method, call_held, (method, *args))
 
     def _call(
-        self, kind: CallKind, function: Callable[..., Result], args: tuple[Any, ...]
+        self,
+        declared: Callable[..., Result],
+        function: Callable[..., Any],
+        args: tuple[Any, ...],
     ) -> Result:
         if self._closed:
             raise ChildClosed
-        if self._reach is not None and not (code := code_of(function)) <= self._code:
+        if self._reach is not None and not (code := code_of(declared)) <= self._code:
             self._code |= code
             self.retire()
         try:
             if self._calls_left == 0:
                 self._start()
             self._calls_left -= 1
-            return self._exchange(kind, function, args, self._limits.wall_s)
+            return self._exchange(declared, function, args, self._limits.wall_s)
         except ChildFailed:
             self.retire()
             raise
@@ -169,11 +172,11 @@ class IsolatedChild:
                 code = self._code | {Path(path).parent for path, _ in files}
                 if self._factory is not None:
                     code |= code_of(self._factory)
-                self._exchange("function", confine, (self._reach, code), _START_UP_S)
+                self._exchange(confine, confine, (self._reach, code), _START_UP_S)
             if files:  # first: the factory may use their definitions
-                self._exchange("function", load_same, (files,), _START_UP_S)
+                self._exchange(load_same, load_same, (files,), _START_UP_S)
             if self._factory is not None:
-                self._exchange("factory", self._factory, self._args, _START_UP_S)
+                self._exchange(hold, hold, (self._factory, *self._args), _START_UP_S)
         except ChildFailed as failure:
             if self._closed:
                 raise ChildClosed from failure
@@ -184,21 +187,20 @@ class IsolatedChild:
 
     def _exchange(
         self,
-        kind: CallKind,
-        function: Callable[..., Result],
+        declared: Callable[..., Result],
+        function: Callable[..., Any],
         args: tuple[Any, ...],
         wall_s: float,
     ) -> Result:
+        """Send a call, and return the result, checked by the type that `declared` returns."""
         from pipeline.isolation.result_schema import result_reader  # children do without
 
         assert self._connection is not None
-        # a factory's object stays in the child, which answers None
-        declared: Callable[..., Any] = _no_result if kind == "factory" else function
         result_reader(declared)  # raises first if the declared result type cannot be checked
         file = self._connection.fileno()
         wait = CallTime(self._process.pid, wall_s)
         try:
-            send(file, [ForkingPickler.dumps((kind, function, args))], wait)
+            send(file, [ForkingPickler.dumps((function, args))], wait)
             answer = receive(file, wait, min(self._limits.memory_bytes, _MOST_BYTES))
             result: Result = decode_answer(answer, declared)
             return result
@@ -221,10 +223,6 @@ class IsolatedChild:
             return ChildFailed(f"crashed_signal_{-code}", f"native code ended by {name}")
         hint = "; the system may be out of memory" if -code == signal.SIGKILL else ""
         return ChildFailed("killed", f"ended by {name}{hint}")
-
-
-def _no_result() -> None:
-    """Declare the answer to a factory."""
 
 
 def _cannot_be_set_up(failure: ChildFailed) -> EnvironmentFailure:

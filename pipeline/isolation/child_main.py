@@ -10,7 +10,7 @@ import traceback
 from collections.abc import Callable
 from multiprocessing.connection import Connection
 from multiprocessing.reduction import ForkingPickler
-from typing import Any, Literal
+from typing import Any
 
 from pipeline.isolation.answers import encode_error, encode_result, receive, send, wait_forever
 from storage.errors import EnvironmentFailure, Rejected, TrilightError
@@ -42,8 +42,19 @@ def _leave_owner(connection: Connection, output: Connection) -> None:
     die_with_parent()
 
 
-CallKind = Literal["factory", "function", "method"]
-"""`factory` makes the object that the child holds, which `method` receives first."""
+_held: Any = None
+"""The object that this child holds."""
+
+
+def hold(factory: Callable[..., object], *args: Any) -> None:
+    """Make the object that this child holds."""
+    global _held
+    _held = factory(*args)
+
+
+def call_held(method: Callable[..., Any], *args: Any) -> Any:
+    """Call a function with the object that this child holds, and further arguments."""
+    return method(_held, *args)
 
 
 def serve(connection: Connection, output: Connection, memory_bytes: int, cpu_s: int | None) -> None:
@@ -61,24 +72,14 @@ def serve(connection: Connection, output: Connection, memory_bytes: int, cpu_s: 
         memory_bytes = min(memory_bytes, most)
     resource.setrlimit(resource.RLIMIT_AS, (memory_bytes, memory_bytes))
     file = connection.fileno()
-    held: Any = None
-
-    def hold(factory: Callable[..., Any], *args: Any) -> None:
-        nonlocal held
-        held = factory(*args)
-
     while True:
         try:
             # pickle: the child trusts its owner; the owner never unpickles a child's bytes
             (message,) = receive(file, wait_forever, sys.maxsize)
-            kind, function, args = ForkingPickler.loads(message.data)
+            function, args = ForkingPickler.loads(message.data)
         except EOFError:
             os._exit(0)  # the parent has died: skip the destructors of native libraries
         _allow_cpu(cpu_s)
-        if kind == "factory":
-            function, args = hold, (function, *args)
-        elif kind == "method":
-            args = (held, *args)
         send(file, _answer(function, args), wait_forever)
 
 

@@ -1,5 +1,6 @@
 """Objects that no mesh stage has made: files and assets by hand, and what stands for the stage."""
 
+import contextlib
 import dataclasses
 import functools
 import hashlib
@@ -103,19 +104,14 @@ class Mesher:
             done()
         return assets, failures
 
-    def __enter__(self) -> "Mesher":
-        return self
-
-    def __exit__(self, *error: object) -> None:
-        """Hold nothing."""
-
 
 def use_mesher(monkeypatch: pytest.MonkeyPatch, *, batch: int) -> Mesher:
     """Replace the mesh stage, with batches of so many objects and short pauses."""
     mesher = Mesher()
     monkeypatch.setattr(object_batches, "_NUM_OBJECTS", batch)
     monkeypatch.setattr(object_batches, "_PAUSES_S", (0.001, 0.05))
-    monkeypatch.setattr(object_batches, "MeshWork", lambda settings, workers: mesher)
+    stage = contextlib.nullcontext(mesher.prepare)
+    monkeypatch.setattr(object_batches, "mesh_stage", lambda settings, workers: stage)
     return mesher
 
 

@@ -375,7 +375,7 @@ def test_folders_and_shares_belong_together() -> None:
         map_folders(GenerateOptions(textures="t"), preset_settings("smoke", changes=SHARES))
     with pytest.raises(TrilightError, match=r"--textures is given, but .*own_share 0"):
         map_folders(GenerateOptions(textures="t"), preset_settings("smoke"))
-    with pytest.raises(TrilightError, match="only where scenes are composed"):
+    with pytest.raises(TrilightError, match="--scenes-from scenes was given with --textures"):
         GenerateOptions(textures="t", scenes_from="scenes")
     with pytest.raises(TrilightError, match="only with --textures or --skies"):
         GenerateOptions(map_licence="MIT")

@@ -349,7 +349,7 @@ def test_all_rounds_of_a_run_are_at_most_a_thousand_tasks() -> None:
         ({"failure_budget": 1.5}, "failure_budget is 1.5"),
         ({"shards": "4:4"}, "shards is '4:4'"),
         ({"views": 2}, "--views is 2"),
-        ({"scenes_from": "a", "scenes": 3}, "expected neither"),
+        ({"scenes_from": "a", "scenes": 3}, "given with --scenes; expected it without"),
     ],
 )
 def test_wrong_orders_are_named(changes: dict[str, object], message: str) -> None:
