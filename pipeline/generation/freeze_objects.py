@@ -371,7 +371,8 @@ def changed_error(display_name: str, uid: str, state: str) -> TrilightError:
     """Return the error of a frozen object or file that its source has lost or changed."""
     return TrilightError(
         f"{display_name}: {uid!r} {state}; expected what the dataset was begun with "
-        "(objects.lock.jsonl). Restore it, name the source that has it, or choose another --out."
+        "(objects.lock.jsonl). Restore it, name the source that has it by --objects or "
+        "--scenes-from, or choose another --out."
     )
 
 

@@ -244,8 +244,7 @@ def _pairs(
         "Best": changed[-_PICTURES:],
     }
     pairs: dict[str, list[Pair]] = {name: [] for name in groups}
-    child = asset_child()
-    try:
+    with contextlib.closing(asset_child()) as child:
         for name, indices in groups.items():
             for i in indices:
                 path = prepared[i].record.path
@@ -255,6 +254,4 @@ def _pairs(
                         child, preview_source_and_level, path, settings, levels[i], _WIDTH_PX
                     )
                     pairs[name].append(Pair(row=rows[i], source=source, result=result))
-    finally:
-        child.close()
     return pairs

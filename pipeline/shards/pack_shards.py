@@ -127,18 +127,16 @@ def _pack(folder: DatasetFolder, name: str, scene_indices: range, *, grows: bool
     path = folder.shard(name)
     rejections = rejections_of_shard(folder, name)
     write_failures(rejections, failures)
-    if not grows:
-        write_shard(path, samples)
-        shutil.rmtree(staged_folder, ignore_errors=True)  # leftovers are never read
-        return index_shard(path)
-    written = folder.staging / path.name
-    written.unlink(missing_ok=True)
+    written = folder.staging / path.name if grows else path
+    if grows:
+        written.unlink(missing_ok=True)
     write_shard(written, samples)
     shard = index_shard(written)
-    note_shard(folder, ShardNote(shard=shard, failures=tuple(failures)))  # until it has the name,
-    os.replace(written, path)  # the old one can be read
-    write_failures(rejections, failures)
-    write_manifest(folder.manifest, read_manifest(folder.manifest).with_grown(shard))
+    if grows:
+        note_shard(folder, ShardNote(shard=shard, failures=tuple(failures)))  # until it has the
+        os.replace(written, path)  # name, the old one can be read
+        write_failures(rejections, failures)
+        write_manifest(folder.manifest, read_manifest(folder.manifest).with_grown(shard))
     shutil.rmtree(staged_folder, ignore_errors=True)  # leftovers are never read
     return shard
 

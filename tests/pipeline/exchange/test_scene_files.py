@@ -196,11 +196,11 @@ def test_files_are_frozen_by_digest(folder: Path, tmp_path: Path) -> None:
     mesh = folder / "meshes/green.obj"
     before = mesh.read_bytes()
     mesh.write_bytes(before + b"\n")
-    with pytest.raises(TrilightError, match="scene file meshes/green.obj: has changed"):
+    with pytest.raises(TrilightError, match="scene files: 'meshes/green.obj' has changed"):
         _accept(folder, out)
     mesh.write_bytes(before)
     _change(folder, "b.json", remesh=False)
-    with pytest.raises(TrilightError, match="scene file b.json: has changed"):
+    with pytest.raises(TrilightError, match="scene files: 'b.json' has changed"):
         _accept(folder, out)
     shutil.copy(folder / "a.json", folder / "c.json")
     with pytest.raises(TrilightError, match="listed_scenes was 2, now 3"):
