@@ -38,10 +38,9 @@ from prefect.logging import get_run_logger
 from prefect.tasks import Task, exponential_backoff
 
 from pipeline.flows.prefect_server import DISK_LIMIT, GPU_LIMIT
-from pipeline.generation.generate_options import GenerateOptions
+from pipeline.generation.generate_options import PRICES, USD_PER_CORE_HOUR, GenerateOptions
 from pipeline.generation.generation_run import Outcome, Piece, Run, Runner, ShardJob, TaskResult
 from pipeline.generation.pipeline import make_dataset, make_task
-from pipeline.generation.price import PRICES, USD_PER_CORE_HOUR
 from storage.dataset.layout import dataset_folder
 from storage.dataset.progress import DatasetStatus, read_status
 from storage.dataset.statistics import Statistics

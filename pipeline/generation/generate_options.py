@@ -29,6 +29,20 @@ _PER_MACHINE = ("build", "out", "shards", "workers")
 """Fields that differ from machine to machine: folder, range of shards, number of processes."""
 
 
+USD_PER_CORE_HOUR = 0.04
+"""Default price of a core-hour."""
+PRICES = Within(0, 1000, unit="USD per core-hour")
+"""Range of prices; its upper end is ten thousand times the usual rent of a core."""
+
+
+@checked()
+class CorePrice:
+    """The price of computing."""
+
+    price: Annotated[float, PRICES] = USD_PER_CORE_HOUR
+    """Price of one core for an hour, in USD."""
+
+
 @checked()
 class GenerateOptions:
     """The dataset to make, the range of its shards, and how."""

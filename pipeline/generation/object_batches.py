@@ -242,8 +242,10 @@ def prepare_in_batches(
         pause_s = _PAUSES_S[0]
         notice = WaitNotice()
         while True:
-            for number in _collect_results(batches, results) - ours:
-                done(len(batches[number].records))
+            for number, batch in enumerate(batches):
+                if number not in results and (result := batch.result()) is not None:
+                    results[number] = result
+                    done(0 if number in ours else len(batch.records))
             missing = [number for number in order if number not in results]
             if not missing or should_stop():
                 break
@@ -259,16 +261,6 @@ def prepare_in_batches(
                 pause_s = min(2 * pause_s, _PAUSES_S[1])
     ordered = [result for _, result in sorted(results.items())]
     return [one for some, _ in ordered for one in some], [f for _, some in ordered for f in some]
-
-
-def _collect_results(batches: Sequence[ObjectBatch], results: dict[int, PrepareResult]) -> set[int]:
-    """Add the results that are new to `results`; return the numbers of their batches."""
-    new = set()
-    for number, batch in enumerate(batches):
-        if number not in results and (result := batch.result()) is not None:
-            results[number] = result
-            new.add(number)
-    return new
 
 
 def _may_change(failures: Iterable[Failure]) -> bool:

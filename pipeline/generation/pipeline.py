@@ -54,9 +54,8 @@ from pipeline.generation.render_sample import failure_of
 from pipeline.generation.render_workers import (
     close_children,
     cores_of_child,
-    render_child,
+    job_children,
     restore_object,
-    scene_reader,
 )
 from pipeline.generation.scene_worker import MAX_ATTEMPTS, SceneAttempt, SceneWorker
 from pipeline.isolation import ChildFailed, IsolatedChild, with_retries
@@ -196,7 +195,7 @@ def make_task(job: ShardJob, pieces: tuple[Piece, ...]) -> TaskResult:
         TrilightError: the output cannot be written, or this machine would make other bytes.
     """
     started = time.monotonic()
-    with render_child(job) as child, scene_reader(job) as read:
+    with job_children(job) as (child, read):
         made = [make_piece(job, piece, child, read) for piece in pieces]
     seconds = time.monotonic() - started
     return TaskResult(

@@ -346,8 +346,6 @@ class ChildPool:
         self._free: queue.SimpleQueue[IsolatedChild] = queue.SimpleQueue()
         for child in self._children:
             self._free.put(child)
-        self.num_users = 0
-        """Number of tasks that use the pool; counted by the owner of several pools."""
 
     @contextlib.contextmanager
     def borrow(self) -> Iterator[IsolatedChild]:

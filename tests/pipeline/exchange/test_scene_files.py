@@ -20,6 +20,7 @@ from pipeline.generation.accept_scene_files import (
 )
 from pipeline.generation.dataset_writer import begin_or_resume_dataset
 from pipeline.generation.generate_options import GenerateOptions
+from pipeline.isolation import ChildPool
 from pipeline.presets.registry import preset_settings
 from pipeline.presets.settings import DatasetSettings
 from storage.dataset.layout import DatasetFolder
@@ -224,12 +225,14 @@ def test_a_run_reads_files_in_a_confined_child(
     settings = _settings(folder)
     (folder / "c.json").write_text((folder / "a.json").read_text())
     files = _files(folder, "a.json", "c.json", **{"c.json": "it is not wanted"})
+    no_renderer = cast(Any, lambda number: SimpleNamespace(close=lambda: None))
+    monkeypatch.setattr(render_workers, "_render_pool", lambda job: ChildPool(no_renderer, 1))
     job = cast(Any, SimpleNamespace(
         folder=DatasetFolder(tmp_path / "set"), settings=settings, lock_sha256="",
         accepted=SimpleNamespace(origin=files), num_at_once=1, device="",
     ))  # fmt: skip
     try:
-        with render_workers.scene_reader(job) as read:
+        with render_workers.job_children(job) as (_, read):
             assert read is not None
             scene, expected = read(0), _scene(files, 0, settings)
             assert scene.provenance == expected.provenance
@@ -241,12 +244,14 @@ def test_a_run_reads_files_in_a_confined_child(
                 patch.setattr(render_workers, "call_with_retries", lambda *asked: wrong)
                 with pytest.raises(TrilightError):
                     read(0)
-            (child,) = next(iter(render_workers._pools.values()))._children
+            (children,) = render_workers._jobs.values()
+            assert children.readers is not None
+            (child,) = children.readers._children
             assert child._reach is not None and child._reach.reads == {folder.resolve()}
     finally:
         render_workers.close_children()
     job.accepted.origin = NO_OBJECTS.origin
-    with render_workers.scene_reader(job) as nothing:
+    with render_workers.job_children(job) as (_, nothing):
         assert nothing is None
 
 

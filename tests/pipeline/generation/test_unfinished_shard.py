@@ -19,7 +19,7 @@ from pipeline.generation.generate_options import GenerateOptions
 from pipeline.generation.generation_run import Piece, Run, Runner, ShardJob, TaskResult
 from pipeline.generation.pipeline import make_dataset, make_piece
 from pipeline.generation.scene_worker import SceneAttempt
-from pipeline.isolation import ChildFailed, ChildPool, IsolatedChild
+from pipeline.isolation import ChildFailed, IsolatedChild
 from pipeline.shards import pack_shards as pack
 from pipeline.shards.pack_shards import UnfinishedShard, pack_shard
 from storage import file_locks
@@ -340,17 +340,20 @@ def test_only_children_that_nobody_uses_are_closed(monkeypatch: pytest.MonkeyPat
     """Another run may be at work on the same Dask worker."""
     closed: list[str] = []
 
-    def pool(name: str) -> ChildPool:
-        child = SimpleNamespace(close=lambda: closed.append(name))
-        return ChildPool(lambda number: cast(IsolatedChild, child), 1)
+    def children(name: str) -> SimpleNamespace:
+        lent = SimpleNamespace(borrow=lambda: contextlib.nullcontext("child"))
+        return SimpleNamespace(
+            num_users=0, renderers=lent, readers=None, close=lambda: closed.append(name)
+        )
 
     job = cast(Any, SimpleNamespace(
         folder=DatasetFolder(Path("a")), settings=SimpleNamespace(digest="d"), lock_sha256="l",
         device="cpu",
     ))  # fmt: skip
-    monkeypatch.setattr(render_workers, "_pools", {("b", "d", "l"): pool("other")})
-    monkeypatch.setattr(render_workers, "_render_pool", lambda job: pool("ours"))
-    with render_workers.render_child(job):
+    monkeypatch.setattr(render_workers, "_jobs", {("b", "d", "l"): children("other")})
+    monkeypatch.setattr(render_workers, "_JobChildren", lambda job: children("ours"))
+    with render_workers.job_children(job) as lent:
+        assert lent == ("child", None)
         assert closed == ["other"]
         render_workers.close_idle_children()
         assert closed == ["other"]
