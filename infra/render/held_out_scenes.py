@@ -49,9 +49,7 @@ def composing_child(
     """
     variant = variant or choose_variant()
     workers = threads or available_cores()
-    publication = begin_or_resume_dataset(
-        DatasetFolder(folder), settings, environment(variant), 1, accept_environment=False
-    )
+    publication = begin_or_resume_dataset(DatasetFolder(folder), settings, environment(variant), 1)
     accepted = ObjectLock(
         source=objects, licence=None, settings=settings, writer=publication, workers=workers
     ).freeze()

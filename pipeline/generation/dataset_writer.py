@@ -438,7 +438,7 @@ def begin_or_resume_dataset(
     environment: Mapping[str, Any],
     num_scenes: int,
     *,
-    accept_environment: bool,
+    accept_environment: bool = False,
 ) -> DatasetWriter:
     """Begin a dataset in a folder or a bucket, or resume the one that is there.
 

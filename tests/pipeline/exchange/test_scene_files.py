@@ -94,9 +94,7 @@ def _scene(files: SceneFiles, scene_index: int, settings: DatasetSettings) -> Sc
 
 def _accept(folder: Path, out: Path, licence: str | None = None) -> object:
     found, settings = find_scene_files(str(folder)), _settings(folder)
-    publication = begin_or_resume_dataset(
-        DatasetFolder(out), settings, {}, 1, accept_environment=False
-    )
+    publication = begin_or_resume_dataset(DatasetFolder(out), settings, {}, 1)
     return accept_scene_files(found, licence, settings, publication).origin
 
 

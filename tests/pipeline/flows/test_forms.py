@@ -27,8 +27,6 @@ from pipeline.executors.slurm_and_kubernetes import (
     options_from_environment,
 )
 from pipeline.flows import flow_executors, prefect_flows, prefect_runner
-from pipeline.flows import prefect_flows as building
-from pipeline.flows import prefect_runner as runner
 from pipeline.flows.forms import DatasetInRuns, DatasetOverrides, changed_values, options_of_form
 from pipeline.flows.prefect_flows import (
     build_dataset,
@@ -47,7 +45,7 @@ from pipeline.flows.prefect_runner import (
 )
 from pipeline.flows.prefect_server import GPU_LIMIT, run_to_end
 from pipeline.generation.generate_options import GenerateOptions
-from pipeline.generation.generation_run import TaskResult, shard_ranges
+from pipeline.generation.generation_run import TaskResult
 from pipeline.presets.settings import DatasetSettings
 from storage.errors import EnvironmentFailure, TrilightError
 from tests.for_each import for_each
@@ -208,25 +206,22 @@ def made(monkeypatch: pytest.MonkeyPatch) -> list[str | None]:
         ranges.append(f"{deployment} {parameters['shards']}")
 
     status = SimpleNamespace(shards_planned=10)
-    monkeypatch.setattr(building, "prepare_assets", lambda **given: None)
-    monkeypatch.setattr(building, "read_status", lambda out: status)
-    monkeypatch.setattr(building, "run_deployment", started)
-    monkeypatch.setattr(building, "generate_scenes", lambda **given: ranges.append(given["shards"]))
+    monkeypatch.setattr(prefect_flows, "prepare_assets", lambda **given: None)
+    monkeypatch.setattr(prefect_flows, "read_status", lambda out: status)
+    monkeypatch.setattr(prefect_flows, "run_deployment", started)
+    monkeypatch.setattr(
+        prefect_flows, "generate_scenes", lambda **given: ranges.append(given["shards"])
+    )
     return ranges
 
 
 def test_so_many_flow_runs_are_so_many_in_all(made: list[str | None]) -> None:
-    flow: Any = building.build_dataset
+    flow: Any = prefect_flows.build_dataset
     flow.fn(**_parameters(flow_runs=3, deployment="d/x"))
     assert made == ["d/x 3:6", "d/x 6:10", "0:3", None]
     made.clear()
     flow.fn(**_parameters())
     assert made == [None]
-
-
-def test_there_are_no_more_ranges_than_shards() -> None:
-    assert shard_ranges(2, 5) == ["0:1", "1:2"]
-    assert shard_ranges(7, 1) == ["0:7"]
 
 
 @for_each(
@@ -254,18 +249,20 @@ def test_rendering_on_a_gpu_takes_its_limit(
         taken.append(occupy)
         yield
 
-    monkeypatch.setattr(runner, "concurrency", limit)
-    monkeypatch.setattr(runner, "make_task", lambda job, pieces: (job, pieces, list(taken)))
-    monkeypatch.setattr(runner.make_scenes, "submit", cast(Any, runner.make_scenes).fn)
+    monkeypatch.setattr(prefect_runner, "concurrency", limit)
+    monkeypatch.setattr(prefect_runner, "make_task", lambda job, pieces: (job, pieces, list(taken)))
+    monkeypatch.setattr(
+        prefect_runner.make_scenes, "submit", cast(Any, prefect_runner.make_scenes).fn
+    )
     job, pieces = SimpleNamespace(device=device), (SimpleNamespace(shard_index=0, first=0),)
-    submit = cast(Any, runner.PrefectRunner().submit)
+    submit = cast(Any, prefect_runner.PrefectRunner().submit)
     assert submit(pieces, job) == (job, pieces, held)
 
 
 def test_documents_are_tried_again_where_that_can_help() -> None:
-    task = cast(Any, runner.write_documents_task)
-    assert task.retries == cast(Any, runner.make_scenes).retries > 0
-    assert task.retry_condition_fn is runner.is_retryable
+    task = cast(Any, prefect_runner.write_documents_task)
+    assert task.retries == cast(Any, prefect_runner.make_scenes).retries > 0
+    assert task.retry_condition_fn is prefect_runner.is_retryable
 
 
 def test_a_dask_worker_that_sees_another_folder_is_named_before_any_work(tmp_path: Path) -> None:
@@ -505,18 +502,6 @@ def test_who_watches_alone_asks_for_nothing_and_waits_so_long(
     with pytest.raises(TrilightError, match=r"no new scene for 0\.0001 hours \(none made\)"):
         run(out=str(tmp_path / "set"), scheduler="none", quiet_hours=0.0001)
     assert cluster == [] and shown == []
-
-
-def test_a_page_that_cannot_be_shown_does_not_end_an_array(
-    shown: Shown,
-    cluster: list[list[int]],
-    tmp_path: Path,
-    monkeypatch: pytest.MonkeyPatch,
-    caplog: pytest.LogCaptureFixture,
-) -> None:
-    _cannot_show(monkeypatch)
-    run(out=str(tmp_path / "set"), scenes=4)
-    assert [record.levelname for record in caplog.records].count("WARNING") == 1
 
 
 def test_machines_are_those_of_the_worker(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -64,9 +64,7 @@ def prepared(number: int) -> PreparedObject:
 
 def begun(root: Path) -> DatasetWriter:
     """Begin a dataset of four scenes."""
-    return begin_or_resume_dataset(
-        DatasetFolder(root), build(), ENVIRONMENT, 4, accept_environment=False
-    )
+    return begin_or_resume_dataset(DatasetFolder(root), build(), ENVIRONMENT, 4)
 
 
 def asked(writer: DatasetWriter, source: str = SOURCE, licence: str | None = None) -> ObjectLock:

@@ -44,7 +44,7 @@ def _begin(
     root: Path, build: DatasetSettings, scenes: int = 4, **environment: str
 ) -> DatasetWriter:
     return begin_or_resume_dataset(
-        DatasetFolder(root), build, {**ENVIRONMENT, **environment}, scenes, accept_environment=False
+        DatasetFolder(root), build, {**ENVIRONMENT, **environment}, scenes
     )
 
 
