@@ -14,7 +14,7 @@ from pathlib import Path
 from pipeline.assets.stage import PreparedObject
 from pipeline.generation.accept_maps import AcceptedMaps, accept_maps
 from pipeline.generation.dataset_writer import DatasetWriter
-from pipeline.generation.frozen_pool import ComposedScenes
+from pipeline.generation.frozen_pool import ComposedScenes, require_same
 from pipeline.generation.object_batches import (
     ObjectWork,
     PrepareResult,
@@ -22,7 +22,7 @@ from pipeline.generation.object_batches import (
     prepare_in_batches,
 )
 from pipeline.generation.prepare_isolated import format_unread, write_unread
-from pipeline.generation.revisited_scenes import AcceptedObjects
+from pipeline.generation.scene_origins import AcceptedObjects
 from pipeline.isolation import is_transient
 from pipeline.objects.sources import ListedObjects, list_objects
 from pipeline.presets.settings import DatasetSettings
@@ -365,23 +365,3 @@ def require_tried(display_name: str, failure: Failure) -> None:
             f"prepared this time ({failure.reason}: {failure.message}). Nothing has changed; run "
             "the same command again."
         )
-
-
-def changed_error(display_name: str, uid: str, state: str) -> TrilightError:
-    """Return the error of a frozen object or file that its source has lost or changed."""
-    return TrilightError(
-        f"{display_name}: {uid!r} {state}; expected what the dataset was begun with "
-        "(objects.lock.jsonl). Restore it, name the source that has it by --objects or "
-        "--scenes-from, or choose another --out."
-    )
-
-
-def require_same(
-    display_name: str, frozen: Mapping[str, LockedObject], now: Sequence[LockedObject]
-) -> None:
-    """Raise TrilightError if a row differs from the frozen one, is missing, or is new."""
-    by_uid = {entry.uid: entry for entry in now}
-    for uid in sorted({*frozen, *by_uid}):
-        if frozen.get(uid) != by_uid.get(uid):
-            state = "has changed" if uid in by_uid else "is missing or no longer usable"
-            raise changed_error(display_name, uid, state if uid in frozen else "is new")

@@ -7,7 +7,7 @@ open. If an object's file is missing on this machine, the worker prepares it aga
 """
 
 from collections import OrderedDict
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
@@ -160,3 +160,23 @@ def _texture(path: Path) -> UserTexture:
 
 def _radiance(path: Path) -> NDArray[np.float32]:
     return decode_prepared(path.read_bytes(), path.name).arrays["radiance"]
+
+
+def changed_error(display_name: str, uid: str, state: str) -> TrilightError:
+    """Return the error of a frozen object or file that its source has lost or changed."""
+    return TrilightError(
+        f"{display_name}: {uid!r} {state}; expected what the dataset was begun with "
+        "(objects.lock.jsonl). Restore it, name the source that has it by --objects or "
+        "--scenes-from, or choose another --out."
+    )
+
+
+def require_same(
+    display_name: str, frozen: Mapping[str, LockedObject], now: Sequence[LockedObject]
+) -> None:
+    """Raise TrilightError if a row differs from the frozen one, is missing, or is new."""
+    by_uid = {entry.uid: entry for entry in now}
+    for uid in sorted({*frozen, *by_uid}):
+        if frozen.get(uid) != by_uid.get(uid):
+            state = "has changed" if uid in by_uid else "is missing or no longer usable"
+            raise changed_error(display_name, uid, state if uid in frozen else "is new")

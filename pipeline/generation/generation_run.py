@@ -26,11 +26,16 @@ from typing import Any, Generic, TypeVar
 
 from pipeline.exchange.scene_files import SceneFiles, find_scene_files
 from pipeline.generation.accept_maps import map_folders
-from pipeline.generation.accept_scene_files import accept_scene_files, settings_for_files
 from pipeline.generation.dataset_writer import DatasetWriter
 from pipeline.generation.freeze_objects import ObjectLock
 from pipeline.generation.generate_options import GenerateOptions
-from pipeline.generation.revisited_scenes import Accept, AcceptedObjects, resolve_revisit
+from pipeline.generation.scene_origins import (
+    Accept,
+    AcceptedObjects,
+    accept_scene_files,
+    resolve_revisit,
+    settings_for_files,
+)
 from pipeline.objects.sources import check_source
 from pipeline.presets.registry import DATASET_PRESETS, frozen_note, object_source
 from pipeline.presets.settings import DatasetSettings

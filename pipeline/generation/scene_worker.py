@@ -11,7 +11,7 @@ from dataclasses import dataclass
 from pipeline.assets.asset_store import AssetStore
 from pipeline.generation.frozen_pool import AssetMissing, ComposedScenes, SplitPool, user_maps
 from pipeline.generation.render_sample import RenderInput, ViewProgress, failure_of, render_sample
-from pipeline.generation.revisited_scenes import RevisitedScenes, SceneOrigin
+from pipeline.generation.scene_origins import RevisitedScenes, SceneOrigin
 from pipeline.presets.settings import DatasetSettings
 from pipeline.renders.mitsuba_variant import Variant, activate
 from pipeline.renders.renderer import set_threads

@@ -13,13 +13,13 @@ import pytest
 
 from pipeline.exchange.scene_files import SceneFiles, find_scene_files
 from pipeline.generation import render_workers
-from pipeline.generation.accept_scene_files import (
+from pipeline.generation.dataset_writer import begin_or_resume_dataset
+from pipeline.generation.generate_options import GenerateOptions
+from pipeline.generation.scene_origins import (
     accept_scene_files,
     build_once,
     settings_for_files,
 )
-from pipeline.generation.dataset_writer import begin_or_resume_dataset
-from pipeline.generation.generate_options import GenerateOptions
 from pipeline.isolation import ChildPool
 from pipeline.presets.registry import preset_settings
 from pipeline.presets.settings import DatasetSettings
@@ -38,7 +38,7 @@ CAMERA = {"position": [0, -2, 0], "look_at": [0, 0, 0], "up": [0, 0, 1], "fov": 
 def no_child(monkeypatch: pytest.MonkeyPatch) -> None:
     """Accept files without a child, of which each costs seconds."""
     here = SimpleNamespace(call=lambda function, *args: function(*args), close=lambda: None)
-    child = "pipeline.generation.accept_scene_files.asset_child"
+    child = "pipeline.generation.scene_origins.asset_child"
     monkeypatch.setattr(child, lambda confined_to: here)
 
 

@@ -16,7 +16,7 @@ from pipeline.generation.accept_maps import AcceptedMaps
 from pipeline.generation.dataset_writer import DatasetWriter, begin_or_resume_dataset
 from pipeline.generation.freeze_objects import ObjectLock
 from pipeline.generation.prepare_isolated import asset_store
-from pipeline.generation.revisited_scenes import AcceptedObjects
+from pipeline.generation.scene_origins import AcceptedObjects
 from pipeline.presets.registry import preset_settings
 from pipeline.presets.settings import DatasetSettings
 from storage.dataset.layout import DatasetFolder

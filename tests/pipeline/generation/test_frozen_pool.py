@@ -16,11 +16,16 @@ from pipeline.generation import accept_maps as accepting
 from pipeline.generation import freeze_objects, frozen_pool, pipeline, render_workers
 from pipeline.generation.accept_maps import AcceptedMaps, accept_maps, map_folders
 from pipeline.generation.dataset_writer import DatasetWriter
-from pipeline.generation.freeze_objects import require_same
-from pipeline.generation.frozen_pool import AssetMissing, ComposedScenes, SplitPool, user_maps
+from pipeline.generation.frozen_pool import (
+    AssetMissing,
+    ComposedScenes,
+    SplitPool,
+    require_same,
+    user_maps,
+)
 from pipeline.generation.generate_options import GenerateOptions
 from pipeline.generation.prepare_isolated import asset_store
-from pipeline.generation.revisited_scenes import AcceptedObjects
+from pipeline.generation.scene_origins import AcceptedObjects
 from pipeline.generation.scene_worker import SceneAttempt
 from pipeline.objects.maps.prepared import prepare_map
 from pipeline.presets.registry import preset_settings
