@@ -133,9 +133,17 @@ def _prepare_maps(
         try:
             with pool.borrow() as child:
                 path = _prepare_file(kind, user_map.files, size, child)
-            return _lock_entry(kind, user_map, path, settings), path
+            data = path.read_bytes()
+            content_sha256 = decode_prepared(data, path.name).content_sha256
         except Rejected as rejection:
             return failure_of("objects", user_map.record.uid, rejection)
+        locked = LockedObject(
+            **user_map.record.identity,
+            asset_sha256=sha256_hex(data),
+            split=split_of_object(content_sha256, settings.splits),
+            kind=kind,
+        )
+        return locked, path
 
     children = ChildPool(lambda _: IsolatedChild(limits=_LIMITS, confined_to=all_files), workers)
     with contextlib.closing(children) as pool, ThreadPoolExecutor(workers) as threads:
@@ -163,18 +171,6 @@ def _prepare_file(kind: str, files: Mapping[str, Path], size: int, child: Isolat
             write_atomically(_notes(path), message.encode())
         write_atomically(path, data)
     return path
-
-
-def _lock_entry(
-    kind: str, user_map: FoundMap, path: Path, settings: DatasetSettings
-) -> LockedObject:
-    data = path.read_bytes()
-    return LockedObject(
-        **user_map.record.identity,
-        asset_sha256=sha256_hex(data),
-        split=split_of_object(decode_prepared(data, path.name).content_sha256, settings.splits),
-        kind=kind,
-    )
 
 
 def _warn_of_maps(kind: str, locked: Sequence[LockedObject], lost: Sequence[Failure]) -> None:

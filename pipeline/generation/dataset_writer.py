@@ -200,27 +200,26 @@ class DatasetWriter:
         Raises:
             TrilightError: it is not here, so that its worker uses another folder.
         """
-        self._require_visible(shard.name)
+        number = number_of_shard(shard)
+        here = range(number, number + 1)
+        for pause_s in (*(2**look for look in range(_MAX_LOOKS - 1)), 0):
+            if self.folder.has_shard(shard.name) or shard.name in self._finished_shards(here):
+                break
+            time.sleep(pause_s)
+        else:
+            raise TrilightError(
+                f"{self.folder.display_name}: a worker has packed {shard.name}, and it is not "
+                "here: the worker's folder is not this one. Expected workers that see the same "
+                "--out at the same place (for a bucket, the same TRILIGHT_CACHE); share it, and "
+                "run this command again."
+            )
         failures = read_failures(rejections_of_shard(self.folder, shard.name))
         note = self._shards.publish(ShardNote(shard=shard, failures=tuple(failures)))
         if note is None:
             return
-        scenes = scenes_of_shard(number_of_shard(note.shard), self.splits)
+        scenes = scenes_of_shard(number, self.splits)
         self.failures += note.failures
         self.given_up += len(scenes) - note.shard.num_samples
-
-    def _require_visible(self, name: str) -> None:
-        number = int(name.removesuffix(".tar").rpartition("-")[2])
-        for look in range(_MAX_LOOKS):
-            is_here = self.folder.has_shard(name)
-            if is_here or name in self._finished_shards(range(number, number + 1)):
-                return
-            time.sleep(2**look if look < _MAX_LOOKS - 1 else 0)
-        raise TrilightError(
-            f"{self.folder.display_name}: a worker has packed {name}, and it is not here: the "
-            "worker's folder is not this one. Expected workers that see the same --out at the same "
-            "place (for a bucket, the same TRILIGHT_CACHE); share it, and run this command again."
-        )
 
     def unfinished_shards(self, requested: range | None = None) -> list[int]:
         """Return the unfinished or growing shards among the requested ones; by default of all.

@@ -177,20 +177,17 @@ def used_objects(selected: Sequence[SelectedScene]) -> list[LockedObject]:
                 for name in (f"uid {uid}", f"asset {locked.asset_sha256}"):
                     split, first = splits.setdefault(name, (entry.facts.shard.split, entry))
                     if split != entry.facts.shard.split:
-                        raise TrilightError(_leak(uid, first, entry))
+                        places = " and in ".join(
+                            f"{each.facts.shard.split} of {each.source.folder.root} (scene "
+                            f"{each.facts.key})"
+                            for each in (first, entry)
+                        )
+                        raise TrilightError(
+                            f"object {uid!r} is in {places}; expected every object in one split "
+                            "only. Generate both with the same splits.held_out_objects, or take "
+                            "one split of each with `trilight shards select` first."
+                        )
     return list(used)
-
-
-def _leak(uid: str, first: SelectedScene, second: SelectedScene) -> str:
-    places = " and in ".join(
-        f"{entry.facts.shard.split} of {entry.source.folder.root} (scene {entry.facts.key})"
-        for entry in (first, second)
-    )
-    return (
-        f"object {uid!r} is in {places}; expected every object in one split only. Generate both "
-        "with the same splits.held_out_objects, or take one split of each with `trilight shards "
-        "select` first."
-    )
 
 
 def even_shards(

@@ -191,7 +191,14 @@ class ObjectLock:
             for failure in transient:
                 require_tried(display_name, failure)
         writer.add_failures([*rejected, *maps.failures])
-        objects = [self._lock_entry(asset) for asset in prepared]
+        objects = [
+            LockedObject(
+                **asset.record.identity,
+                asset_sha256=asset.asset_sha256,
+                split=split_of_object(asset.geometry_sha256, self.settings.splits),
+            )
+            for asset in prepared
+        ]
         locked = [*objects, *(entry for entry, _ in maps.rows)]
         if frozen is None:
             self._require_enough(objects)
@@ -296,13 +303,6 @@ class ObjectLock:
             done=lambda count: count_object(folder, count),
             should_stop=should_stop,
             retry_transient=retry_transient,
-        )
-
-    def _lock_entry(self, asset: PreparedObject) -> LockedObject:
-        return LockedObject(
-            **asset.record.identity,
-            asset_sha256=asset.asset_sha256,
-            split=split_of_object(asset.geometry_sha256, self.settings.splits),
         )
 
     def _require_enough(self, locked: list[LockedObject]) -> None:

@@ -6,10 +6,9 @@ open. If an object's file is missing on this machine, the worker prepares it aga
 (`pipeline.generation.render_workers.restore_object`).
 """
 
-from collections import OrderedDict
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
-from functools import partial
+from functools import lru_cache, partial
 from pathlib import Path
 
 import numpy as np
@@ -77,7 +76,7 @@ class SplitPool(Sequence[PooledAsset]):
         self._split = split
         self._lock = LockRows(frozen.lock)
         self._store = store
-        self._open: OrderedDict[int, PooledAsset] = OrderedDict()
+        self._open = lru_cache(_MOST_OPEN)(self._read)
 
     def __len__(self) -> int:
         return len(self._offsets)
@@ -91,12 +90,7 @@ class SplitPool(Sequence[PooledAsset]):
         """
         if not 0 <= row < len(self):
             raise IndexError(row)
-        if row not in self._open:
-            self._open[row] = self._read(row)
-            if len(self._open) > _MOST_OPEN:
-                self._open.popitem(last=False)
-        self._open.move_to_end(row)
-        return self._open[row]
+        return self._open(row)
 
     def _read(self, row: int) -> PooledAsset:
         locked = self._lock.at(int(self._offsets[row : row + 1][0]))

@@ -284,7 +284,10 @@ class PublishedShards:
         first = self._store.create_if_absent(name, folder.shard(name))
         theirs = None if first else self._read_note(name)
         if not first and theirs is None:
-            theirs = dataclasses.replace(made, shard=self._index_remote(name))
+            assert isinstance(self._store, RemoteStore)
+            url = self._store.url.child(name)
+            with shard_cache().open(url, num_bytes=None, sha256=None) as stream:
+                theirs = dataclasses.replace(made, shard=index_stream(stream, Path(name).name))
             if theirs.shard.num_samples < made.shard.num_samples:
                 theirs = dataclasses.replace(theirs, scenes=0)
             elif not self._store.create_if_absent(note, encode_note(theirs)):
@@ -381,12 +384,6 @@ class PublishedShards:
         theirs = published_manifest(self._store)
         shard = {entry.name: entry for entry in theirs.shards}[name]
         return ShardNote(shard=shard, failures=(), scenes=planned_scenes_of(theirs, shard))
-
-    def _index_remote(self, name: str) -> ShardEntry:
-        assert isinstance(self._store, RemoteStore)
-        url = self._store.url.child(name)
-        with shard_cache().open(url, num_bytes=None, sha256=None) as stream:
-            return index_stream(stream, Path(name).name)
 
     def _mark_sent(self, name: str) -> None:
         path = self._folder.staged_sent / name

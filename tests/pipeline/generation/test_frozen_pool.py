@@ -123,7 +123,7 @@ def test_only_a_few_objects_are_open(
     for row in (0, 1, 2, 0, 3, 0, 1):
         assert pool[row].locked.uid == read_objects_lock_uids(made[0])[row]
     assert len(read) == 5  # 0, 1, 2, 3, and 1 again
-    assert len(pool._open) == 3
+    assert pool._open.cache_info().currsize == 3
     for row in (-1, len(pool)):
         with pytest.raises(IndexError):
             pool[row]
