@@ -77,7 +77,13 @@ def _make(options: GenerateOptions, address: str) -> Outcome:
     from pipeline.flows.prefect_runner import PrefectRunner
 
     with _client(address) as client:
-        threads = _threads(client, address)
+        workers: Mapping[str, Any] = client.scheduler_info(n_workers=-1)["workers"]
+        if not workers:
+            raise TrilightError(
+                f"--address {address}: the scheduler has no worker; expected some. Start them with "
+                "`dask worker ADDRESS --nthreads 1 --no-nanny`."
+            )
+        threads = [int(worker["nthreads"]) for worker in workers.values()]
         _require_shared(client, options)
     runner = PrefectRunner(window=_AHEAD * sum(threads), num_at_once=max(threads))
     try:
@@ -101,17 +107,6 @@ def _client(address: str) -> Iterator["Client"]:
         ) from error
     with client:
         yield client
-
-
-def _threads(client: "Client", address: str) -> list[int]:
-    """Return the number of threads of each worker of a cluster."""
-    workers: Mapping[str, Any] = client.scheduler_info(n_workers=-1)["workers"]
-    if not workers:
-        raise TrilightError(
-            f"--address {address}: the scheduler has no worker; expected some. Start them with "
-            "`dask worker ADDRESS --nthreads 1 --no-nanny`."
-        )
-    return [int(worker["nthreads"]) for worker in workers.values()]
 
 
 def _require_shared(client: "Client", options: GenerateOptions) -> None:

@@ -151,11 +151,14 @@ def _read_status(client: SyncPrefectClient, run: FlowRun) -> RunStatus:
     )
     in_order = sorted(artifacts, key=lambda artifact: str(artifact.updated))
     bars = [artifact for artifact in in_order if artifact.type == "progress"]
-    tables = {
-        artifact.key: rows
-        for artifact in in_order
-        if artifact.type == "table" and artifact.key and (rows := _rows(artifact.data))
-    }
+    tables: dict[str, Sequence[tuple[str, str]]] = {}
+    for table in in_order:
+        data: Any = table.data
+        if table.type == "table" and table.key:
+            rows = json.loads(data) if isinstance(data, str) else data or []
+            named = [row for row in rows if {"what", "value"} <= set(row)]  # others are not ours
+            if named:
+                tables[table.key] = [(str(row["what"]), str(row["value"])) for row in named]
     return RunStatus(
         state=state.name or state.type.value if state else "Pending",
         message=safe_text(state.message or "") if state else "",
@@ -164,12 +167,6 @@ def _read_status(client: SyncPrefectClient, run: FlowRun) -> RunStatus:
         is_final=is_final,
         is_completed=state is not None and state.is_completed(),
     )
-
-
-def _rows(data: Any) -> list[tuple[str, str]]:
-    """Return the rows of a table with columns `what` and `value`; none of any other table."""
-    rows = json.loads(data) if isinstance(data, str) else data or []
-    return [(str(row["what"]), str(row["value"])) for row in rows if {"what", "value"} <= set(row)]
 
 
 def _nest_groups(changes: Mapping[str, Any]) -> dict[str, Any]:

@@ -248,15 +248,15 @@ def list_scenes(
         value_names=(*_TEXTS, *_COLUMNS),
         shard_done=lambda: progress(next(done), total),
     )
-    return [{"key": entry.key, **_row(entry.facts.values)} for entry in selected]
-
-
-def _row(values: Mapping[str, Any]) -> dict[str, object]:
-    row: dict[str, object] = {name: values[name] for name in _TEXTS}
-    for name, (column, of_several) in _COLUMNS.items():
-        number = round(float(of_several(values[name])), QUANTITIES[name].digits)
-        row[column] = number if QUANTITIES[name].digits else int(number)
-    return row
+    rows = []
+    for entry in selected:
+        values = entry.facts.values
+        row: dict[str, object] = {"key": entry.key, **{name: values[name] for name in _TEXTS}}
+        for name, (column, of_several) in _COLUMNS.items():
+            number = round(float(of_several(values[name])), QUANTITIES[name].digits)
+            row[column] = number if QUANTITIES[name].digits else int(number)
+        rows.append(row)
+    return rows
 
 
 Operation = Literal["merge", "select", "reshard"]
@@ -373,26 +373,22 @@ def _manifest(
     shards: tuple[ShardEntry, ...],
 ) -> Manifest:
     manifests = [source.manifest for source in sources]
+    environments = [dict(manifest.environment) for manifest in manifests]
+    environment: Mapping[str, Any] = environments[0]
+    if any(other != environment for other in environments):
+        environment = {**common(environments), "of_sources": environments}
     builds = {manifest.build for manifest in manifests}
     return dataclasses.replace(
         manifests[0],
         build=builds.pop() if len(builds) == 1 else "merged",
         settings=settings,
-        environment=_environment(manifests),
+        environment=environment,
         extensions=_extensions(manifests),
         num_scenes=sum(shard.num_samples for shard in shards),
         schema_version=MANIFEST_VERSION,
         objects_lock_sha256=sha256_hex(encode_objects_lock(objects)),
         shards=shards,
     )
-
-
-def _environment(manifests: Sequence[Manifest]) -> Mapping[str, Any]:
-    """Return the common environment of all sources; if they differ, also that of each."""
-    environments = [dict(manifest.environment) for manifest in manifests]
-    if all(environment == environments[0] for environment in environments):
-        return environments[0]
-    return {**common(environments), "of_sources": environments}
 
 
 def _extensions(manifests: Sequence[Manifest]) -> Mapping[str, str]:

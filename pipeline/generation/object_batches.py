@@ -13,6 +13,7 @@ import uuid
 from collections.abc import Callable, Iterable, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import asdict, dataclass, field
+from operator import attrgetter
 from pathlib import Path
 from typing import Any
 
@@ -133,7 +134,12 @@ class ObjectBatch:
         with writer.claim(self._file) as ours:
             if not ours or self.result() is not None:
                 return False
-            records, lost = self._fetch()
+            records, lost = self.records, list[Failure]()
+            if self._work.fetch is not None:
+                fetched, lost = self._work.fetch(self.records)
+                records = sorted(fetched, key=attrgetter("uid"))
+                if not lost:
+                    self._cached = cache_folder(_CACHE) / self._work.name(records, are_here=True)
             done(len(lost))
             if result := self.result():
                 done(len(records))
@@ -155,37 +161,25 @@ class ObjectBatch:
         if result is not None and _may_change(result[1]):
             self._file.unlink(missing_ok=True)
 
-    def _fetch(self) -> Fetched:
-        if self._work.fetch is None:
-            return self.records, []
-        records, lost = self._work.fetch(self.records)
-        records = sorted(records, key=lambda record: record.uid)
-        if not lost:
-            self._cached = cache_folder(_CACHE) / self._work.name(records, are_here=True)
-        return records, lost
-
     def _read(self, path: Path) -> PrepareResult | None:
+        prepared = list[PreparedObject]()
+        failures = list[Failure]()
         try:
-            return self._decode(read_json_lines(path.read_bytes(), dict[str, Any], str(path)))
+            for row in read_json_lines(path.read_bytes(), dict[str, Any], str(path)):
+                if "reason" in row:
+                    failures.append(Failure(**row))
+                else:
+                    record = self._by_uid[row.pop("uid")]
+                    unread = tuple(row.pop("unread", ()))
+                    prepared.append(PreparedObject(record=record, unread=unread, **row))
+            if len(prepared) + len(failures) != len(self.records):
+                raise ValueError("rows are missing")
+            return prepared, failures
         except FileNotFoundError:
             return None
         except (KeyError, TypeError, ValueError):
             path.unlink(missing_ok=True)  # damaged: it is made again
             return None
-
-    def _decode(self, rows: Iterable[dict[str, Any]]) -> PrepareResult:
-        prepared = list[PreparedObject]()
-        failures = list[Failure]()
-        for row in rows:
-            if "reason" in row:
-                failures.append(Failure(**row))
-            else:
-                record = self._by_uid[row.pop("uid")]
-                unread = tuple(row.pop("unread", ()))
-                prepared.append(PreparedObject(record=record, unread=unread, **row))
-        if len(prepared) + len(failures) != len(self.records):
-            raise ValueError("rows are missing")
-        return prepared, failures
 
 
 def cut_objects(records: Sequence[ObjectRecord]) -> list[list[ObjectRecord]]:
@@ -271,14 +265,13 @@ def _may_change(failures: Iterable[Failure]) -> bool:
 def _encode(result: PrepareResult) -> bytes:
     """Return a result as a file; the digest in its name covers the rights of objects."""
     prepared, failures = result
-    rows = [*map(_row, prepared), *map(asdict, failures)]
+    rows = []
+    for one in prepared:
+        left_out = {"record"} if one.unread else {"record", "unread"}
+        row = {name: value for name, value in vars(one).items() if name not in left_out}
+        rows.append({"uid": one.record.uid, **row})
+    rows += map(asdict, failures)
     return b"".join(canonical_json(row) + b"\n" for row in rows)
-
-
-def _row(one: PreparedObject) -> dict[str, Any]:
-    left_out = {"record"} if one.unread else {"record", "unread"}
-    row = {name: value for name, value in vars(one).items() if name not in left_out}
-    return {"uid": one.record.uid, **row}
 
 
 def _state(path: Path, fetched: bool) -> list[int]:

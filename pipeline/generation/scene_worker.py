@@ -4,6 +4,7 @@
 """
 
 import contextlib
+import functools
 import os
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -71,8 +72,8 @@ class SceneWorker:
         self._origin = origin
         self._assets = assets
         self._folder = folder
-        self._pools: dict[str, Sequence[PooledAsset]] = {}
-        self._maps: dict[str, OwnMaps] = {}
+        self._pool = functools.cache(self._open_pool)
+        self._maps = functools.cache(self._open_maps)
 
     def attempt(
         self, split: str, scene_index: int, attempt: int, from_file: Scene | None = None
@@ -129,22 +130,19 @@ class SceneWorker:
             settings.scenes,
             self._pool(split),
             SceneKey(settings.seed, scene_index, attempt),
-            user_maps=self._maps_of(split),
+            user_maps=self._maps(split),
         )
         return RenderInput(scene=scene)
 
-    def _composed_scenes(self) -> ComposedScenes:
+    @functools.cached_property
+    def _frozen(self) -> ComposedScenes:
         assert isinstance(self._origin, ComposedScenes), "only composed scenes draw objects"
         return self._origin
 
-    def _pool(self, split: str) -> Sequence[PooledAsset]:
+    def _open_pool(self, split: str) -> Sequence[PooledAsset]:
         """Return the objects of a split, sorted by uid; each is opened on first access."""
-        if split not in self._pools:
-            self._pools[split] = SplitPool(self._composed_scenes(), split, self._assets)
-        return self._pools[split]
+        return SplitPool(self._frozen, split, self._assets)
 
-    def _maps_of(self, split: str) -> OwnMaps:
+    def _open_maps(self, split: str) -> OwnMaps:
         """Return the user's textures and maps of a split; each is read when a scene takes it."""
-        if split not in self._maps:
-            self._maps[split] = user_maps(self._composed_scenes().maps, split)
-        return self._maps[split]
+        return user_maps(self._frozen.maps, split)
