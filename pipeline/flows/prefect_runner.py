@@ -157,12 +157,13 @@ class RunPage:
         """
         self._place = place
         self._price = usd_per_core_hour()
-        self._progress: UUID | None = None
         self._rows: list[tuple[str, str]] = []
         self._shown_s = -_EVERY_S
         self._log = get_run_logger()
         self._warned = False
-        self._show(self._begin)
+        # Prefect's functions return coroutines only where an event loop runs
+        begin = partial(create_progress_artifact, 0.0, key="shards", description=place)
+        self._progress = cast(UUID | None, self._show(begin))
 
     def record_task(self, run: Run, outcome: TaskResult) -> None:
         """Log the shards of a finished task, and show the progress if it was shown long ago."""
@@ -175,10 +176,11 @@ class RunPage:
     def show_status(self, status: DatasetStatus) -> None:
         """Show the progress of the dataset, if it has changed."""
         remaining_s = status.remaining_s
+        rate = "unknown" if status.views_per_hour is None else f"{status.views_per_hour:.4g}"
         left = "unknown" if remaining_s is None else f"{remaining_s / 60:.0f} minutes"
         rows = [
             ("scenes in shards", f"{status.scenes_done} of {status.scenes_planned}"),
-            ("views an hour", _number(status.views_per_hour)),
+            ("views an hour", rate),
             ("left at that rate", left),
         ]
         if rows != self._rows:
@@ -198,21 +200,16 @@ class RunPage:
         what = safe_text(f"{type(error).__name__}: {error}".partition("\n")[0])
         self._show(lambda: self._tell_table("summary", [("failed", what)]))
 
-    def _show(self, show: Callable[[], object]) -> None:
-        """Show something; log the first error, and never raise."""
+    def _show(self, show: Callable[[], object]) -> object:
+        """Show something and return what that returns; log the first error, and never raise."""
         try:
-            show()
+            return show()
         except Exception as error:  # a server that is down for a moment must not cost hours of work
             if not self._warned:
                 self._warned = True
                 why = safe_text(str(error).partition("\n")[0])
                 self._log.warning("what this page shows is not complete (%s)", why)
-
-    def _begin(self) -> None:
-        # Prefect's functions return coroutines only where an event loop runs
-        self._progress = cast(
-            UUID, create_progress_artifact(0.0, key="shards", description=self._place)
-        )
+        return None
 
     def _tell(self, status: DatasetStatus, key: str, more: Sequence[tuple[str, str]] = ()) -> None:
         over = status.scenes_done + status.scenes_given_up
@@ -246,10 +243,6 @@ class RunPage:
         if sheet.exists():
             picture = small_picture(sheet)
             create_image_artifact(picture, key="contact-sheet", description=self._place)
-
-
-def _number(value: float | None) -> str:
-    return "unknown" if value is None else f"{value:.4g}"
 
 
 def usd_per_core_hour() -> float:

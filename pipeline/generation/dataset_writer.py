@@ -20,7 +20,6 @@ from pipeline.renders.mitsuba_variant import device_of
 from pipeline.shards.pack_shards import (
     PLANNED,
     PublishedShards,
-    publish_plan,
     unpack_here,
 )
 from storage.atomic import write_atomically
@@ -472,7 +471,8 @@ def begin_or_resume_dataset(
             PublishedShards(folder, store).adopt()  # another machine was first
         manifest = read_head(folder.manifest)
     _require_same_dataset(folder, manifest, settings, environment, accept_environment)
-    publish_plan(store, max(num_planned, manifest.num_scenes))
+    if not store.is_here:  # in a folder the manifest says so
+        store.put(f"{PLANNED}{max(num_planned, manifest.num_scenes):012d}", b"\n")
     writer = DatasetWriter(store, folder, manifest, settings.splits)
     writer.refresh_plan(num_planned)
     return writer

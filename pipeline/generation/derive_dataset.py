@@ -134,16 +134,12 @@ def key_offsets(sources: Sequence[FinishedDataset]) -> list[int]:
     following = 0
     for source in sources:
         offsets.append(following)
-        following += max(_last_key(source) + 1, source.manifest.num_scenes)
+        last = -1
+        if derivation_of(source.manifest.settings):  # else keys are indices
+            keys = (key for shard in source.manifest.shards for key in source.keys(shard))
+            last = max((int(key) for key in keys if key.isdecimal()), default=-1)
+        following += max(last + 1, source.manifest.num_scenes)
     return offsets
-
-
-def _last_key(source: FinishedDataset) -> int:
-    """Return the largest key of a derived dataset; -1 for a generated one (keys are indices)."""
-    if not derivation_of(source.manifest.settings):
-        return -1
-    keys = (key for shard in source.manifest.shards for key in source.keys(shard))
-    return max((int(key) for key in keys if key.isdecimal()), default=-1)
 
 
 def offset_key(key: str, offset: int) -> str:

@@ -201,7 +201,16 @@ class ObjectLock:
         ]
         locked = [*objects, *(entry for entry, _ in maps.rows)]
         if frozen is None:
-            self._require_enough(objects)
+            if not objects:
+                raise TrilightError(
+                    f"{display_name}: none was accepted; expected at least one usable object with "
+                    f"an allowed licence. The reasons are in {writer.folder.failures}."
+                )
+            shards = range(writer.num_shards)
+            require_objects(
+                {split: sum(entry.split == split for entry in objects) for split in SPLITS},
+                {split_of_shard(index, self.settings.splits) for index in shards},
+            )
             self._warn(prepared, transient)
             writer.lock_objects(locked)
         else:
@@ -303,19 +312,6 @@ class ObjectLock:
             done=lambda count: count_object(folder, count),
             should_stop=should_stop,
             retry_transient=retry_transient,
-        )
-
-    def _require_enough(self, locked: list[LockedObject]) -> None:
-        if not locked:
-            raise TrilightError(
-                f"{self._display_name}: none was accepted; expected at least one usable object "
-                f"with an allowed licence. The reasons are in {self.writer.folder.failures}."
-            )
-        shards = range(self.writer.num_shards)
-        splits_in_use = {split_of_shard(index, self.settings.splits) for index in shards}
-        require_objects(
-            {split: sum(entry.split == split for entry in locked) for split in SPLITS},
-            splits_in_use,
         )
 
     def _write_index(

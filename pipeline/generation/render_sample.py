@@ -43,14 +43,11 @@ class ViewProgress:
         for step in steps:
             if not isinstance(step, Sampling):
                 return step
-            self._write(view, step)
+            if self._folder is not None and time.monotonic() - self._written_s >= _EVERY_S:
+                self._written_s = time.monotonic()
+                fraction = min(1.0, step.spp / step.expected_spp)
+                tell_views(self._folder, self._scene_index, view + fraction)
         raise AssertionError("a rendering yields its picture last")
-
-    def _write(self, view: int, now: Sampling) -> None:
-        if self._folder is not None and time.monotonic() - self._written_s >= _EVERY_S:
-            self._written_s = time.monotonic()
-            fraction = min(1.0, now.spp / now.expected_spp)
-            tell_views(self._folder, self._scene_index, view + fraction)
 
     def end(self) -> None:
         """Delete the progress of the scene."""

@@ -365,7 +365,7 @@ class PublishedShards:
         shutil.rmtree(self._folder.staged_sent, ignore_errors=True)  # it is looked at again
         if theirs is None:
             return
-        publish_plan(self._store, theirs.num_scenes)
+        self._store.put(f"{PLANNED}{theirs.num_scenes:012d}", b"\n")
         if own_head:  # as the shards here were packed
             theirs = dataclasses.replace(
                 theirs, num_scenes=own_head.num_scenes, growing=own_head.growing
@@ -415,12 +415,6 @@ def _forget_unused(folder: DatasetFolder) -> None:
         folder.objects_lock.unlink(missing_ok=True)  # a kill came before the manifest named it
         if not folder.shard_files() and not any(folder.staged_samples.rglob("*.tar")):
             folder.manifest.unlink()
-
-
-def publish_plan(store: Store, num_scenes: int) -> None:
-    """Publish a requested number of scenes; in a folder the manifest does so."""
-    if not store.is_here:
-        store.put(f"{PLANNED}{num_scenes:012d}", b"\n")
 
 
 log = logging.getLogger("trilight.scenes")
