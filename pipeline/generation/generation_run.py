@@ -15,20 +15,23 @@ yields their results as they end: memory does not grow with the number of tasks,
 task waits for a slow one.
 """
 
+import contextlib
 import itertools
+import os
 import time
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import partial
 from operator import itemgetter
+from pathlib import Path
 from typing import Any, Generic, TypeVar
 
 from pipeline.exchange.scene_files import SceneFiles, find_scene_files
 from pipeline.generation.accept_maps import map_folders
-from pipeline.generation.dataset_writer import DatasetWriter
+from pipeline.generation.dataset_writer import DatasetWriter, begin_or_resume_dataset
 from pipeline.generation.freeze_objects import ObjectLock
-from pipeline.generation.generate_options import GenerateOptions
+from pipeline.generation.generate_options import GenerateOptions, generate_words
 from pipeline.generation.scene_origins import (
     Accept,
     AcceptedObjects,
@@ -44,12 +47,14 @@ from pipeline.renders.mitsuba_variant import (
     Variant,
     choose_variant,
     device_of,
+    environment,
     gpu_memory_bytes,
     visible_gpus,
 )
-from pipeline.shards.pack_shards import UnfinishedShard
-from storage.dataset.layout import DatasetFolder
+from pipeline.shards.pack_shards import UnfinishedShard, hold_dataset_lock
+from storage.dataset.layout import DatasetFolder, dataset_folder
 from storage.dataset.manifest import Manifest, ShardEntry, read_head
+from storage.dataset.progress import write_asked
 from storage.dataset.settings import SplitSettings
 from storage.dataset.splits import keeps_scenes, lacks_validation, scenes_of_shard
 from storage.dataset.statistics import Statistics
@@ -269,6 +274,55 @@ def choose_dataset_variant(options: GenerateOptions, folder: DatasetFolder) -> V
         default = device_of(read_head(folder.manifest).environment)
         device = default if device == "auto" else device
     return choose_variant(default, device=device)
+
+
+@contextlib.contextmanager
+def begin_run(options: GenerateOptions) -> Iterator[Run]:
+    """Join a dataset's workers and yield the run; the first worker freezes the objects."""
+    folder = dataset_folder(options.place)
+    folder = replace(folder, root=Path(os.path.realpath(folder.root)))
+    settings, accept = resolve_inputs(options, folder)  # refuses before anything is written
+    with hold_dataset_lock(folder):
+        variant = choose_dataset_variant(options, folder)
+        writer = begin_or_resume_dataset(
+            folder,
+            settings,
+            environment(variant),
+            options.num_scenes,
+            accept_environment=options.accept_environment,
+        )
+        requested = options.shard_range()
+        if requested is not None and requested.start >= writer.num_shards:
+            raise TrilightError(
+                f"--range is {options.shards!r}; expected one that begins below "
+                f"{writer.num_shards}, the shards of {writer.manifest.num_scenes} scenes."
+            )
+        if not writer.manifest.objects_lock_sha256:  # else other objects may be refused yet
+            _write_command(options, settings, writer)
+        accepted = accept(writer)
+        _write_command(options, settings, writer)
+        manifest = writer.manifest
+        job = ShardJob(
+            folder=folder,
+            settings=settings,
+            environment={} if options.accept_environment else manifest.environment,
+            accepted=accepted,
+            lock_sha256=manifest.objects_lock_sha256,
+            num_at_once=num_workers(options, settings, variant.device),
+            extensions=manifest.extensions,
+            device=variant.device,
+        )
+        yield Run(options=options, publication=writer, job=job)
+
+
+def _write_command(
+    options: GenerateOptions, settings: DatasetSettings, writer: DatasetWriter
+) -> None:
+    """Write down the command that makes the dataset, with the scenes that it keeps."""
+    num_scenes = writer.manifest.num_scenes
+    if keeps_scenes(num_scenes, options.scenes, settings.splits):
+        options = replace(options, scenes=num_scenes)
+    write_asked(writer.folder, generate_words(options))
 
 
 MAX_TASKS = 1000

@@ -23,18 +23,16 @@ bucket share batches of objects (storage.remote.store) and shards (pipeline.shar
 """
 
 import contextlib
-import os
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from dataclasses import replace
 from functools import partial
-from pathlib import Path
 from typing import Any
 
 from pipeline.documents.dataset_documents import write_documents
 from pipeline.documents.sheets import write_first_pictures
-from pipeline.generation.dataset_writer import DatasetWriter, begin_or_resume_dataset
-from pipeline.generation.generate_options import GenerateOptions, generate_words
+from pipeline.generation.dataset_writer import DatasetWriter
+from pipeline.generation.generate_options import GenerateOptions
 from pipeline.generation.generation_run import (
     FIRST_PAUSE_S,
     Outcome,
@@ -45,9 +43,7 @@ from pipeline.generation.generation_run import (
     TaskCutter,
     TaskResult,
     Watcher,
-    choose_dataset_variant,
-    num_workers,
-    resolve_inputs,
+    begin_run,
     wait_for_others,
 )
 from pipeline.generation.render_sample import failure_of
@@ -59,13 +55,8 @@ from pipeline.generation.render_workers import (
 )
 from pipeline.generation.scene_worker import MAX_ATTEMPTS, SceneAttempt, SceneWorker
 from pipeline.isolation import ChildFailed, IsolatedChild, with_retries
-from pipeline.presets.settings import DatasetSettings
-from pipeline.renders.mitsuba_variant import environment
-from pipeline.shards.pack_shards import UnfinishedShard, hold_dataset_lock
-from storage.dataset.layout import dataset_folder
+from pipeline.shards.pack_shards import UnfinishedShard
 from storage.dataset.manifest import ShardEntry
-from storage.dataset.progress import write_asked
-from storage.dataset.splits import keeps_scenes
 from storage.dataset.statistics import Statistics
 from storage.errors import Rejected, TrilightError
 from storage.records.objects import Failure
@@ -86,7 +77,7 @@ def make_dataset(
     Raises:
         TrilightError: an error that the user can fix; finished scenes stay on disk.
     """
-    with _begin_run(options) as run:  # objects, meshes
+    with begin_run(options) as run:  # objects, meshes
         make_shards(run, runner, watch)  # scenes, renders, shards
         finished = run.publication.finish()
         run.require_within_budget()
@@ -98,57 +89,8 @@ def make_dataset(
 
 def prepare_dataset(options: GenerateOptions) -> Run:
     """Begin a dataset and freeze its objects, without rendering; raises as `make_dataset`."""
-    with _begin_run(options) as run:
+    with begin_run(options) as run:
         return run
-
-
-@contextlib.contextmanager
-def _begin_run(options: GenerateOptions) -> Iterator[Run]:
-    """Join a dataset's workers and yield the run; the first worker freezes the objects."""
-    folder = dataset_folder(options.place)
-    folder = replace(folder, root=Path(os.path.realpath(folder.root)))
-    settings, accept = resolve_inputs(options, folder)  # refuses before anything is written
-    with hold_dataset_lock(folder):
-        variant = choose_dataset_variant(options, folder)
-        writer = begin_or_resume_dataset(
-            folder,
-            settings,
-            environment(variant),
-            options.num_scenes,
-            accept_environment=options.accept_environment,
-        )
-        requested = options.shard_range()
-        if requested is not None and requested.start >= writer.num_shards:
-            raise TrilightError(
-                f"--range is {options.shards!r}; expected one that begins below "
-                f"{writer.num_shards}, the shards of {writer.manifest.num_scenes} scenes."
-            )
-        if not writer.manifest.objects_lock_sha256:  # else other objects may be refused yet
-            _write_command(options, settings, writer)
-        accepted = accept(writer)
-        _write_command(options, settings, writer)
-        manifest = writer.manifest
-        job = ShardJob(
-            folder=folder,
-            settings=settings,
-            environment={} if options.accept_environment else manifest.environment,
-            accepted=accepted,
-            lock_sha256=manifest.objects_lock_sha256,
-            num_at_once=num_workers(options, settings, variant.device),
-            extensions=manifest.extensions,
-            device=variant.device,
-        )
-        yield Run(options=options, publication=writer, job=job)
-
-
-def _write_command(
-    options: GenerateOptions, settings: DatasetSettings, writer: DatasetWriter
-) -> None:
-    """Write down the command that makes the dataset, with the scenes that it keeps."""
-    num_scenes = writer.manifest.num_scenes
-    if keeps_scenes(num_scenes, options.scenes, settings.splits):
-        options = replace(options, scenes=num_scenes)
-    write_asked(writer.folder, generate_words(options))
 
 
 def make_shards(run: Run, runner: Runner, watch: Watcher) -> None:

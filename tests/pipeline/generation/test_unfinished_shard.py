@@ -308,7 +308,7 @@ def test_a_rerun_does_not_escape_the_failure_budget(
     with pytest.raises(TrilightError, match=r"4 of 4 .*The reasons are in failures\.jsonl"):
         run.require_within_budget()  # while it is made
     assert [row.item for row in read_failures(folder.failures)] == [*map(sample_key, range(4))]
-    monkeypatch.setattr(pipeline, "_begin_run", lambda order: contextlib.nullcontext(run))
+    monkeypatch.setattr(pipeline, "begin_run", lambda order: contextlib.nullcontext(run))
     with pytest.raises(TrilightError, match="4 of 4 scenes could not be made"):
         make_dataset(run.options, Idle())
 
