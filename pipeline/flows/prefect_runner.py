@@ -177,11 +177,11 @@ class RunPage:
         """Show the progress of the dataset, if it has changed."""
         remaining_s = status.remaining_s
         rate = "unknown" if status.views_per_hour is None else f"{status.views_per_hour:.4g}"
-        left = "unknown" if remaining_s is None else f"{remaining_s / 60:.0f} minutes"
+        remaining = "unknown" if remaining_s is None else f"{remaining_s / 60:.0f} minutes"
         rows = [
             ("scenes in shards", f"{status.scenes_done} of {status.scenes_planned}"),
             ("views an hour", rate),
-            ("left at that rate", left),
+            ("left at that rate", remaining),
         ]
         if rows != self._rows:
             self._rows = rows

@@ -200,9 +200,9 @@ class DatasetWriter:
             TrilightError: it is not here, so that its worker uses another folder.
         """
         number = number_of_shard(shard)
-        here = range(number, number + 1)
+        own_shard = range(number, number + 1)
         for pause_s in (*(2**look for look in range(_MAX_LOOKS - 1)), 0):
-            if self.folder.has_shard(shard.name) or shard.name in self._finished_shards(here):
+            if self.folder.has_shard(shard.name) or shard.name in self._finished_shards(own_shard):
                 break
             time.sleep(pause_s)
         else:

@@ -115,18 +115,18 @@ class GenerateOptions:
     def __post_init__(self) -> None:
         DATASET_PRESETS.find(self.build)
         stated = [name for name, value in vars(self).items() if value is not None]
-        for name, others in _EXCLUDED.items():
-            if name in stated and (wrong := [other for other in others if other in stated]):
+        for name, excluded in _EXCLUDED.items():
+            if name in stated and (wrong := [other for other in excluded if other in stated]):
                 raise TrilightError(
                     f"{_flag(name)} {getattr(self, name)} was given with "
                     f"{' and '.join(map(_flag, wrong))}; expected it without: it says what scenes "
                     "are made of. Leave one out."
                 )
-        for name, others in _NEEDS.items():
-            if name in stated and not {*others} & {*stated}:
+        for name, necessary in _NEEDS.items():
+            if name in stated and not {*necessary} & {*stated}:
                 raise TrilightError(
                     f"{_flag(name)} is {getattr(self, name)!r}; expected it only with "
-                    f"{' or '.join(map(_flag, others))}."
+                    f"{' or '.join(map(_flag, necessary))}."
                 )
         dataset_folder(self.place)
         self.shard_range()

@@ -85,7 +85,7 @@ class Run:
     publication: DatasetWriter
     """Writes the manifest and publishes finished shards."""
     job: "ShardJob"
-    """What all tasks of the run share; a runner may set another `num_at_once`."""
+    """Input that all tasks of the run share."""
 
     @property
     def accepted(self) -> AcceptedObjects:

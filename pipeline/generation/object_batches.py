@@ -134,7 +134,8 @@ class ObjectBatch:
         with writer.claim(self._file) as ours:
             if not ours or self.result() is not None:
                 return False
-            records, lost = self.records, list[Failure]()
+            records = self.records
+            lost: list[Failure] = []
             if self._work.fetch is not None:
                 fetched, lost = self._work.fetch(self.records)
                 records = sorted(fetched, key=attrgetter("uid"))
@@ -218,9 +219,8 @@ def prepare_in_batches(
         TrilightError: as `prepare_assets`, or the dataset cannot be written.
     """
     batches = [ObjectBatch(batch, work) for batch in cut_objects(records)]
-    if retry_transient:
-        for batch in batches:
-            batch.forget_transient()
+    for batch in batches if retry_transient else ():
+        batch.forget_transient()
     results: dict[int, PrepareResult] = {}
     ours: set[int] = set()
 
@@ -244,8 +244,8 @@ def prepare_in_batches(
             if not missing or should_stop():
                 break
             tried = zip(missing, threads.map(make, missing), strict=True)
-            made = [number for number, is_ours in tried if is_ours]
-            ours.update(made)
+            made = {number for number, is_ours in tried if is_ours}
+            ours |= made
             if made:
                 pause_s = _PAUSES_S[0]
                 notice = WaitNotice()

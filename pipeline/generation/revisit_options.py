@@ -109,8 +109,8 @@ def _cameras(words: str, num_views: int) -> dict[str, Any]:
         layout = drawn["layout"]
         count = int(drawn["count"])
         if layout is None:
-            kept = min(count, num_views)
-            return {"kept_cameras": kept, "new_cameras": count - kept}
+            num_kept = min(count, num_views)
+            return {"kept_cameras": num_kept, "new_cameras": count - num_kept}
         if layout == "new":
             return {"kept_cameras": 0, "new_cameras": count}
         if layout in TEMPLATES:

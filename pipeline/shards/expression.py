@@ -138,13 +138,16 @@ class _Reader:
             case ast.BoolOp(op=op, values=parts):
                 operation = type(op)
             case ast.UnaryOp(op=unary, operand=part):
-                operation, parts = type(unary), [part]
+                operation = type(unary)
+                parts = [part]
             case ast.BinOp(op=binary, left=left, right=right):
-                operation, parts = type(binary), [left, right]
+                operation = type(binary)
+                parts = [left, right]
             case ast.Tuple(elts=parts) | ast.List(elts=parts):
                 operation = type(node)
             case ast.Call(func=ast.Name(id=name), args=[part], keywords=[]):
-                operation, parts = name, [part]
+                operation = name
+                parts = [part]
         if operation not in _OPERATIONS:
             self.refuse(
                 node, "nothing that a condition may hold", f"{', '.join(_FUNCTIONS)}, comparisons, "
