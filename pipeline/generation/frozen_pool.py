@@ -6,10 +6,11 @@ open. If an object's file is missing on this machine, the worker prepares it aga
 (`pipeline.generation.render_workers.restore_object`).
 """
 
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from functools import lru_cache, partial
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -124,18 +125,15 @@ def user_maps(rows: Iterable[tuple[LockedObject, Path]], split: str) -> OwnMaps:
         ((locked, path) for locked, path in rows if locked.split == split),
         key=lambda pair: pair[0].uid,
     )
-    return OwnMaps(
-        textures=[
-            UserMap(uid=locked.uid, source=_source(locked), load=partial(_texture, path))
+
+    def maps_of(kind: str, load: Callable[[Path], Any]) -> list[UserMap[Any]]:
+        return [
+            UserMap(uid=locked.uid, source=_source(locked), load=partial(load, path))
             for locked, path in of_split
-            if locked.kind == TEXTURE
-        ],
-        skies=[
-            UserMap(uid=locked.uid, source=_source(locked), load=partial(_radiance, path))
-            for locked, path in of_split
-            if locked.kind == SKY
-        ],
-    )
+            if locked.kind == kind
+        ]
+
+    return OwnMaps(textures=maps_of(TEXTURE, _texture), skies=maps_of(SKY, _radiance))
 
 
 def _source(locked: LockedObject) -> MapSource:

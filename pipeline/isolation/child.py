@@ -254,7 +254,7 @@ def _launch(limits: ChildLimits) -> tuple[Any, Connection]:
             target=serve, args=(theirs, output_sink, limits.memory_bytes, limits.cpu_s), daemon=True
         )
         try:
-            with _without_main(), _outside_working_folder():
+            with _apart_from_program():
                 process.start()
         except (EOFError, OSError) as error:
             ours.close()
@@ -281,47 +281,39 @@ def _print_output(output: Connection) -> None:
 
 
 @contextlib.contextmanager
-def _without_main() -> Iterator[None]:
-    """Hide a program that runs from a file: multiprocessing would run it again in the child.
+def _apart_from_program() -> Iterator[None]:
+    """Keep the program and modules of the working folder out of a child, and of its servers.
 
+    A program that runs from a file is hidden: multiprocessing would run it again in the child.
     Children import the functions that they call by name, and do not need the program. A user's
     program without `if __name__ == "__main__"` would start children there. A program run by
     `python -m` is a module, whose functions a child may import.
+
+    A file of the working folder that is named like one of Python's modules would be run before the
+    child is confined. The socket of the fork server is below /tmp if TMPDIR is too long for one.
     """
     with _one_start:
         program = sys.modules["__main__"]
+        environment = os.environ.copy()
+        paths = sys.path
+        temporary = tempfile.tempdir
         if program.__spec__ is None:
             sys.modules["__main__"] = ModuleType("__main__")
+        os.environ.update(child_environment())
+        sys.path = order_installed_first(paths)
+        if len(os.fsencode(tempfile.gettempdir())) > _LONGEST_FOLDER:
+            tempfile.tempdir = "/tmp"
         try:
             yield
         finally:
             sys.modules["__main__"] = program
-
-
-@contextlib.contextmanager
-def _outside_working_folder() -> Iterator[None]:
-    """Keep modules of the working folder out of a child, and out of the servers that start it.
-
-    A file named like one of Python's modules would be run there, before the child is confined. The
-    socket of the fork server is below /tmp if TMPDIR is too long for one.
-    """
-    environment = os.environ.copy()
-    paths = sys.path
-    temporary = tempfile.tempdir
-    os.environ.update(child_environment())
-    sys.path = order_installed_first(paths)
-    if len(os.fsencode(tempfile.gettempdir())) > _LONGEST_FOLDER:
-        tempfile.tempdir = "/tmp"
-    try:
-        yield
-    finally:
-        sys.path = paths
-        tempfile.tempdir = temporary
-        for name in ("PYTHONSAFEPATH", "PYTHONPATH"):
-            if name in environment:
-                os.environ[name] = environment[name]
-            else:
-                del os.environ[name]
+            sys.path = paths
+            tempfile.tempdir = temporary
+            for name in ("PYTHONSAFEPATH", "PYTHONPATH"):
+                if name in environment:
+                    os.environ[name] = environment[name]
+                else:
+                    del os.environ[name]
 
 
 def preload(modules: list[str]) -> None:
