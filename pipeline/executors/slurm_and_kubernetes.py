@@ -266,6 +266,13 @@ def job_manifest(job: ArrayJob, options: KubernetesOptions) -> dict[str, Any]:
         TrilightError: a task would need a file of this machine, or there is no image.
     """
     _require_bucket_alone(job.options)
+    image = options.image or os.environ.get("TRILIGHT_IMAGE")
+    if not image:
+        raise TrilightError(
+            "submit kubernetes: --image is not given; expected the address of Trilight's image as "
+            "the machines pull it, such as registry.example/trilight@sha256:... Build and push "
+            "infra/images/cpu.Dockerfile, or set TRILIGHT_IMAGE."
+        )
     words = ["trilight", *generate_words(job.options), "--out", job.options.place]
     words += ["--runner", "kubernetes"]
     environment = {
@@ -290,23 +297,12 @@ def job_manifest(job: ArrayJob, options: KubernetesOptions) -> dict[str, Any]:
     if options.machine_type:
         pod["nodeSelector"] = {"node.kubernetes.io/instance-type": options.machine_type}
     pod["containers"][0] |= {
-        "image": _image(options),
+        "image": image,
         "command": words,
         "env": [{"name": name, "value": value} for name, value in environment.items()],
         "resources": {"requests": amounts, "limits": dict(amounts)},
     }
     return manifest
-
-
-def _image(options: KubernetesOptions) -> str:
-    image = options.image or os.environ.get("TRILIGHT_IMAGE")
-    if not image:
-        raise TrilightError(
-            "submit kubernetes: --image is not given; expected the address of Trilight's image as "
-            "the machines pull it, such as registry.example/trilight@sha256:... Build and push "
-            "infra/images/cpu.Dockerfile, or set TRILIGHT_IMAGE."
-        )
-    return image
 
 
 def _require_bucket_alone(options: GenerateOptions) -> None:

@@ -65,25 +65,24 @@ class ObjectWork:
 
     def name(self, records: Sequence[ObjectRecord], *, are_here: bool) -> str:
         """Return the file name of a batch's result; `are_here` says that its files are local."""
-        of_objects = [self._facts(record, are_here) for record in records]
-        facts = [of_objects, asdict(self.settings), RECIPE, READERS]
-        digest = sha256_hex(canonical_json(facts))[:32]
-        return f"{digest[:2]}/{digest}.jsonl"
-
-    def _facts(self, record: ObjectRecord, is_here: bool) -> list[Any]:
-        """Return inputs of a result as JSON values: the record, and the state of a local file."""
-        facts = asdict(record)
-        path = Path(facts.pop("path"))
-        root = facts.pop("root")
-        if not is_here:
-            return [facts]
         with_pictures = self.settings.own_materials.keep
-        fetched = path.is_relative_to(cache_folder(""))  # its time is that of the download
-        suffix = path.suffix.lower()
-        alone = fetched or suffix in _SELF_CONTAINED or (suffix == ".ply" and not with_pictures)
-        folder = Path(root) if root and with_pictures else path.parent
-        neighbors = "" if alone else self._digest_neighbors(folder, suffix in _LAYERS)
-        return [facts, path.suffix, *_state(path, fetched), neighbors]
+        of_objects = list[list[Any]]()  # each record, and the state of its file if that is local
+        for record in records:
+            facts = asdict(record)
+            path = Path(facts.pop("path"))
+            root = facts.pop("root")
+            of_objects.append([facts])
+            if are_here:
+                fetched = path.is_relative_to(cache_folder(""))  # its time is of the download
+                suffix = path.suffix.lower()
+                alone = suffix in _SELF_CONTAINED or (suffix == ".ply" and not with_pictures)
+                folder = Path(root) if root and with_pictures else path.parent
+                is_layer = suffix in _LAYERS
+                near = "" if fetched or alone else self._digest_neighbors(folder, is_layer)
+                of_objects[-1] += [path.suffix, *_state(path, fetched), near]
+        inputs = [of_objects, asdict(self.settings), RECIPE, READERS]
+        digest = sha256_hex(canonical_json(inputs))[:32]
+        return f"{digest[:2]}/{digest}.jsonl"
 
     def _digest_neighbors(self, folder: Path, layers: bool) -> str:
         """Return a digest of the files of a folder that an object in it may refer to."""

@@ -426,17 +426,12 @@ def serve(connection: Connection, output: Connection, memory_bytes: int, cpu_s: 
             function, args = ForkingPickler.loads(message.data)
         except EOFError:
             os._exit(0)  # the parent has died: skip the destructors of native libraries
-        _allow_cpu(cpu_s)
+        if cpu_s is not None:  # after so many more, the kernel ends this process in any code
+            used = resource.getrusage(resource.RUSAGE_SELF)
+            soft = math.ceil(used.ru_utime + used.ru_stime) + cpu_s
+            hard = resource.getrlimit(resource.RLIMIT_CPU)[1]
+            resource.setrlimit(resource.RLIMIT_CPU, (soft, hard))
         send(file, _answer(function, args), wait_forever)
-
-
-def _allow_cpu(seconds: int | None) -> None:
-    """Allow more CPU seconds from now on; after them the kernel ends this process in any code."""
-    if seconds is None:
-        return
-    used = resource.getrusage(resource.RUSAGE_SELF)
-    soft = math.ceil(used.ru_utime + used.ru_stime) + seconds
-    resource.setrlimit(resource.RLIMIT_CPU, (soft, resource.getrlimit(resource.RLIMIT_CPU)[1]))
 
 
 def _answer(function: Callable[..., Any], args: tuple[Any, ...]) -> list[bytes | memoryview]:
