@@ -94,26 +94,21 @@ def make_by_array(**parameters: Any) -> None:
     """
     options = options_of_form(parameters, DatasetByArray)
     page = RunPage(options.place)
-    if options.scheduler != "none":
-        _submit(options)
+    if (on := options.scheduler) != "none":
+        job = array_job(
+            options.dataset, per_task=options.shards_per_task, at_once=options.at_once, on=on
+        )
+        if job.tasks:
+            name = (
+                submit_slurm_array(job)
+                if on == "slurm"
+                else submit_job(job, options_from_environment()).parent.name
+            )
+            get_run_logger().info(
+                "%s has %s: tasks %s of %d shards", on, name, number_ranges(job.tasks), job.per_task
+            )
     _watch_until_finished(options, page)
     page.show_result()
-
-
-def _submit(options: DatasetByArray) -> None:
-    on = options.scheduler
-    job = array_job(
-        options.dataset, per_task=options.shards_per_task, at_once=options.at_once, on=on
-    )
-    if job.tasks:
-        name = (
-            submit_slurm_array(job)
-            if on == "slurm"
-            else submit_job(job, options_from_environment()).parent.name
-        )
-        get_run_logger().info(
-            "%s has %s: tasks %s of %d shards", on, name, number_ranges(job.tasks), job.per_task
-        )
 
 
 def _watch_until_finished(options: DatasetByArray, page: RunPage) -> None:

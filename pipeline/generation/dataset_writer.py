@@ -487,8 +487,10 @@ def _require_same_dataset(
 ) -> None:
     _require_extendable(folder, manifest)
     stored = from_record(DatasetSettings, manifest.settings).as_json()  # fields may come later
-    _require_same(folder, "setting", stored, settings.as_json(), "choose another --out")
-    if not accept_environment:
+    differing = list(differences(stored, settings.as_json()))
+    what = "setting"
+    next_step = "choose another --out"
+    if not (differing or accept_environment):
         before = device_of(manifest.environment)
         now = device_of(environment)
         if before != now:
@@ -497,13 +499,18 @@ def _require_same_dataset(
                 f"go on with a {now.upper()}; choose --device {before} or another --out, or accept "
                 "pictures that agree only within their stated errors with --accept-environment."
             )
-        _require_same(
-            folder,
-            "environment",
-            manifest.environment,
-            environment,
-            "choose another --out, or accept pictures that agree only within their noise "
-            "floors with --accept-environment",
+        differing = list(differences(manifest.environment, environment))
+        what = "environment"
+        next_step += (
+            ", or accept pictures that agree only within their noise floors with "
+            "--accept-environment"
+        )
+    if differing:
+        name, old, new = differing[0]
+        more = f" (and {len(differing) - 1} more)" if len(differing) > 1 else ""
+        raise TrilightError(
+            f"{folder.display_name}: this dataset was begun with another {what}: {name} was "
+            f"{old!r}, now {new!r}{more}; {next_step}."
         )
 
 
@@ -521,20 +528,3 @@ def _require_free(folder: DatasetFolder, store: Store) -> None:
                 f"{folder.display_name}: {path.name} is there, and the dataset's own would replace "
                 "it; expected an empty folder or a dataset. Choose another --out."
             )
-
-
-def _require_same(
-    folder: DatasetFolder,
-    what: str,
-    before: Mapping[str, Any],
-    now: Mapping[str, Any],
-    next_step: str,
-) -> None:
-    differing = list(differences(before, now))
-    if differing:
-        name, old, new = differing[0]
-        more = f" (and {len(differing) - 1} more)" if len(differing) > 1 else ""
-        raise TrilightError(
-            f"{folder.display_name}: this dataset was begun with another {what}: {name} was "
-            f"{old!r}, now {new!r}{more}; {next_step}."
-        )
