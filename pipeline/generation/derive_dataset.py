@@ -453,7 +453,7 @@ def derive_dataset(
         The dataset digest, and the statistics of the dataset.
 
     Raises:
-        TrilightError: as `pipeline.shards.derive.derive_shards`, or `out` is not empty.
+        TrilightError: as `derive_shards`, or `out` is not empty.
     """
     out = Path(os.path.realpath(out))
     if out.exists() and (not out.is_dir() or any(out.iterdir())):

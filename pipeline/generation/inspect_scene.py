@@ -131,11 +131,9 @@ def _turntable(scene: Scene, variant: Variant) -> NDArray[np.uint8]:
     for pose in turntable_poses(scene):
         renderer = SceneRenderer(seen_into(scene, pose), settings)
         pictures.append(preview_srgb8(renderer.render_view(pose, _FOV_DEG, 0).radiance_rgb))
-    rows = [
-        np.concatenate(pictures[at * VIEWS // ROWS : (at + 1) * VIEWS // ROWS], axis=1)
-        for at in range(ROWS)
-    ]
-    return np.concatenate(rows, axis=0)
+    each = VIEWS // ROWS
+    rows = [pictures[first : first + each] for first in range(0, VIEWS, each)]
+    return np.concatenate([np.concatenate(row, axis=1) for row in rows], axis=0)
 
 
 def seen_into(scene: Scene, pose: NDArray[np.float32]) -> Scene:

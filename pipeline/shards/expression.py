@@ -7,7 +7,7 @@ called. Type errors are reported before any scene is read.
 
 import ast
 import operator
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from typing import Any, Literal, NoReturn
 
@@ -134,7 +134,10 @@ class _Reader:
             case ast.Name(id=name):
                 return self._read_name(node, name)
             case ast.Compare(left=left, ops=ops, comparators=others):
-                return self._read_comparison([left, *others], ops)
+                terms = [self.read(side) for side in (left, *others)]
+                pairs = zip(others, terms, terms[1:], ops, strict=False)
+                tests = [self._test(*pair) for pair in pairs]
+                return _Term(kind="truth", of=lambda values: all(test(values) for test in tests))
             case ast.BoolOp(op=op, values=parts):
                 operation = type(op)
             case ast.UnaryOp(op=unary, operand=part):
@@ -168,12 +171,6 @@ class _Reader:
         if part.kind != kind:
             self.refuse(node, part.kind, _HINTS.get((part.kind, kind), _article(kind)))
         return part
-
-    def _read_comparison(self, nodes: Sequence[ast.expr], ops: Sequence[ast.cmpop]) -> _Term:
-        parts = [self.read(node) for node in nodes]
-        pairs = list(zip(nodes[1:], parts, parts[1:], ops, strict=False))
-        tests = [self._test(*pair) for pair in pairs]
-        return _Term(kind="truth", of=lambda values: all(test(values) for test in tests))
 
     def _test(
         self, node: ast.expr, first: _Term, second: _Term, op: ast.cmpop

@@ -2,7 +2,6 @@
 
 import base64
 import contextlib
-import dataclasses
 import io
 import json
 import logging
@@ -61,8 +60,9 @@ FLOWS = {
 }
 
 
-def _defaults(**given: Any) -> dict[str, Any]:
-    plain = {field.name: field.default for field in dataclasses.fields(GenerateOptions)}
+def _parameters(kind: Any = GenerateOptions, **given: Any) -> dict[str, Any]:
+    """Return the parameters of a flow that takes the options of a class."""
+    plain = {name: getattr(kind(), name) for name in kind.__dataclass_fields__}
     return {**plain, "changes": None, **given}
 
 
@@ -102,9 +102,9 @@ def test_changes_become_dotted_names() -> None:
     form = DatasetOverrides(**{"renders": {"max_spp": 64}, "storage": {"profile": "lossless"}})
     expected = {"renders.max_spp": 64, "storage.profile": "lossless"}
     assert changed_values(form) == expected
-    order = options_of_form(_defaults(scenes=3, changes=form), GenerateOptions)
+    order = options_of_form(_parameters(scenes=3, changes=form), GenerateOptions)
     assert order == GenerateOptions(scenes=3, changes=expected)
-    assert options_of_form(_defaults(), GenerateOptions) == GenerateOptions()
+    assert options_of_form(_parameters(), GenerateOptions) == GenerateOptions()
 
 
 @for_each(
@@ -168,7 +168,7 @@ def test_a_place_that_cannot_be_written_is_refused_by_name() -> None:
     """Before anything is begun: a flow makes its order first."""
     for out in ("https://host/set", "hf://datasets/ada/set", "ftp://host/set"):
         with pytest.raises(TrilightError, match=f"^out '{out}'"):
-            options_of_form(_defaults(out=out), GenerateOptions)
+            options_of_form(_parameters(out=out), GenerateOptions)
 
 
 def test_only_what_can_pass_is_tried_again() -> None:
@@ -191,12 +191,6 @@ def test_only_what_can_pass_is_tried_again() -> None:
     assert list(outcomes.values()) == [True, True, False, False]
 
 
-def _parameters(**given: Any) -> dict[str, Any]:
-    example = DatasetInRuns()
-    plain = {name: getattr(example, name) for name in DatasetInRuns.__dataclass_fields__}
-    return {**plain, "changes": None, **given}
-
-
 @pytest.fixture
 def made(monkeypatch: pytest.MonkeyPatch) -> list[str | None]:
     """Which ranges are made, those of other runs first; nothing is."""
@@ -217,10 +211,10 @@ def made(monkeypatch: pytest.MonkeyPatch) -> list[str | None]:
 
 def test_so_many_flow_runs_are_so_many_in_all(made: list[str | None]) -> None:
     flow: Any = prefect_flows.build_dataset
-    flow.fn(**_parameters(flow_runs=3, deployment="d/x"))
+    flow.fn(**_parameters(DatasetInRuns, flow_runs=3, deployment="d/x"))
     assert made == ["d/x 3:6", "d/x 6:10", "0:3", None]
     made.clear()
-    flow.fn(**_parameters())
+    flow.fn(**_parameters(DatasetInRuns))
     assert made == [None]
 
 
@@ -234,7 +228,7 @@ def test_so_many_flow_runs_are_so_many_in_all(made: list[str | None]) -> None:
 )
 def test_wrong_numbers_of_runs_are_named(given: dict[str, Any], message: str) -> None:
     with pytest.raises(TrilightError, match=message):
-        options_of_form(_parameters(**given), DatasetInRuns)
+        options_of_form(_parameters(DatasetInRuns, **given), DatasetInRuns)
 
 
 @for_each(("device", "held"), [("gpu", [1]), ("cpu", [])])
@@ -465,15 +459,9 @@ def cluster(monkeypatch: pytest.MonkeyPatch) -> list[list[int]]:
 
 
 def run(**given: Any) -> None:
-    plain = {
-        each.name: getattr(tiny_order(), each.name) for each in dataclasses.fields(GenerateOptions)
-    }
-    own = {name: DatasetByArray.__dataclass_fields__[name].default for name in _OWN}
     flow: Any = make_by_array
-    checked = flow.validate_parameters(
-        {**plain, **own, "changes": {"scenes": {"num_views": 2}}, **given}
-    )
-    flow.fn(**checked)
+    tiny = {"resolution": 16, "changes": {"scenes": {"num_views": 2}}}
+    flow.fn(**flow.validate_parameters(_parameters(DatasetByArray, **tiny, **given)))
 
 
 _OWN = set(DatasetByArray.__dataclass_fields__) - set(GenerateOptions.__dataclass_fields__)
