@@ -128,21 +128,21 @@ def user_maps(rows: Iterable[tuple[LockedObject, Path]], split: str) -> OwnMaps:
 
     def maps_of(kind: str, load: Callable[[Path], Any]) -> list[UserMap[Any]]:
         return [
-            UserMap(uid=locked.uid, source=_source(locked), load=partial(load, path))
+            UserMap(
+                uid=locked.uid,
+                source=MapSource(
+                    name=locked.title,
+                    licence=locked.licence,
+                    attribution=locked.attribution,
+                    source_url=locked.source_url,
+                ),
+                load=partial(load, path),
+            )
             for locked, path in of_split
             if locked.kind == kind
         ]
 
     return OwnMaps(textures=maps_of(TEXTURE, _texture), skies=maps_of(SKY, _radiance))
-
-
-def _source(locked: LockedObject) -> MapSource:
-    return MapSource(
-        name=locked.title,
-        licence=locked.licence,
-        attribution=locked.attribution,
-        source_url=locked.source_url,
-    )
 
 
 def _texture(path: Path) -> UserTexture:

@@ -68,7 +68,13 @@ class RevisitedScenes:
             members = opened.members(key)
         sample = decode_sample(key, members)
         origin = self._origin(sample.scene, key, revisit, settings.seed, attempt)
-        scene = _redraw(sample.scene.with_provenance(origin), index, attempt, settings)
+        scene = sample.scene.with_provenance(origin)
+        ranges = settings.scenes.of_scene(origin["scene_index"])
+        scene_key = SceneKey(settings.seed, index, attempt)
+        if revisit.materials == "new":
+            scene = with_new_materials(scene, ranges.materials, scene_key)
+        if revisit.lights == "new":
+            scene = with_new_lights(scene, ranges.lights, revisit.num_lights, scene_key)
         given_cameras = [
             ViewCamera(
                 c2w=np.array(camera.c2w, np.float32).reshape(4, 4),
@@ -79,7 +85,7 @@ class RevisitedScenes:
         ]
         scene = with_first_cameras(
             scene,
-            settings.scenes.of_scene(origin["scene_index"]),
+            ranges,
             first_cameras=[*cameras_of(sample.scene)[: revisit.kept_cameras], *given_cameras],
         )
         if not revisit.keeps_light:
@@ -139,18 +145,6 @@ def require_digest(dataset: FinishedDataset, digest: str) -> None:
             f"expected {digest}, whose scenes the new dataset was begun with. Name that one, or "
             "choose another --out."
         )
-
-
-def _redraw(scene: Scene, index: int, attempt: int, settings: DatasetSettings) -> Scene:
-    revisit = settings.revisit
-    scene_key = SceneKey(settings.seed, index, attempt)
-    assert revisit is not None
-    ranges = settings.scenes.of_scene(scene.provenance["scene_index"])
-    if revisit.materials == "new":
-        scene = with_new_materials(scene, ranges.materials, scene_key)
-    if revisit.lights == "new":
-        scene = with_new_lights(scene, ranges.lights, revisit.num_lights, scene_key)
-    return scene
 
 
 SceneOrigin = ComposedScenes | SceneFiles | RevisitedScenes
