@@ -18,7 +18,6 @@ from pipeline.generation.generate_options import GenerateOptions
 from pipeline.generation.generation_run import MAX_TASKS, TASK_S, Piece
 from pipeline.generation.pipeline import make_task, prepare_dataset
 from pipeline.generation.render_workers import close_children
-from pipeline.presets.registry import DATASET_PRESETS, preset_settings
 from pipeline.presets.settings import DatasetSettings
 from pipeline.renders.mitsuba_variant import visible_gpus
 from storage.dataset.layout import DatasetFolder
@@ -113,10 +112,10 @@ def measure_scenes(
         TrilightError: as `prepare_dataset`.
     """
     # prepared at its full size, so that a lack of objects is reported now and not by `generate`
-    scenes = max(count, _num_scenes(options))
+    scenes = max(count, options.num_scenes)
     run = prepare_dataset(dataclasses.replace(options, out=str(place), scenes=scenes))
-    job = run.job(1)
-    splits = run.settings.splits
+    job = dataclasses.replace(run.job, num_at_once=1)
+    splits = job.settings.splits
     core_s = []
     sizes = []
     try:
@@ -129,7 +128,7 @@ def measure_scenes(
     finally:
         close_children()
     return MeasuredScenes(
-        core_s=tuple(core_s), num_bytes=tuple(sizes), num_views=run.settings.scenes.num_views
+        core_s=tuple(core_s), num_bytes=tuple(sizes), num_views=job.settings.scenes.num_views
     )
 
 
@@ -142,8 +141,8 @@ def predict_cost(
     it is left out if there are others. Means are resampled 2000 times (Efron's bootstrap), which is
     too narrow for very few scenes and cannot predict costs that none of them shows.
     """
-    splits = _settings(options).splits
-    num_scenes = planned_scenes(_num_scenes(options), splits)
+    splits = options.settings().splits
+    num_scenes = planned_scenes(options.num_scenes, splits)
     num_shards = shards_for(num_scenes, splits)
     core_hours = _total(measured.core_s[1:] or measured.core_s, num_scenes / 3600)
     scene_s = core_hours.value * 3600 / num_scenes / available_cores()
@@ -178,10 +177,10 @@ def describe_run(options: GenerateOptions, folder: DatasetFolder) -> str:
 
     It is empty if files or another dataset define the scenes.
     """
-    settings = _settings(options)
+    settings = options.settings()
     if options.scenes_from or options.revisits or settings.revisit:
         return ""
-    scenes = _num_scenes(options)
+    scenes = options.num_scenes
     remaining = scenes
     core_s: list[float] = []
     size = size_note = ""
@@ -229,19 +228,6 @@ def _expected_time(settings: DatasetSettings, remaining: int, core_s: Sequence[f
 
 def _count_text(count: int, noun: str) -> str:
     return f"{count:,} {noun}{'' if count == 1 else 's'}"
-
-
-def _num_scenes(options: GenerateOptions) -> int:
-    return DATASET_PRESETS[options.build].num_scenes if options.scenes is None else options.scenes
-
-
-def _settings(options: GenerateOptions) -> DatasetSettings:
-    return preset_settings(
-        options.build,
-        resolution=options.resolution,
-        noise_targets=options.noise_targets,
-        changes=options.changes,
-    )
 
 
 def _scene_bytes(folder: DatasetFolder, shard: str, scene: int) -> int:

@@ -15,8 +15,7 @@ from infra.cli.console import (
 from infra.cli.options import command
 from infra.cli.overrides import BaseSettings, with_base_settings
 from infra.cli.process_exit import temporary_folder
-from pipeline.generation.generate_options import GenerateOptions, generate_words
-from pipeline.generation.price import CorePrice
+from pipeline.generation.generate_options import CorePrice, GenerateOptions, generate_words
 from storage.dataset.layout import dataset_folder
 from storage.errors import TrilightError
 from storage.machine import available_cores

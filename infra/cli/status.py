@@ -14,7 +14,7 @@ from infra.cli.console import (
     suggest_look,
 )
 from infra.cli.options import command
-from pipeline.generation.price import CorePrice
+from pipeline.generation.generate_options import CorePrice
 from storage.aliases import PRESET_ALIASES, name_for_people
 from storage.dataset.progress import DatasetStatus, missing_shards, read_status
 from storage.errors import TrilightError

@@ -9,7 +9,8 @@ from pathlib import Path
 
 from pipeline.generation.dataset_writer import begin_or_resume_dataset
 from pipeline.generation.freeze_objects import ObjectLock
-from pipeline.generation.scene_worker import SceneRecipe, SceneWorker
+from pipeline.generation.prepare_isolated import asset_store
+from pipeline.generation.scene_worker import SceneWorker
 from pipeline.isolation import ChildLimits, IsolatedChild
 from pipeline.presets.settings import DatasetSettings
 from pipeline.presets.training import smoke
@@ -48,17 +49,13 @@ def composing_child(
     """
     variant = variant or choose_variant()
     workers = threads or available_cores()
-    publication = begin_or_resume_dataset(
-        DatasetFolder(folder), settings, environment(variant), 1, accept_environment=False
-    )
+    publication = begin_or_resume_dataset(DatasetFolder(folder), settings, environment(variant), 1)
     accepted = ObjectLock(
         source=objects, licence=None, settings=settings, writer=publication, workers=workers
     ).freeze()
-    recipe = SceneRecipe(
-        settings=settings, variant=variant, threads=workers, origin=accepted.origin
-    )
+    arguments = (settings, accepted.origin, asset_store(), variant, workers)
     limits = dataclasses.replace(_LIMITS, memory_bytes=variant.address_space(_LIMITS.memory_bytes))
-    return IsolatedChild(limits=limits, factory=SceneWorker, args=(recipe,))
+    return IsolatedChild(limits=limits, factory=SceneWorker, args=arguments)
 
 
 def held_out_settings() -> DatasetSettings:

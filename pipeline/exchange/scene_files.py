@@ -45,7 +45,7 @@ class SceneFiles:
     albedo_over_one: AlbedoOverOne = "scale"  # treatment of albedos over 1
     notes: tuple[str, ...] = ()  # sentences about the built scenes
 
-    def scene(self, scene_index: int, assets: AssetSettings, *, num_views: int, seed: int) -> Scene:
+    def scene(self, scene_index: int, assets: AssetSettings, num_views: int, seed: int) -> Scene:
         """Build the scene of the file `names[scene_index]`; only child processes call this.
 
         `num_views` cameras are taken; the provenance records the dataset's `seed`.

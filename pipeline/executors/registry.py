@@ -52,7 +52,7 @@ EXECUTORS: Registry[Executor] = Registry(
         "threads": Executor(make=_load_on_use("pipeline.executors.threads")),
         "slurm": Executor(make=_load_on_use("pipeline.executors.threads", "make_slurm")),
         "kubernetes": Executor(make=_load_on_use("pipeline.executors.threads", "make_kubernetes")),
-        "prefect": Executor(make=_load_on_use("pipeline.flows.flow_executors", "make_on_prefect")),
+        "prefect": Executor(make=_load_on_use("pipeline.flows.flow_executors")),
         "dask": Executor(
             make=_load_on_use("pipeline.flows.flow_executors"),
             needs_address=True,

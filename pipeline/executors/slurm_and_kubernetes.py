@@ -126,6 +126,7 @@ def _is_begun(place: str) -> bool:
 
 
 SCRIPT = Path(__file__).parents[2] / "infra/slurm/generate.sbatch"
+_JOB = Path(__file__).parents[2] / "infra/kubernetes/array/job.yaml"
 
 
 def sbatch_command(job: ArrayJob, options: Sequence[str] = ()) -> list[str]:
@@ -155,11 +156,6 @@ def submit_slurm_array(job: ArrayJob, options: Sequence[str] = ()) -> str:
     Raises:
         TrilightError: there is no sbatch here, or it refuses.
     """
-    if shutil.which("sbatch") is None:
-        raise TrilightError(
-            "submit slurm: no sbatch here; expected a login node of a Slurm cluster. --dry-run "
-            "prints the command."
-        )
     Path("logs").mkdir(exist_ok=True)  # the script's tasks write their logs here
     said = _submit("slurm", sbatch_command(job, options), sbatch_environment(job))
     return said.strip().partition(";")[0]
@@ -169,6 +165,11 @@ def _submit(
     on: str, command: Sequence[str], variables: Mapping[str, str] | None = None, hint: str = ""
 ) -> str:
     """Run a scheduler's command and return what it prints; raises TrilightError if it refuses."""
+    if shutil.which(command[0]) is None:
+        raise TrilightError(
+            f"submit {on}: no {command[0]} here; expected a machine from which the cluster takes "
+            "jobs. --dry-run prints the command."
+        )
     environment = {**os.environ, **(variables or {})}
     done = subprocess.run(command, env=environment, capture_output=True, text=True, check=False)
     if done.returncode:
@@ -179,8 +180,6 @@ def _submit(
 
 MACHINES = "TRILIGHT_MACHINES"
 """Variable with the path of a JSON file: options of machines, such as {"where": "a-namespace"}."""
-_KEPT_S = 86400
-"""Seconds that an ended job stays visible in the cluster."""
 
 
 @checked()
@@ -255,11 +254,6 @@ def submit_job(job: ArrayJob, options: KubernetesOptions) -> Path:
         TrilightError: there is no kubectl here, or it refuses; or as `write_manifest`.
     """
     path = write_job_file(job, options)
-    if shutil.which("kubectl") is None:
-        raise TrilightError(
-            "submit kubernetes: no kubectl here; expected it installed and logged in. The "
-            "manifest is written; --dry-run prints the command that submits it."
-        )
     hint = " Where a job of that name has ended, delete it, and submit again."
     _submit("kubernetes", create_command(path), hint=hint)
     return path
@@ -272,6 +266,13 @@ def job_manifest(job: ArrayJob, options: KubernetesOptions) -> dict[str, Any]:
         TrilightError: a task would need a file of this machine, or there is no image.
     """
     _require_bucket_alone(job.options)
+    image = options.image or os.environ.get("TRILIGHT_IMAGE")
+    if not image:
+        raise TrilightError(
+            "submit kubernetes: --image is not given; expected the address of Trilight's image as "
+            "the machines pull it, such as registry.example/trilight@sha256:... Build and push "
+            "infra/images/cpu.Dockerfile, or set TRILIGHT_IMAGE."
+        )
     words = ["trilight", *generate_words(job.options), "--out", job.options.place]
     words += ["--runner", "kubernetes"]
     environment = {
@@ -281,87 +282,27 @@ def job_manifest(job: ArrayJob, options: KubernetesOptions) -> dict[str, Any]:
         "HOME": "/tmp",
     }
     said = repr((words, environment, job.at_once, options))
-    return {
-        "apiVersion": "batch/v1",
-        "kind": "Job",
-        "metadata": {
-            "name": f"trilight-{sha256_hex(said.encode())[:12]}",
-            "namespace": options.where or "trilight",
-            "labels": {"app": "trilight-array"},
-        },
-        "spec": {
-            "completionMode": "Indexed",
-            "completions": len(job.tasks),
-            "parallelism": min(job.at_once or len(job.tasks), len(job.tasks)),
-            "backoffLimitPerIndex": options.tries - 1,
-            "podFailurePolicy": {
-                "rules": [
-                    {"action": "Ignore", "onPodConditions": [{"type": "DisruptionTarget"}]},
-                    {
-                        "action": "FailIndex",
-                        "onExitCodes": {"containerName": "task", "operator": "In", "values": [2]},
-                    },
-                ]
-            },
-            "ttlSecondsAfterFinished": _KEPT_S,
-            "template": {
-                "metadata": {"labels": {"app": "trilight-array"}},
-                "spec": _pod(words, environment, options),
-            },
-        },
-    }
-
-
-def _pod(
-    words: Sequence[str], environment: dict[str, str], options: KubernetesOptions
-) -> dict[str, Any]:
     amounts = {"cpu": str(options.cores), "memory": f"{options.memory_gib}Gi"}
-    mounts = {"tmp": "/tmp", "cache": "/cache", "data": "/data"}
-    pod: dict[str, Any] = {
-        "restartPolicy": "Never",
-        "activeDeadlineSeconds": round(3600 * options.task_hours),
-        "automountServiceAccountToken": False,
-        "securityContext": {
-            "runAsNonRoot": True, "runAsUser": 10001, "fsGroup": 10001,
-            "seccompProfile": {"type": "RuntimeDefault"},
-        },
-        "containers": [
-            {
-                "name": "task",
-                "image": _image(options),
-                "imagePullPolicy": "IfNotPresent",
-                "command": words,
-                "env": [{"name": name, "value": value} for name, value in environment.items()],
-                "envFrom": [{"secretRef": {"name": "trilight-bucket", "optional": True}}],
-                "resources": {"requests": amounts, "limits": dict(amounts)},
-                "securityContext": {
-                    "allowPrivilegeEscalation": False,
-                    "readOnlyRootFilesystem": True,
-                    "capabilities": {"drop": ["ALL"]},
-                },
-                "volumeMounts": [
-                    {"name": name, "mountPath": path} for name, path in mounts.items()
-                ],
-            }
-        ],
-        "volumes": [{"name": name, "emptyDir": {}} for name in mounts],
-    }  # fmt: skip
+    manifest: dict[str, Any] = yaml.safe_load(_JOB.read_bytes())
+    manifest["metadata"]["name"] = f"trilight-{sha256_hex(said.encode())[:12]}"
+    manifest["metadata"]["namespace"] = options.where or "trilight"
+    spec = manifest["spec"]
+    spec["completions"] = len(job.tasks)
+    spec["parallelism"] = min(job.at_once or len(job.tasks), len(job.tasks))
+    spec["backoffLimitPerIndex"] = options.tries - 1
+    pod = spec["template"]["spec"]
+    pod["activeDeadlineSeconds"] = round(3600 * options.task_hours)
     if options.account:
         pod["serviceAccountName"] = options.account
     if options.machine_type:
         pod["nodeSelector"] = {"node.kubernetes.io/instance-type": options.machine_type}
-    return pod
-
-
-def _image(options: KubernetesOptions) -> str:
-    image = options.image or os.environ.get("TRILIGHT_IMAGE")
-    if not image:
-        raise TrilightError(
-            "submit kubernetes: --image is not given; expected the address of Trilight's image as "
-            "the machines pull it, such as registry.example/trilight@sha256:... Build and push "
-            "infra/images/cpu.Dockerfile, or set TRILIGHT_IMAGE."
-        )
-    return image
+    pod["containers"][0] |= {
+        "image": image,
+        "command": words,
+        "env": [{"name": name, "value": value} for name, value in environment.items()],
+        "resources": {"requests": amounts, "limits": dict(amounts)},
+    }
+    return manifest
 
 
 def _require_bucket_alone(options: GenerateOptions) -> None:

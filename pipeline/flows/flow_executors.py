@@ -33,40 +33,34 @@ _AHEAD = 2
 
 
 def make(options: GenerateOptions, address: str | None) -> Outcome:
-    """Make a dataset with the workers of a Dask cluster, as a flow run of this process.
+    """Make a dataset as a flow run of this process, by a Dask cluster if its address is given.
 
     Raises:
-        TrilightError: prefect-dask is not installed, the cluster does not answer, has no worker or
-            one that sees another folder; or as `make_dataset`.
+        TrilightError: the private server does not start; prefect-dask is not installed, the cluster
+            does not answer, has no worker or one that sees another folder; or as `make_dataset`.
     """
-    assert address is not None, "the executor needs one"
     quiet_prefect()
-    with prefect_server():
-        return _make(options, address)
+    with prefect_server(), _runner(options, address) as (runner, flow_options):
+        from prefect import flow  # Prefect reads settings on import
+
+        from pipeline.flows.prefect_runner import make_with_page
+
+        def generate() -> Outcome:
+            return make_with_page(options, runner)
+
+        return flow(name="generate-scenes", persist_result=False, **flow_options)(generate)()
 
 
-def make_on_prefect(options: GenerateOptions, address: str | None) -> Outcome:
-    """Make a dataset here; raises as `make_dataset`, or if the private server does not start."""
-    quiet_prefect()
-    with prefect_server():
-        from pipeline.flows.prefect_runner import PrefectRunner  # Prefect reads settings on import
+@contextlib.contextmanager
+def _runner(
+    options: GenerateOptions, address: str | None
+) -> Iterator[tuple["PrefectRunner", dict[str, Any]]]:
+    """Provide a runner, and options of Prefect for its flow."""
+    from pipeline.flows.prefect_runner import PrefectRunner
 
-        return _as_flow(options, PrefectRunner())
-
-
-def _as_flow(options: GenerateOptions, runner: "PrefectRunner", **flow_options: Any) -> Outcome:
-    """Make a dataset as a flow run, with its artifacts; `flow_options` are Prefect's."""
-    from prefect import flow
-
-    from pipeline.flows.prefect_runner import make_with_artifacts
-
-    def generate() -> Outcome:
-        return make_with_artifacts(options, runner)
-
-    return flow(name="generate-scenes", persist_result=False, **flow_options)(generate)()
-
-
-def _make(options: GenerateOptions, address: str) -> Outcome:
+    if address is None:
+        yield PrefectRunner(), {}
+        return
     try:
         from prefect_dask import DaskTaskRunner
     except ImportError as error:
@@ -74,14 +68,18 @@ def _make(options: GenerateOptions, address: str) -> Outcome:
             "--runner dask needs prefect-dask; expected it to be installed. Run pip install "
             "--requirement requirements/served.txt."
         ) from error
-    from pipeline.flows.prefect_runner import PrefectRunner
-
     with _client(address) as client:
-        threads = _threads(client, address)
+        workers: Mapping[str, Any] = client.scheduler_info(n_workers=-1)["workers"]
+        if not workers:
+            raise TrilightError(
+                f"--address {address}: the scheduler has no worker; expected some. Start them with "
+                "`dask worker ADDRESS --nthreads 1 --no-nanny`."
+            )
+        threads = [int(worker["nthreads"]) for worker in workers.values()]
         _require_shared(client, options)
     runner = PrefectRunner(window=_AHEAD * sum(threads), num_at_once=max(threads))
     try:
-        return _as_flow(options, runner, task_runner=DaskTaskRunner(address=address))
+        yield runner, {"task_runner": DaskTaskRunner(address=address)}
     finally:
         # the workers outlive the run; where the cluster is gone, so are its children
         with contextlib.suppress(TrilightError, OSError), _client(address) as client:
@@ -101,17 +99,6 @@ def _client(address: str) -> Iterator["Client"]:
         ) from error
     with client:
         yield client
-
-
-def _threads(client: "Client", address: str) -> list[int]:
-    """Return the number of threads of each worker of a cluster."""
-    workers: Mapping[str, Any] = client.scheduler_info(n_workers=-1)["workers"]
-    if not workers:
-        raise TrilightError(
-            f"--address {address}: the scheduler has no worker; expected some. Start them with "
-            "`dask worker ADDRESS --nthreads 1 --no-nanny`."
-        )
-    return [int(worker["nthreads"]) for worker in workers.values()]
 
 
 def _require_shared(client: "Client", options: GenerateOptions) -> None:

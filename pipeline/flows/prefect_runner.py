@@ -1,4 +1,4 @@
-"""`PrefectRunner`: runs a dataset's tasks as Prefect tasks; `RunArtifacts` shows them on its page.
+"""`PrefectRunner`: runs a dataset's tasks as Prefect tasks; `RunPage` shows them on its page.
 
 A task run is some minutes of scenes (pipeline.generation.generation_run), with retries after
 transient errors. Native code runs in our own child processes, never in a process pool of Prefect's,
@@ -38,14 +38,13 @@ from prefect.logging import get_run_logger
 from prefect.tasks import Task, exponential_backoff
 
 from pipeline.flows.prefect_server import DISK_LIMIT, GPU_LIMIT
-from pipeline.generation.generate_options import GenerateOptions
+from pipeline.generation.generate_options import PRICES, USD_PER_CORE_HOUR, GenerateOptions
 from pipeline.generation.generation_run import Outcome, Piece, Run, Runner, ShardJob, TaskResult
 from pipeline.generation.pipeline import make_dataset, make_task
-from pipeline.generation.price import PRICES, USD_PER_CORE_HOUR
 from storage.dataset.layout import dataset_folder
+from storage.dataset.progress import DatasetStatus, read_status
 from storage.dataset.statistics import Statistics
 from storage.errors import EnvironmentFailure, TrilightError
-from storage.records.objects import count_by_reason, read_failures
 from storage.remote.safe_url import safe_text
 
 
@@ -133,153 +132,117 @@ _SHEET_PX = 1024
 """Longest side of the contact sheet on the page: about 100 kB."""
 
 
-def make_with_artifacts(options: GenerateOptions, runner: Runner) -> Outcome:
-    """Make a dataset within a flow run and show its artifacts; the summary includes failures."""
+def make_with_page(options: GenerateOptions, runner: Runner) -> Outcome:
+    """Make a dataset within a flow run and show its progress; the summary includes failures."""
     # one line per scene; PREFECT_LOGGING_EXTRA_LOGGERS=trilight brings it to the server
     logging.getLogger("trilight").setLevel(logging.INFO)
-    watched = RunArtifacts(options)
+    page = RunPage(options.place)
     try:
-        outcome = make_dataset(options, runner, watched.record_task)
+        outcome = make_dataset(options, runner, page.record_task)
     except Exception as error:
-        watched.show_failure(error)
+        page.show_failure(error)
         raise
-    watched.show_result(outcome)
+    page.show_result(outcome.statistics)
     return outcome
 
 
-class ArtifactPage:
-    """The progress and the tables of a dataset on the page of a run; errors do not end the run."""
+class RunPage:
+    """What the page of a run shows of its dataset; an error of the page does not end the run."""
 
     def __init__(self, place: str) -> None:
-        """Create the first artifact of a run, for a dataset of a path or URL."""
+        """Create the first artifact of a run, for a dataset of a path or URL.
+
+        Raises:
+            TrilightError: TRILIGHT_USD_PER_CORE_HOUR is not a valid price.
+        """
         self._place = place
-        self._folder = dataset_folder(place)
-        self._progress: UUID | None = None
+        self._price = usd_per_core_hour()
+        self._rows: list[tuple[str, str]] = []
+        self._shown_s = -_EVERY_S
         self._log = get_run_logger()
         self._warned = False
-        self._show(self._begin)
+        # Prefect's functions return coroutines only where an event loop runs
+        begin = partial(create_progress_artifact, 0.0, key="shards", description=place)
+        self._progress = cast(UUID | None, self._show(begin))
 
-    def _show(self, show: Callable[[], object]) -> None:
-        """Show something; log the first error, and never raise."""
+    def record_task(self, run: Run, outcome: TaskResult) -> None:
+        """Log the shards of a finished task, and show the progress if it was shown long ago."""
+        for shard in outcome.shards:
+            self._log.info("shard %s: %d scenes", shard.name, shard.num_samples)
+        if time.monotonic() - self._shown_s >= _EVERY_S:
+            self._shown_s = time.monotonic()
+            self._show(lambda: self.show_status(read_status(self._place)))
+
+    def show_status(self, status: DatasetStatus) -> None:
+        """Show the progress of the dataset, if it has changed."""
+        remaining_s = status.remaining_s
+        rate = "unknown" if status.views_per_hour is None else f"{status.views_per_hour:.4g}"
+        remaining = "unknown" if remaining_s is None else f"{remaining_s / 60:.0f} minutes"
+        rows = [
+            ("scenes in shards", f"{status.scenes_done} of {status.scenes_planned}"),
+            ("views an hour", rate),
+            ("left at that rate", remaining),
+        ]
+        if rows != self._rows:
+            self._rows = rows
+            self._show(lambda: self._tell(status, "progress", rows))
+
+    def show_result(self, statistics: Statistics | None = None) -> None:
+        """Show the final counts, and the pictures of a finished dataset that are on this machine.
+
+        Args:
+            statistics: of the dataset, if this run has finished it.
+        """
+        self._show(lambda: self._sum_up(statistics))
+
+    def show_failure(self, error: Exception) -> None:
+        """Show why the run ended early; finished scenes stay on disk."""
+        what = safe_text(f"{type(error).__name__}: {error}".partition("\n")[0])
+        self._show(lambda: self._tell_table("summary", [("failed", what)]))
+
+    def _show(self, show: Callable[[], object]) -> object:
+        """Show something and return what that returns; log the first error, and never raise."""
         try:
-            show()
+            return show()
         except Exception as error:  # a server that is down for a moment must not cost hours of work
             if not self._warned:
                 self._warned = True
                 why = safe_text(str(error).partition("\n")[0])
                 self._log.warning("what this page shows is not complete (%s)", why)
+        return None
 
-    def _begin(self) -> None:
-        # Prefect's functions return coroutines only where an event loop runs
-        self._progress = cast(
-            UUID, create_progress_artifact(0.0, key="shards", description=self._place)
-        )
-
-    def _tell_percent(self, percent: float) -> None:
+    def _tell(self, status: DatasetStatus, key: str, more: Sequence[tuple[str, str]] = ()) -> None:
+        over = status.scenes_done + status.scenes_given_up
         if self._progress is not None:
+            percent = 100.0 * over / max(status.scenes_planned, 1)
             update_progress_artifact(self._progress, percent)
+        core_hours = status.core_hours or 0.0
+        rows = [
+            ("shards", f"{status.shards_done} of {status.shards_planned}"),
+            *more,
+            *((f"rejected: {why} ({stage})", str(count)) for stage, why, count in status.failures),
+            ("cost", f"{core_hours:.3f} core-hours, {core_hours * self._price:.2f} USD"),
+        ]
+        self._tell_table(key, rows)
 
     def _tell_table(self, key: str, rows: Sequence[tuple[str, str]]) -> None:
         table = [{"what": name, "value": value} for name, value in rows]
         create_table_artifact(table, key, description=self._place)
 
-    def _tell_sheet(self) -> None:
-        sheet = small_picture(self._folder.contact_sheet)
-        create_image_artifact(sheet, key="contact-sheet", description=self._place)
-
-
-class RunArtifacts(ArtifactPage):
-    """The artifacts of one flow run."""
-
-    def __init__(self, options: GenerateOptions) -> None:
-        """Create the first artifact of a run.
-
-        Raises:
-            TrilightError: TRILIGHT_USD_PER_CORE_HOUR is not a valid price.
-        """
-        self._price = usd_per_core_hour()
-        self._began: float | None = None  # the first scene; objects are prepared before
-        self._shown_s = -_EVERY_S
-        self._scenes = 0
-        self._core_s = 0.0
-        self._run: Run | None = None
-        super().__init__(options.place)
-
-    def record_task(self, run: Run, outcome: TaskResult) -> None:
-        """Record a finished task, and show a new table if the last one is old."""
-        now = time.monotonic()
-        if self._began is None and outcome.scenes:
-            self._began = now - outcome.seconds
-        self._run = run
-        self._scenes += outcome.scenes
-        self._core_s += outcome.core_s
-        for shard in outcome.shards:
-            self._log.info("shard %s: %d scenes", shard.name, shard.num_samples)
-        if now - self._shown_s >= _EVERY_S:
-            self._shown_s = now
-            self._show(lambda: self._tell(run))
-
-    def show_result(self, outcome: Outcome) -> None:
-        if (run := self._run) is not None:
-            self._show(lambda: self._tell(run))
-        self._show(lambda: self._sum_up(outcome))
-        done = outcome.num_shards
-        planned = outcome.num_shards_planned
-        self._log.info("%d of %d shards are there; digest %s", done, planned, outcome.digest)
-
-    def show_failure(self, error: Exception) -> None:
-        """Show why the run ended early; finished scenes stay on disk."""
-        what = safe_text(f"{type(error).__name__}: {error}".partition("\n")[0])
-        made = ("scenes of this run", str(self._scenes))
-        self._show(lambda: self._table("summary", [("failed", what), made]))
-
-    def scenes_per_s(self) -> float:
-        """Return scenes per second since this run's first scene began; 0 before one is made."""
-        return self._scenes / (time.monotonic() - self._began) if self._began is not None else 0.0
-
-    def _tell(self, run: Run) -> None:
-        writer = run.publication
-        of = writer.progress
-        done = of.scenes
-        planned = of.scenes_requested
-        per_s = self.scenes_per_s()
-        remaining = "unknown" if per_s == 0 else f"{(planned - done) / per_s / 60:.0f} minutes"
-        self._tell_percent(100.0 * done / planned)
-        self._table(
-            "progress",
-            [
-                ("shards", f"{of.shards} of {of.shards_requested}"),
-                ("scenes in shards", f"{done - of.given_up} of {planned}"),
-                ("views an hour", f"{3600 * per_s * writer.manifest.num_views:.0f}"),
-                ("left for this run alone", remaining),
-            ],
-        )
-
-    def _sum_up(self, outcome: Outcome) -> None:
-        done = outcome.num_shards
-        planned = outcome.num_shards_planned
-        self._tell_percent(100.0 * done / planned)
-        rows = [("shards", f"{done} of {planned}"), ("dataset digest", outcome.digest)]
-        rows += outcome.statistics.lines() if outcome.statistics else []
-        if outcome.statistics is None:
-            self._table("summary", rows)
-            return
+    def _sum_up(self, statistics: Statistics | None) -> None:
+        status = read_status(self._place)
+        rows = [("dataset digest", status.digest), *(statistics.lines() if statistics else ())]
         # Prefect's page cannot show files of the worker, only their path
-        self._table("summary", [*rows, ("report", f"{self._place}/report.html")])
-        if url := report_url(self._place):
+        report = [("report", f"{self._place}/report.html")] if status.finished else []
+        self._tell(status, "summary", [*rows, *report])
+        done = f"{status.shards_done} of {status.shards_planned}"
+        self._log.info("%s shards are there; digest %s", done, status.digest)
+        if status.finished and (url := report_url(self._place)):
             create_link_artifact(url, key="report", link_text="report")
-        self._tell_sheet()
-
-    def _table(self, key: str, rows: Sequence[tuple[str, str]]) -> None:
-        rejected = count_by_reason(read_failures(self._folder.failures))
-        core_hours = self._core_s / 3600
-        cost = f"{core_hours:.3f} core-hours, {core_hours * self._price:.2f} USD"
-        everything = [
-            *rows,
-            *((f"rejected: {reason} ({stage})", str(count)) for stage, reason, count in rejected),
-            ("cost of this run", cost),
-        ]
-        self._tell_table(key, everything)
+        sheet = dataset_folder(self._place).contact_sheet
+        if sheet.exists():
+            picture = small_picture(sheet)
+            create_image_artifact(picture, key="contact-sheet", description=self._place)
 
 
 def usd_per_core_hour() -> float:

@@ -7,7 +7,6 @@ only this run knows (pipeline.flows.guarded_server), and prints nothing. If PREF
 """
 
 import contextlib
-import http.client
 import io
 import json
 import os
@@ -18,8 +17,6 @@ import socket
 import subprocess
 import sys
 import time
-import urllib.error
-import urllib.request
 from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -239,14 +236,13 @@ def wait_until_healthy(
     began = time.monotonic()
     deadline = began + _START_UP_S
     next_sign = began + _SIGN_OF_LIFE_S
-    direct = urllib.request.build_opener(
-        urllib.request.ProxyHandler({})
-    )  # no proxy: it is on this machine
+    import httpx
+
     while time.monotonic() < deadline and server.poll() is None:
-        with contextlib.suppress(urllib.error.URLError, OSError, http.client.HTTPException):
-            with direct.open(f"{url}/health", timeout=2):
-                if server.poll() is None:  # else another server answered at this port
-                    return
+        with contextlib.suppress(httpx.HTTPError):  # no proxy: it is on this machine
+            answer = httpx.get(f"{url}/health", timeout=2, trust_env=False)
+            if answer.is_success and server.poll() is None:  # else another server answered here
+                return
         if (now := time.monotonic()) >= next_sign:
             next_sign = now + _SIGN_OF_LIFE_S
             say(f"the server is still starting: {now - began:.0f} of at most {_START_UP_S:.0f} s")

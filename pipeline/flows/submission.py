@@ -19,8 +19,9 @@ from prefect.client.schemas.filters import (
     FlowFilter,
     FlowFilterName,
 )
-from prefect.client.schemas.objects import FlowRun, WorkerStatus
+from prefect.client.schemas.objects import WorkerStatus
 from prefect.settings import get_current_settings
+from prefect.states import Pending
 
 from pipeline.flows.prefect_server import prefect_client
 from storage.errors import TrilightError
@@ -57,8 +58,6 @@ class RunStatus:
     """Finished shards in percent, 0 to 100."""
     tables: Mapping[str, Sequence[tuple[str, str]]]
     """Rows of the artifact `progress` and, at the end, of `summary`."""
-    is_final: bool
-    """True if the state will not change any more."""
     is_completed: bool
     """True if the run ended without an error."""
 
@@ -135,41 +134,32 @@ def poll_run(
     client: SyncPrefectClient, run: UUID, sleep: Callable[[float], None] = time.sleep
 ) -> Iterator[RunStatus]:
     """Poll a flow run; yield its status until it has ended."""
+    of_run = ArtifactFilter(flow_run_id=ArtifactFilterFlowRunId(any_=[run]))
     while True:
-        look = _read_status(client, client.read_flow_run(run))
-        yield look
-        if look.is_final:
+        state = client.read_flow_run(run).state or Pending()
+        artifacts = client.read_artifacts(artifact_filter=of_run)
+        percent = 0.0
+        tables: dict[str, Sequence[tuple[str, str]]] = {}
+        for artifact in sorted(artifacts, key=lambda artifact: str(artifact.updated)):
+            data: Any = artifact.data
+            if artifact.type == "progress":
+                percent = float(str(data))
+            elif artifact.type == "table" and artifact.key:
+                rows = json.loads(data) if isinstance(data, str) else data or []
+                named = [
+                    row for row in rows if {"what", "value"} <= set(row)
+                ]  # others are not ours
+                tables[artifact.key] = [(str(row["what"]), str(row["value"])) for row in named]
+        yield RunStatus(
+            state=state.name or state.type.value,
+            message=safe_text(state.message or ""),
+            percent=percent,
+            tables=tables,
+            is_completed=state.is_completed(),
+        )
+        if state.is_final():
             return
         sleep(POLL_S)
-
-
-def _read_status(client: SyncPrefectClient, run: FlowRun) -> RunStatus:
-    state = run.state
-    is_final = state is not None and state.is_final()
-    artifacts = client.read_artifacts(
-        artifact_filter=ArtifactFilter(flow_run_id=ArtifactFilterFlowRunId(any_=[run.id]))
-    )
-    in_order = sorted(artifacts, key=lambda artifact: str(artifact.updated))
-    bars = [artifact for artifact in in_order if artifact.type == "progress"]
-    tables = {
-        artifact.key: rows
-        for artifact in in_order
-        if artifact.type == "table" and artifact.key and (rows := _rows(artifact.data))
-    }
-    return RunStatus(
-        state=state.name or state.type.value if state else "Pending",
-        message=safe_text(state.message or "") if state else "",
-        percent=float(str(bars[-1].data)) if bars else 0.0,
-        tables=tables,
-        is_final=is_final,
-        is_completed=state is not None and state.is_completed(),
-    )
-
-
-def _rows(data: Any) -> list[tuple[str, str]]:
-    """Return the rows of a table with columns `what` and `value`; none of any other table."""
-    rows = json.loads(data) if isinstance(data, str) else data or []
-    return [(str(row["what"]), str(row["value"])) for row in rows if {"what", "value"} <= set(row)]
 
 
 def _nest_groups(changes: Mapping[str, Any]) -> dict[str, Any]:

@@ -4,6 +4,7 @@ Each file is decoded once, in a child with limits; the result is in the user's c
 its content decides the split of a texture or map, by the rule of objects.
 """
 
+import contextlib
 import logging
 from collections.abc import Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
@@ -48,24 +49,8 @@ class AcceptedMaps:
     """Reasons why other files cannot be used, or not fully."""
 
 
-NO_MAPS = AcceptedMaps()
-
-
-@dataclass(frozen=True, kw_only=True)
-class MapFolders:
-    """Folders of the user's textures and environment maps."""
-
-    folders: tuple[tuple[str, str], ...] = ()
-    """Pairs of a kind (TEXTURE or SKY) and a folder."""
-    licence: str | None = None
-    """Licence that the user states for folders without a catalogue."""
-
-
-NO_FOLDERS = MapFolders()
-
-
-def map_folders(options: GenerateOptions, settings: DatasetSettings) -> MapFolders:
-    """Return the folders of textures and maps that the options name.
+def map_folders(options: GenerateOptions, settings: DatasetSettings) -> Mapping[str, str]:
+    """Return the folders of textures and maps that the options name, by kind.
 
     Raises:
         TrilightError: a folder is given that no scene would use, or scenes need a folder that is
@@ -89,18 +74,17 @@ def map_folders(options: GenerateOptions, settings: DatasetSettings) -> MapFolde
                 f"{own_share:g}; expected both above 0. Add --set scenes.{name}.share=0.5 "
                 f"--set scenes.{name}.own_share=1, or leave --{name} out."
             )
-    return MapFolders(
-        folders=tuple((kind, entry[0]) for kind, entry in shares.items() if entry[0] is not None),
-        licence=options.map_licence,
-    )
+    return {kind: entry[0] for kind, entry in shares.items() if entry[0] is not None}
 
 
 def accept_maps(
-    user_folders: MapFolders, settings: DatasetSettings, *, workers: int
+    folders: Mapping[str, str], licence: str | None, settings: DatasetSettings, *, workers: int
 ) -> AcceptedMaps:
     """Prepare the textures and maps of folders.
 
     Args:
+        folders: a folder by kind, TEXTURE or SKY.
+        licence: licence that the user states for folders without a catalogue.
         workers: number of files that are decoded at the same time.
 
     Raises:
@@ -109,9 +93,9 @@ def accept_maps(
     """
     rows: list[tuple[LockedObject, Path]] = []
     failures: list[Failure] = []
-    for kind, folder in user_folders.folders:
+    for kind, folder in folders.items():
         listing = find_maps(
-            kind, folder, licence=user_folders.licence, allowed_licences=settings.allowed_licences
+            kind, folder, licence=licence, allowed_licences=settings.allowed_licences
         )
         outcomes = _prepare_maps(kind, listing.maps, settings, workers)
         usable = [outcome for outcome in outcomes if not isinstance(outcome, Failure)]
@@ -144,21 +128,26 @@ def _prepare_maps(
     scenes = settings.scenes
     size = scenes.textures.surfaces.size if kind == TEXTURE else scenes.skies.maps.height
     all_files = reach(files=(path for user_map in maps for path in user_map.files.values()))
-    pool = ChildPool(lambda _: IsolatedChild(limits=_LIMITS, confined_to=all_files), workers)
 
     def prepare(user_map: FoundMap) -> tuple[LockedObject, Path] | Failure:
         try:
             with pool.borrow() as child:
                 path = _prepare_file(kind, user_map.files, size, child)
-            return _lock_entry(kind, user_map, path, settings), path
+            data = path.read_bytes()
+            content_sha256 = decode_prepared(data, path.name).content_sha256
         except Rejected as rejection:
             return failure_of("objects", user_map.record.uid, rejection)
+        locked = LockedObject(
+            **user_map.record.identity,
+            asset_sha256=sha256_hex(data),
+            split=split_of_object(content_sha256, settings.splits),
+            kind=kind,
+        )
+        return locked, path
 
-    try:
-        with ThreadPoolExecutor(workers) as threads:
-            return list(threads.map(prepare, maps))
-    finally:
-        pool.close()
+    children = ChildPool(lambda _: IsolatedChild(limits=_LIMITS, confined_to=all_files), workers)
+    with contextlib.closing(children) as pool, ThreadPoolExecutor(workers) as threads:
+        return list(threads.map(prepare, maps))
 
 
 def _notes(prepared: Path) -> Path:
@@ -182,18 +171,6 @@ def _prepare_file(kind: str, files: Mapping[str, Path], size: int, child: Isolat
             write_atomically(_notes(path), message.encode())
         write_atomically(path, data)
     return path
-
-
-def _lock_entry(
-    kind: str, user_map: FoundMap, path: Path, settings: DatasetSettings
-) -> LockedObject:
-    data = path.read_bytes()
-    return LockedObject(
-        **user_map.record.identity,
-        asset_sha256=sha256_hex(data),
-        split=split_of_object(decode_prepared(data, path.name).content_sha256, settings.splits),
-        kind=kind,
-    )
 
 
 def _warn_of_maps(kind: str, locked: Sequence[LockedObject], lost: Sequence[Failure]) -> None:

@@ -12,7 +12,6 @@ import dataclasses
 import shutil
 import time
 from collections.abc import Iterable, Iterator, Mapping
-from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -21,7 +20,6 @@ from pipeline.renders.mitsuba_variant import device_of
 from pipeline.shards.pack_shards import (
     PLANNED,
     PublishedShards,
-    publish_plan,
     unpack_here,
 )
 from storage.atomic import write_atomically
@@ -71,22 +69,6 @@ _MAX_LOOKS = 7
 """Looks for a shard that a worker has packed; network file systems may show it a minute later."""
 
 
-@dataclass(kw_only=True)
-class DatasetProgress:
-    """Progress of the requested shards."""
-
-    shards: int = 0
-    """Finished shards among the requested ones."""
-    scenes: int = 0
-    """Scenes of the finished shards, given-up ones included."""
-    shards_requested: int = 0
-    """Shards that this run requested."""
-    scenes_requested: int = 0
-    """Scenes of the requested shards."""
-    given_up: int = 0
-    """Scenes of this run that could not be made; of all runs once the dataset is finished."""
-
-
 class DatasetWriter:
     """Writes the published files of a dataset to its store, together with its other workers.
 
@@ -105,8 +87,8 @@ class DatasetWriter:
         self.folder = folder
         self.manifest = manifest
         """Manifest of the dataset; it lists shards only once the dataset is finished."""
-        self.progress = DatasetProgress()
-        """Progress of the requested shards, at this worker's last look."""
+        self.given_up = 0
+        """Scenes of this run that could not be made; of all runs once the dataset is finished."""
         self.failures: list[Failure] = []
         """Rejections of this run's scenes, until the manifest lists their shards."""
         self.left_to_others = False
@@ -185,7 +167,7 @@ class DatasetWriter:
         lock = encode_objects_lock(objects)
         name = self.folder.objects_lock.name
         theirs = self.store.get(name)
-        with self._lock_manifest():
+        with self.hold_lock("manifest"):
             if theirs in (None, lock):
                 self._shards.merge_failures()
                 self.publish(self.folder.failures)
@@ -208,7 +190,7 @@ class DatasetWriter:
         head = self._shards.read_published_head()
         if head and head.objects_lock_sha256:
             self._shards.fetch_lock(head.objects_lock_sha256)
-            with self._lock_manifest():
+            with self.hold_lock("manifest"):
                 self._write(objects_lock_sha256=head.objects_lock_sha256)
 
     def add_shard(self, shard: ShardEntry) -> None:
@@ -217,29 +199,26 @@ class DatasetWriter:
         Raises:
             TrilightError: it is not here, so that its worker uses another folder.
         """
-        self._require_visible(shard.name)
+        number = number_of_shard(shard)
+        own_shard = range(number, number + 1)
+        for pause_s in (*(2**look for look in range(_MAX_LOOKS - 1)), 0):
+            if self.folder.has_shard(shard.name) or shard.name in self._finished_shards(own_shard):
+                break
+            time.sleep(pause_s)
+        else:
+            raise TrilightError(
+                f"{self.folder.display_name}: a worker has packed {shard.name}, and it is not "
+                "here: the worker's folder is not this one. Expected workers that see the same "
+                "--out at the same place (for a bucket, the same TRILIGHT_CACHE); share it, and "
+                "run this command again."
+            )
         failures = read_failures(rejections_of_shard(self.folder, shard.name))
         note = self._shards.publish(ShardNote(shard=shard, failures=tuple(failures)))
         if note is None:
             return
-        num_scenes = self._num_scenes([number_of_shard(note.shard)])
+        scenes = scenes_of_shard(number, self.splits)
         self.failures += note.failures
-        self.progress.shards += 1
-        self.progress.scenes += num_scenes
-        self.progress.given_up += num_scenes - note.shard.num_samples
-
-    def _require_visible(self, name: str) -> None:
-        number = int(name.removesuffix(".tar").rpartition("-")[2])
-        for look in range(_MAX_LOOKS):
-            is_here = self.folder.has_shard(name)
-            if is_here or name in self._finished_shards(range(number, number + 1)):
-                return
-            time.sleep(2**look if look < _MAX_LOOKS - 1 else 0)
-        raise TrilightError(
-            f"{self.folder.display_name}: a worker has packed {name}, and it is not here: the "
-            "worker's folder is not this one. Expected workers that see the same --out at the same "
-            "place (for a bucket, the same TRILIGHT_CACHE); share it, and run this command again."
-        )
+        self.given_up += len(scenes) - note.shard.num_samples
 
     def unfinished_shards(self, requested: range | None = None) -> list[int]:
         """Return the unfinished or growing shards among the requested ones; by default of all.
@@ -251,21 +230,11 @@ class DatasetWriter:
         self.refresh_plan()
         every = range(self.num_shards)
         selected = every if requested is None else every[requested.start : requested.stop]
-        missing = self._missing_shards(selected)
-        progress = self.progress
-        progress.shards_requested = len(selected)
-        progress.scenes_requested = self._num_scenes(selected)
-        progress.shards = len(selected) - len(missing)
-        progress.scenes = progress.scenes_requested - self._num_scenes(missing)
-        return missing
+        return self._missing_shards(selected)
 
     def _missing_shards(self, shards: range) -> list[int]:
         finished = self._finished_shards(shards)
         return [index for index in shards if shard_name(index, self._splits) not in finished]
-
-    def _num_scenes(self, shards: Iterable[int]) -> int:
-        splits = self.splits
-        return sum(len(scenes_of_shard(index, splits)) for index in shards)
 
     def _finished_shards(self, shards: range) -> set[str]:
         """Return the names of finished shards: at least all finished ones of a range."""
@@ -302,7 +271,7 @@ class DatasetWriter:
             if not self._is_complete():
                 return None
             self._wait_for_lister()
-            with self._lock_manifest():
+            with self.hold_lock("manifest"):
                 if not self._is_complete():  # another run has planned more
                     return None
                 listed = self._list_shards()
@@ -313,8 +282,7 @@ class DatasetWriter:
             has_new_plan = self.refresh_plan()
         self.failures = []
         self.manifest = listed
-        every = self._num_scenes(range(self.num_shards))
-        self.progress.given_up = every - listed.num_samples
+        self.given_up = listed.num_scenes - listed.num_samples
         return listed
 
     def _wait_for_lister(self) -> None:
@@ -366,7 +334,7 @@ class DatasetWriter:
         folder.staged_given_up.unlink(missing_ok=True)
         return listed
 
-    def extend(self, num_scenes: int) -> None:
+    def _extend(self, num_scenes: int) -> None:
         """Plan more scenes; call while holding the mutex of the manifest.
 
         A last shard that is not full grows from now on. While the mutex is held, each shard of a
@@ -383,15 +351,15 @@ class DatasetWriter:
                 growing.add(name)
         self._write(num_scenes=num_scenes, growing=tuple(sorted(growing)), documents={})
 
-    def refresh_plan(self) -> bool:
-        """Read the plans of other workers; return True if more scenes are planned than before."""
+    def refresh_plan(self, requested: int = 0) -> bool:
+        """Plan as many scenes as other workers, or as requested; return True if they are more."""
         before = self.manifest.num_scenes
         names = (name.removeprefix(PLANNED) for name in self.store.list(PLANNED))
         plans = {int(text) for text in names if text.isdecimal()}
         self.refresh()
-        if max(plans, default=0) > self.manifest.num_scenes:
-            with self._lock_manifest():
-                self.extend(max(*plans, self.manifest.num_scenes))
+        if (most := max(requested, *plans, 0)) > self.manifest.num_scenes:
+            with self.hold_lock("manifest"):
+                self._extend(max(most, self.manifest.num_scenes))
         splits = self.splits
         each = self._splits.scenes_per_shard
         last = () if splits.listed_shards else {plan // each for plan in plans if plan % each}
@@ -400,7 +368,7 @@ class DatasetWriter:
 
     def add_failures(self, failures: Iterable[Failure]) -> None:
         """Add rows to `failures.jsonl`, without duplicates."""
-        with self._lock_manifest():
+        with self.hold_lock("manifest"):
             self._add_failures(failures)
 
     def refresh(self) -> None:
@@ -418,8 +386,13 @@ class DatasetWriter:
         self.manifest = head
 
     @contextlib.contextmanager
-    def _lock_manifest(self) -> Iterator[None]:
-        with self.folder.mutex("manifest"):
+    def hold_lock(self, what: str) -> Iterator[None]:
+        """Hold the lock of a step that one worker does at a time, with the manifest as it is then.
+
+        Raises:
+            TrilightError: as `refresh`.
+        """
+        with self.folder.mutex(what):
             self.refresh()
             yield
 
@@ -463,7 +436,7 @@ def begin_or_resume_dataset(
     environment: Mapping[str, Any],
     num_scenes: int,
     *,
-    accept_environment: bool,
+    accept_environment: bool = False,
 ) -> DatasetWriter:
     """Begin a dataset in a folder or a bucket, or resume the one that is there.
 
@@ -497,12 +470,11 @@ def begin_or_resume_dataset(
         if is_new and not store.create_if_absent(folder.manifest.name, folder.manifest):
             PublishedShards(folder, store).adopt()  # another machine was first
         manifest = read_head(folder.manifest)
-        _require_same_dataset(folder, manifest, settings, environment, accept_environment)
-        writer = DatasetWriter(store, folder, manifest, settings.splits)
-        if num_planned > manifest.num_scenes:
-            writer.extend(num_planned)
-    publish_plan(store, writer.manifest.num_scenes)
-    writer.refresh_plan()
+    _require_same_dataset(folder, manifest, settings, environment, accept_environment)
+    if not store.is_here:  # in a folder the manifest says so
+        store.put(f"{PLANNED}{max(num_planned, manifest.num_scenes):012d}", b"\n")
+    writer = DatasetWriter(store, folder, manifest, settings.splits)
+    writer.refresh_plan(num_planned)
     return writer
 
 
@@ -515,8 +487,10 @@ def _require_same_dataset(
 ) -> None:
     _require_extendable(folder, manifest)
     stored = from_record(DatasetSettings, manifest.settings).as_json()  # fields may come later
-    _require_same(folder, "setting", stored, settings.as_json(), "choose another --out")
-    if not accept_environment:
+    differing = list(differences(stored, settings.as_json()))
+    what = "setting"
+    next_step = "choose another --out"
+    if not (differing or accept_environment):
         before = device_of(manifest.environment)
         now = device_of(environment)
         if before != now:
@@ -525,13 +499,18 @@ def _require_same_dataset(
                 f"go on with a {now.upper()}; choose --device {before} or another --out, or accept "
                 "pictures that agree only within their stated errors with --accept-environment."
             )
-        _require_same(
-            folder,
-            "environment",
-            manifest.environment,
-            environment,
-            "choose another --out, or accept pictures that agree only within their noise "
-            "floors with --accept-environment",
+        differing = list(differences(manifest.environment, environment))
+        what = "environment"
+        next_step += (
+            ", or accept pictures that agree only within their noise floors with "
+            "--accept-environment"
+        )
+    if differing:
+        name, old, new = differing[0]
+        more = f" (and {len(differing) - 1} more)" if len(differing) > 1 else ""
+        raise TrilightError(
+            f"{folder.display_name}: this dataset was begun with another {what}: {name} was "
+            f"{old!r}, now {new!r}{more}; {next_step}."
         )
 
 
@@ -549,20 +528,3 @@ def _require_free(folder: DatasetFolder, store: Store) -> None:
                 f"{folder.display_name}: {path.name} is there, and the dataset's own would replace "
                 "it; expected an empty folder or a dataset. Choose another --out."
             )
-
-
-def _require_same(
-    folder: DatasetFolder,
-    what: str,
-    before: Mapping[str, Any],
-    now: Mapping[str, Any],
-    next_step: str,
-) -> None:
-    differing = list(differences(before, now))
-    if differing:
-        name, old, new = differing[0]
-        more = f" (and {len(differing) - 1} more)" if len(differing) > 1 else ""
-        raise TrilightError(
-            f"{folder.display_name}: this dataset was begun with another {what}: {name} was "
-            f"{old!r}, now {new!r}{more}; {next_step}."
-        )

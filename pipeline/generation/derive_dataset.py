@@ -83,7 +83,7 @@ class Selection:
 class SelectedScene:
     """One scene of the new dataset."""
 
-    source: int  # number of its source, from 0
+    source: FinishedDataset
     facts: SceneFacts  # its facts in the source
     key: str  # its new key
 
@@ -109,16 +109,16 @@ def select_scenes(
     names = {*value_names, *(where.names if where else ())}
     selected: list[SelectedScene] = []
     seen: dict[str, SelectedScene] = {}
-    for row, source in enumerate(sources):
+    for source, offset in zip(sources, offsets, strict=True):
         for facts in read_facts(source, names=names, shard_done=shard_done):
             if not selection.takes(facts) or not (where is None or where.holds(facts.values)):
                 continue
-            entry = SelectedScene(source=row, facts=facts, key=offset_key(facts.key, offsets[row]))
+            entry = SelectedScene(source=source, facts=facts, key=offset_key(facts.key, offset))
             first = seen.setdefault(facts.arrays_sha256, entry)
-            if first.source != row:
+            if first.source is not source:
                 raise TrilightError(
                     f"scene {facts.key} of {source.folder.root} is scene {first.facts.key} of "
-                    f"{sources[first.source].folder.root}; expected each scene once. Leave one of "
+                    f"{first.source.folder.root}; expected each scene once. Leave one of "
                     "the datasets out, or generate it with another --seed."
                 )
             selected.append(entry)
@@ -134,16 +134,12 @@ def key_offsets(sources: Sequence[FinishedDataset]) -> list[int]:
     following = 0
     for source in sources:
         offsets.append(following)
-        following += max(_last_key(source) + 1, source.manifest.num_scenes)
+        last = -1
+        if derivation_of(source.manifest.settings):  # else keys are indices
+            keys = (key for shard in source.manifest.shards for key in source.keys(shard))
+            last = max((int(key) for key in keys if key.isdecimal()), default=-1)
+        following += max(last + 1, source.manifest.num_scenes)
     return offsets
-
-
-def _last_key(source: FinishedDataset) -> int:
-    """Return the largest key of a derived dataset; -1 for a generated one (keys are indices)."""
-    if not derivation_of(source.manifest.settings):
-        return -1
-    keys = (key for shard in source.manifest.shards for key in source.keys(shard))
-    return max((int(key) for key in keys if key.isdecimal()), default=-1)
 
 
 def offset_key(key: str, offset: int) -> str:
@@ -155,9 +151,7 @@ def offset_key(key: str, offset: int) -> str:
     return sample_key(int(key) + offset)
 
 
-def used_objects(
-    sources: Sequence[FinishedDataset], selected: Sequence[SelectedScene]
-) -> list[LockedObject]:
+def used_objects(selected: Sequence[SelectedScene]) -> list[LockedObject]:
     """Return the locked objects that the selected scenes use.
 
     Raises:
@@ -167,7 +161,7 @@ def used_objects(
     splits: dict[str, tuple[str, SelectedScene]] = {}
     used: dict[LockedObject, None] = {}
     for entry in selected:
-        source = sources[entry.source]
+        source = entry.source
         for uid in entry.facts.uids:
             if uid not in source.objects:
                 raise TrilightError(
@@ -179,23 +173,17 @@ def used_objects(
                 for name in (f"uid {uid}", f"asset {locked.asset_sha256}"):
                     split, first = splits.setdefault(name, (entry.facts.shard.split, entry))
                     if split != entry.facts.shard.split:
-                        raise TrilightError(_leak(uid, sources, first, entry))
+                        places = " and in ".join(
+                            f"{each.facts.shard.split} of {each.source.folder.root} (scene "
+                            f"{each.facts.key})"
+                            for each in (first, entry)
+                        )
+                        raise TrilightError(
+                            f"object {uid!r} is in {places}; expected every object in one split "
+                            "only. Generate both with the same splits.held_out_objects, or take "
+                            "one split of each with `trilight shards select` first."
+                        )
     return list(used)
-
-
-def _leak(
-    uid: str, sources: Sequence[FinishedDataset], first: SelectedScene, second: SelectedScene
-) -> str:
-    places = " and in ".join(
-        f"{entry.facts.shard.split} of {sources[entry.source].folder.root} (scene "
-        f"{entry.facts.key})"
-        for entry in (first, second)
-    )
-    return (
-        f"object {uid!r} is in {places}; expected every object in one split only. Generate both "
-        "with the same splits.held_out_objects, or take one split of each with `trilight shards "
-        "select` first."
-    )
 
 
 def even_shards(
@@ -256,15 +244,15 @@ def list_scenes(
         value_names=(*_TEXTS, *_COLUMNS),
         shard_done=lambda: progress(next(done), total),
     )
-    return [{"key": entry.key, **_row(entry.facts.values)} for entry in selected]
-
-
-def _row(values: Mapping[str, Any]) -> dict[str, object]:
-    row: dict[str, object] = {name: values[name] for name in _TEXTS}
-    for name, (column, of_several) in _COLUMNS.items():
-        number = round(float(of_several(values[name])), QUANTITIES[name].digits)
-        row[column] = number if QUANTITIES[name].digits else int(number)
-    return row
+    rows = []
+    for entry in selected:
+        values = entry.facts.values
+        row: dict[str, object] = {"key": entry.key, **{name: values[name] for name in _TEXTS}}
+        for name, (column, of_several) in _COLUMNS.items():
+            number = round(float(of_several(values[name])), QUANTITIES[name].digits)
+            row[column] = number if QUANTITIES[name].digits else int(number)
+        rows.append(row)
+    return rows
 
 
 Operation = Literal["merge", "select", "reshard"]
@@ -327,7 +315,7 @@ def derive_shards(
         num_scenes = sum(source.manifest.num_samples for source in sources)
         raise TrilightError(f"none of the {num_scenes} scenes is selected; expected at least one.")
     objects = sorted(
-        used_objects(sources, selected), key=lambda row: canonical_json(dataclasses.asdict(row))
+        used_objects(selected), key=lambda row: canonical_json(dataclasses.asdict(row))
     )
     groups, scenes_per_shard = _group_scenes(sources, derive, selected)
     write_objects_lock(out.objects_lock, objects)
@@ -335,7 +323,7 @@ def derive_shards(
     shards = []
     for number, group in enumerate(groups):
         name = named_shard(number, group[0].facts.shard.split)
-        write_shard(out.shard(name), _samples(sources, group))
+        write_shard(out.shard(name), _samples(group))
         shards.append(index_shard(out.shard(name)))
         progress(next(done), total + len(groups))
     derivation = Derivation(
@@ -355,7 +343,7 @@ def _group_scenes(
 ) -> tuple[list[list[SelectedScene]], int | None]:
     """Return the scenes of each new shard, and the shard size if it is not the sources'."""
     if derive.operation == "merge":
-        groups: dict[tuple[int, str], list[SelectedScene]] = {}
+        groups: dict[tuple[FinishedDataset, str], list[SelectedScene]] = {}
         for entry in selected:
             groups.setdefault((entry.source, entry.facts.shard.name), []).append(entry)
         return list(groups.values()), None
@@ -365,15 +353,12 @@ def _group_scenes(
     return even_shards(selected, size), size
 
 
-def _samples(
-    sources: Sequence[FinishedDataset], group: Sequence[SelectedScene]
-) -> Iterator[tuple[str, Mapping[str, bytes]]]:
-    for (source, _), entries in itertools.groupby(
-        group, key=lambda entry: (entry.source, entry.facts.shard.name)
+def _samples(group: Sequence[SelectedScene]) -> Iterator[tuple[str, Mapping[str, bytes]]]:
+    for (source, shard), entries in itertools.groupby(
+        group, key=lambda entry: (entry.source, entry.facts.shard)
     ):
-        first, *following = entries
-        with sources[source].open_shard(first.facts.shard, checked=True) as opened:
-            for entry in (first, *following):
+        with source.open_shard(shard, checked=True) as opened:
+            for entry in entries:
                 yield entry.key, opened.members(entry.facts.key)
 
 
@@ -384,26 +369,22 @@ def _manifest(
     shards: tuple[ShardEntry, ...],
 ) -> Manifest:
     manifests = [source.manifest for source in sources]
+    environments = [dict(manifest.environment) for manifest in manifests]
+    environment: Mapping[str, Any] = environments[0]
+    if any(other != environment for other in environments):
+        environment = {**common(environments), "of_sources": environments}
     builds = {manifest.build for manifest in manifests}
     return dataclasses.replace(
         manifests[0],
         build=builds.pop() if len(builds) == 1 else "merged",
         settings=settings,
-        environment=_environment(manifests),
+        environment=environment,
         extensions=_extensions(manifests),
         num_scenes=sum(shard.num_samples for shard in shards),
         schema_version=MANIFEST_VERSION,
         objects_lock_sha256=sha256_hex(encode_objects_lock(objects)),
         shards=shards,
     )
-
-
-def _environment(manifests: Sequence[Manifest]) -> Mapping[str, Any]:
-    """Return the common environment of all sources; if they differ, also that of each."""
-    environments = [dict(manifest.environment) for manifest in manifests]
-    if all(environment == environments[0] for environment in environments):
-        return environments[0]
-    return {**common(environments), "of_sources": environments}
 
 
 def _extensions(manifests: Sequence[Manifest]) -> Mapping[str, str]:
@@ -426,12 +407,12 @@ def _failures(
     keys = {(entry.source, entry.facts.key) for entry in selected}
     held = sum(source.manifest.num_samples for source in sources)
     rows = []
-    for row, (source, offset) in enumerate(zip(sources, offsets, strict=True)):
+    for source, offset in zip(sources, offsets, strict=True):
         for failure in source.failures():
             key, dot, view = failure.item.partition(".")
             if failure.stage not in ("scenes", "renders"):
                 rows.append(failure)
-            elif (row, key) in keys or held == len(selected):
+            elif (source, key) in keys or held == len(selected):
                 item = f"{offset_key(key, offset)}{dot}{view}"
                 rows.append(dataclasses.replace(failure, item=item))
     return rows
@@ -472,7 +453,7 @@ def derive_dataset(
         The dataset digest, and the statistics of the dataset.
 
     Raises:
-        TrilightError: as `pipeline.shards.derive.derive_shards`, or `out` is not empty.
+        TrilightError: as `derive_shards`, or `out` is not empty.
     """
     out = Path(os.path.realpath(out))
     if out.exists() and (not out.is_dir() or any(out.iterdir())):

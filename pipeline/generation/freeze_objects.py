@@ -6,21 +6,15 @@ The frozen objects are the pool that its scenes draw from, equal for all workers
 import logging
 import shutil
 import threading
-from collections.abc import Callable, Sequence
-from dataclasses import dataclass, replace
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, field, replace
 from operator import attrgetter
 from pathlib import Path
 
 from pipeline.assets.stage import PreparedObject
-from pipeline.generation.accept_maps import (
-    NO_FOLDERS,
-    NO_MAPS,
-    AcceptedMaps,
-    MapFolders,
-    accept_maps,
-)
+from pipeline.generation.accept_maps import AcceptedMaps, accept_maps
 from pipeline.generation.dataset_writer import DatasetWriter
-from pipeline.generation.frozen_pool import ComposedScenes
+from pipeline.generation.frozen_pool import ComposedScenes, require_same
 from pipeline.generation.object_batches import (
     ObjectWork,
     PrepareResult,
@@ -28,7 +22,7 @@ from pipeline.generation.object_batches import (
     prepare_in_batches,
 )
 from pipeline.generation.prepare_isolated import format_unread, write_unread
-from pipeline.generation.revisited_scenes import AcceptedObjects
+from pipeline.generation.scene_origins import AcceptedObjects
 from pipeline.isolation import is_transient
 from pipeline.objects.sources import ListedObjects, list_objects
 from pipeline.presets.settings import DatasetSettings
@@ -66,8 +60,10 @@ class ObjectLock:
     """Writer of the dataset that the objects are frozen for."""
     workers: int
     """Number of objects that are prepared at the same time."""
-    user_folders: MapFolders = NO_FOLDERS
-    """Folders of textures and maps, which are frozen with the objects."""
+    map_folders: Mapping[str, str] = field(default_factory=dict)
+    """Folders of textures and maps by kind, which are frozen with the objects."""
+    map_licence: str | None = None
+    """Licence that the user states for these folders where they have no catalogue."""
 
     def accept(self) -> AcceptedObjects:
         """Return the frozen objects; prepare and freeze them with the other workers if need be.
@@ -78,8 +74,7 @@ class ObjectLock:
         if trusted := self.load():
             return trusted
         listed = self.prepare()
-        with self.writer.folder.mutex("objects"):  # one worker freezes, and the others load it
-            self.writer.refresh()
+        with self.writer.hold_lock("objects"):  # one worker freezes, and the others load it
             return self.freeze(listed)
 
     def load(self) -> AcceptedObjects | None:
@@ -102,8 +97,7 @@ class ObjectLock:
         known = facts.lock_sha256, facts.lock_bytes, facts.asked
         if known != (self.writer.manifest.objects_lock_sha256, lock.num_bytes, self._digest):
             return None
-        accepted_maps = accept_maps(self.user_folders, self.settings, workers=self.workers)
-        maps = tuple(row for row in accepted_maps.rows if lock.find(row[0].uid) == row[0])
+        maps = tuple(row for row in self._accept_maps().rows if lock.find(row[0].uid) == row[0])
         if len(maps) != facts.num_maps:  # the long way says which one has changed
             return None
         return self._frozen_inputs(facts.num_objects, facts.num_found, maps)
@@ -118,8 +112,7 @@ class ObjectLock:
             TrilightError: as `list_objects` and `prepare_in_batches`.
         """
         folder = self.writer.folder
-        with folder.mutex("objects"):  # one worker writes built-in objects, the others load them
-            self.writer.refresh()
+        with self.writer.hold_lock("objects"):  # one writes built-in objects, the others load them
             self.writer.fetch_lock()
             if self.writer.frozen_objects() is not None:
                 return None
@@ -149,12 +142,12 @@ class ObjectLock:
         frozen = self.writer.frozen_objects()
         shared = listed is not None
         listed = listed or self._list_source()
-        maps = accept_maps(self.user_folders, self.settings, workers=self.workers)
+        maps = self._accept_maps()
         selected = listed.allowed
         if frozen is not None:
             maps = replace(maps, rows=tuple(row for row in maps.rows if row[0].uid in frozen))
             of_maps = {uid: entry for uid, entry in frozen.items() if entry.kind != OBJECT}
-            require_same(safe_url(self.source), of_maps, [entry for entry, _ in maps.rows])
+            require_same(self._display_name, of_maps, [entry for entry, _ in maps.rows])
             # whole batches: one that holds a frozen object may be prepared already
             batches = cut_objects(sorted(selected, key=attrgetter("uid")))
             batches = [batch for batch in batches if any(one.uid in frozen for one in batch)]
@@ -177,7 +170,7 @@ class ObjectLock:
         prepared: list[PreparedObject],
         rejected: list[Failure],
         num_found: int,
-        maps: AcceptedMaps = NO_MAPS,
+        maps: AcceptedMaps,
     ) -> AcceptedObjects:
         """Freeze the objects in the first run; in later runs require that they are the same.
 
@@ -191,17 +184,33 @@ class ObjectLock:
             EnvironmentFailure: a frozen object could not be prepared this time.
         """
         writer = self.writer
-        display_name = safe_url(self.source)
+        display_name = self._display_name
         frozen = writer.frozen_objects()
         transient = [failure for failure in rejected if is_transient(failure.reason)]
         if frozen is not None:
             for failure in transient:
                 require_tried(display_name, failure)
         writer.add_failures([*rejected, *maps.failures])
-        objects = [self._lock_entry(asset) for asset in prepared]
+        objects = [
+            LockedObject(
+                **asset.record.identity,
+                asset_sha256=asset.asset_sha256,
+                split=split_of_object(asset.geometry_sha256, self.settings.splits),
+            )
+            for asset in prepared
+        ]
         locked = [*objects, *(entry for entry, _ in maps.rows)]
         if frozen is None:
-            self._require_enough(objects)
+            if not objects:
+                raise TrilightError(
+                    f"{display_name}: none was accepted; expected at least one usable object with "
+                    f"an allowed licence. The reasons are in {writer.folder.failures}."
+                )
+            shards = range(writer.num_shards)
+            require_objects(
+                {split: sum(entry.split == split for entry in objects) for split in SPLITS},
+                {split_of_shard(index, self.settings.splits) for index in shards},
+            )
             self._warn(prepared, transient)
             writer.lock_objects(locked)
         else:
@@ -211,11 +220,11 @@ class ObjectLock:
 
     def _warn(self, prepared: list[PreparedObject], transient: list[Failure]) -> None:
         """Log what the accepted objects lack, and which others may be tried again."""
-        display_name = safe_url(self.source)
+        display_name = self._display_name
         if transient:
             counts = (f"{count} x {why}" for _, why, count in count_by_reason(transient))
             log.warning(
-                "objects %r: %d could not be prepared this time (%s), each after several tries, "
+                "%s: %d could not be prepared this time (%s), each after several tries, "
                 "and the dataset is begun without them; failures.jsonl names them. A dataset begun "
                 "later tries them again.",
                 display_name,
@@ -231,7 +240,7 @@ class ObjectLock:
             path = write_unread(self.writer.folder.logs, notes, name)
             if notes:
                 log.warning(
-                    "objects %r: %d of %d %s:\n%s",
+                    "%s: %d of %d %s:\n%s",
                     display_name,
                     len(notes),
                     len(prepared),
@@ -256,6 +265,13 @@ class ObjectLock:
     def _digest(self) -> str:
         """Digest of source and licence: with another one, every object is checked again."""
         return sha256_hex(canonical_json([self.source, self.licence]))
+
+    @property
+    def _display_name(self) -> str:
+        return f"objects {safe_url(self.source)!r}"
+
+    def _accept_maps(self) -> AcceptedMaps:
+        return accept_maps(self.map_folders, self.map_licence, self.settings, workers=self.workers)
 
     def _list_source(self) -> ListedObjects:
         return list_objects(
@@ -298,27 +314,6 @@ class ObjectLock:
             retry_transient=retry_transient,
         )
 
-    def _lock_entry(self, asset: PreparedObject) -> LockedObject:
-        return LockedObject(
-            **asset.record.identity,
-            asset_sha256=asset.asset_sha256,
-            split=split_of_object(asset.geometry_sha256, self.settings.splits),
-        )
-
-    def _require_enough(self, locked: list[LockedObject]) -> None:
-        if not locked:
-            raise TrilightError(
-                f"objects {safe_url(self.source)!r}: none was accepted; expected at least one "
-                "usable object with an allowed licence. The reasons are in "
-                f"{self.writer.folder.failures}."
-            )
-        shards = range(self.writer.num_shards)
-        splits_in_use = {split_of_shard(index, self.settings.splits) for index in shards}
-        require_objects(
-            {split: sum(entry.split == split for entry in locked) for split in SPLITS},
-            splits_in_use,
-        )
-
     def _write_index(
         self, locked: list[LockedObject], prepared: list[PreparedObject], num_found: int
     ) -> None:
@@ -358,29 +353,11 @@ _DRAWN = (
 )
 
 
-def require_tried(source: str, failure: Failure) -> None:
+def require_tried(display_name: str, failure: Failure) -> None:
     """Raise EnvironmentFailure if a frozen object failed for a transient reason."""
     if is_transient(failure.reason):
         raise EnvironmentFailure(
-            f"objects {source!r}: {failure.item!r}, which the dataset was begun with, could not be "
+            f"{display_name}: {failure.item!r}, which the dataset was begun with, could not be "
             f"prepared this time ({failure.reason}: {failure.message}). Nothing has changed; run "
             "the same command again."
         )
-
-
-def object_changed_error(source: str, uid: str, state: str) -> TrilightError:
-    """Return the error of a frozen object that its source has lost or changed."""
-    return TrilightError(
-        f"objects {source!r}: {uid!r} {state}; expected the objects that the dataset was begun "
-        "with (objects.lock.jsonl). Restore it, name the source that has it by --objects, or "
-        "choose another --out."
-    )
-
-
-def require_same(source: str, frozen: dict[str, LockedObject], now: list[LockedObject]) -> None:
-    """Raise TrilightError if a frozen row is missing or differs now."""
-    by_uid = {entry.uid: entry for entry in now}
-    for uid, entry in frozen.items():
-        if by_uid.get(uid) != entry:
-            state = "has changed" if uid in by_uid else "is missing or no longer usable"
-            raise object_changed_error(source, uid, state)

@@ -6,11 +6,11 @@ open. If an object's file is missing on this machine, the worker prepares it aga
 (`pipeline.generation.render_workers.restore_object`).
 """
 
-from collections import OrderedDict
-from collections.abc import Iterable, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
-from functools import partial
+from functools import lru_cache, partial
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -77,7 +77,7 @@ class SplitPool(Sequence[PooledAsset]):
         self._split = split
         self._lock = LockRows(frozen.lock)
         self._store = store
-        self._open: OrderedDict[int, PooledAsset] = OrderedDict()
+        self._open = lru_cache(_MOST_OPEN)(self._read)
 
     def __len__(self) -> int:
         return len(self._offsets)
@@ -91,12 +91,7 @@ class SplitPool(Sequence[PooledAsset]):
         """
         if not 0 <= row < len(self):
             raise IndexError(row)
-        if row not in self._open:
-            self._open[row] = self._read(row)
-            if len(self._open) > _MOST_OPEN:
-                self._open.popitem(last=False)
-        self._open.move_to_end(row)
-        return self._open[row]
+        return self._open(row)
 
     def _read(self, row: int) -> PooledAsset:
         locked = self._lock.at(int(self._offsets[row : row + 1][0]))
@@ -130,27 +125,24 @@ def user_maps(rows: Iterable[tuple[LockedObject, Path]], split: str) -> OwnMaps:
         ((locked, path) for locked, path in rows if locked.split == split),
         key=lambda pair: pair[0].uid,
     )
-    return OwnMaps(
-        textures=[
-            UserMap(uid=locked.uid, source=_source(locked), load=partial(_texture, path))
-            for locked, path in of_split
-            if locked.kind == TEXTURE
-        ],
-        skies=[
-            UserMap(uid=locked.uid, source=_source(locked), load=partial(_radiance, path))
-            for locked, path in of_split
-            if locked.kind == SKY
-        ],
-    )
 
+    def maps_of(kind: str, load: Callable[[Path], Any]) -> list[UserMap[Any]]:
+        return [
+            UserMap(
+                uid=locked.uid,
+                source=MapSource(
+                    name=locked.title,
+                    licence=locked.licence,
+                    attribution=locked.attribution,
+                    source_url=locked.source_url,
+                ),
+                load=partial(load, path),
+            )
+            for locked, path in of_split
+            if locked.kind == kind
+        ]
 
-def _source(locked: LockedObject) -> MapSource:
-    return MapSource(
-        name=locked.title,
-        licence=locked.licence,
-        attribution=locked.attribution,
-        source_url=locked.source_url,
-    )
+    return OwnMaps(textures=maps_of(TEXTURE, _texture), skies=maps_of(SKY, _radiance))
 
 
 def _texture(path: Path) -> UserTexture:
@@ -160,3 +152,23 @@ def _texture(path: Path) -> UserTexture:
 
 def _radiance(path: Path) -> NDArray[np.float32]:
     return decode_prepared(path.read_bytes(), path.name).arrays["radiance"]
+
+
+def changed_error(display_name: str, uid: str, state: str) -> TrilightError:
+    """Return the error of a frozen object or file that its source has lost or changed."""
+    return TrilightError(
+        f"{display_name}: {uid!r} {state}; expected what the dataset was begun with "
+        "(objects.lock.jsonl). Restore it, name the source that has it by --objects or "
+        "--scenes-from, or choose another --out."
+    )
+
+
+def require_same(
+    display_name: str, frozen: Mapping[str, LockedObject], now: Sequence[LockedObject]
+) -> None:
+    """Raise TrilightError if a row differs from the frozen one, is missing, or is new."""
+    by_uid = {entry.uid: entry for entry in now}
+    for uid in sorted({*frozen, *by_uid}):
+        if frozen.get(uid) != by_uid.get(uid):
+            state = "has changed" if uid in by_uid else "is missing or no longer usable"
+            raise changed_error(display_name, uid, state if uid in frozen else "is new")

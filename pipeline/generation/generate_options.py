@@ -6,7 +6,8 @@ from dataclasses import field
 from typing import Annotated, Any
 
 from pipeline.exchange.from_description import AlbedoOverOne
-from pipeline.presets.registry import DATASET_PRESETS
+from pipeline.presets.registry import DATASET_PRESETS, preset_settings
+from pipeline.presets.settings import DatasetSettings
 from pipeline.renders.mitsuba_variant import Device
 from pipeline.renders.settings import NoiseFloor, NoiseTargets, Resolution
 from storage.dataset.layout import dataset_folder
@@ -19,8 +20,27 @@ from storage.settings.overrides import option_words
 from storage.settings.ranges import Seed, Share, Within
 
 _RANGE = re.compile(r"(\d+):(\d+)")
+_OF_COMPOSED = ("objects", "scenes", "textures", "skies")
+_EXCLUDED = {"scenes_from": _OF_COMPOSED, "revisits": (*_OF_COMPOSED, "scenes_from")}
+"""Options that cannot be given with an option, as that one says what scenes are made of."""
+_NEEDS = {"map_licence": ("textures", "skies"), "views": ("scenes_from",)}
+"""Options of which one must be given with an option."""
 _PER_MACHINE = ("build", "out", "shards", "workers")
 """Fields that differ from machine to machine: folder, range of shards, number of processes."""
+
+
+USD_PER_CORE_HOUR = 0.04
+"""Default price of a core-hour."""
+PRICES = Within(0, 1000, unit="USD per core-hour")
+"""Range of prices; its upper end is ten thousand times the usual rent of a core."""
+
+
+@checked()
+class CorePrice:
+    """The price of computing."""
+
+    price: Annotated[float, PRICES] = USD_PER_CORE_HOUR
+    """Price of one core for an hour, in USD."""
 
 
 @checked()
@@ -94,20 +114,20 @@ class GenerateOptions:
 
     def __post_init__(self) -> None:
         DATASET_PRESETS.find(self.build)
-        objects_and_scenes = (self.objects, self.scenes)
-        if self.scenes_from is not None and objects_and_scenes != (None, None):
-            raise TrilightError(
-                f"--scenes-from {self.scenes_from} was given with --objects or --scenes; expected "
-                "neither: the files say both."
-            )
-        if self.revisits is not None and (*objects_and_scenes, self.scenes_from) != (None,) * 3:
-            raise TrilightError(
-                f"--revisits {self.revisits} was given with --objects, --scenes or --scenes-from; "
-                "expected none of them: the dataset says all."
-            )
-        _refuse_maps(self)
-        if self.scenes_from is None and self.views is not None:
-            raise TrilightError(f"--views is {self.views}; expected it only with --scenes-from.")
+        stated = [name for name, value in vars(self).items() if value is not None]
+        for name, excluded in _EXCLUDED.items():
+            if name in stated and (wrong := [other for other in excluded if other in stated]):
+                raise TrilightError(
+                    f"{_flag(name)} {getattr(self, name)} was given with "
+                    f"{' and '.join(map(_flag, wrong))}; expected it without: it says what scenes "
+                    "are made of. Leave one out."
+                )
+        for name, necessary in _NEEDS.items():
+            if name in stated and not {*necessary} & {*stated}:
+                raise TrilightError(
+                    f"{_flag(name)} is {getattr(self, name)!r}; expected it only with "
+                    f"{' or '.join(map(_flag, necessary))}."
+                )
         dataset_folder(self.place)
         self.shard_range()
 
@@ -117,6 +137,25 @@ class GenerateOptions:
             log_db=self.noise_floor_db,
             linear_db=self.noise_floor_linear_db,
             objects_db=self.noise_floor_objects_db,
+        )
+
+    @property
+    def num_scenes(self) -> int:
+        return DATASET_PRESETS[self.build].num_scenes if self.scenes is None else self.scenes
+
+    def settings(self) -> DatasetSettings:
+        """Return the preset's settings with the changes of these options.
+
+        Raises:
+            TrilightError: values contradict each other.
+        """
+        return preset_settings(
+            self.build,
+            seed=self.seed,
+            resolution=self.resolution,
+            noise_targets=self.noise_targets,
+            allow_licences=self.allow_licences,
+            changes=self.changes,
         )
 
     @property
@@ -140,19 +179,8 @@ class GenerateOptions:
         return range(int(match[1]), int(match[2]))
 
 
-def _refuse_maps(options: GenerateOptions) -> None:
-    """Raise if map folders are given for scenes that are not composed, or a licence without any."""
-    for name, value in (("--textures", options.textures), ("--skies", options.skies)):
-        if value is not None and (options.scenes_from or options.revisits):
-            raise TrilightError(
-                f"{name} was given with --scenes-from or --revisits; expected it only where scenes "
-                "are composed. Leave it out."
-            )
-    if options.map_licence is not None and options.textures is None and options.skies is None:
-        raise TrilightError(
-            f"--map-licence is {options.map_licence!r}; expected it only with --textures or "
-            "--skies."
-        )
+def _flag(name: str) -> str:
+    return f"--{name.replace('_', '-')}"
 
 
 def generate_words(options: GenerateOptions) -> list[str]:

@@ -15,37 +15,52 @@ yields their results as they end: memory does not grow with the number of tasks,
 task waits for a slow one.
 """
 
+import contextlib
 import itertools
+import os
 import time
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
+from functools import partial
+from operator import itemgetter
+from pathlib import Path
 from typing import Any, Generic, TypeVar
 
-from pipeline.exchange.scene_files import SceneFiles, SceneFolder, find_scene_files
-from pipeline.generation.accept_scene_files import settings_for_files
-from pipeline.generation.dataset_writer import DatasetWriter
-from pipeline.generation.generate_options import GenerateOptions
-from pipeline.generation.revisited_scenes import AcceptedObjects, settings_for_revisit
+from pipeline.exchange.scene_files import SceneFiles, find_scene_files
+from pipeline.generation.accept_maps import map_folders
+from pipeline.generation.dataset_writer import DatasetWriter, begin_or_resume_dataset
+from pipeline.generation.freeze_objects import ObjectLock
+from pipeline.generation.generate_options import GenerateOptions, generate_words
+from pipeline.generation.scene_origins import (
+    Accept,
+    AcceptedObjects,
+    accept_scene_files,
+    resolve_revisit,
+    settings_for_files,
+)
 from pipeline.objects.sources import check_source
-from pipeline.presets.registry import DATASET_PRESETS, frozen_note, object_source, preset_settings
+from pipeline.presets.registry import DATASET_PRESETS, frozen_note, object_source
 from pipeline.presets.settings import DatasetSettings
 from pipeline.renders.mitsuba_variant import (
     Device,
     Variant,
     choose_variant,
     device_of,
+    environment,
     gpu_memory_bytes,
     visible_gpus,
 )
-from pipeline.shards.pack_shards import UnfinishedShard
-from storage.dataset.layout import DatasetFolder
+from pipeline.shards.pack_shards import UnfinishedShard, hold_dataset_lock
+from storage.dataset.layout import DatasetFolder, dataset_folder
 from storage.dataset.manifest import Manifest, ShardEntry, read_head
+from storage.dataset.progress import write_asked
 from storage.dataset.settings import SplitSettings
 from storage.dataset.splits import keeps_scenes, lacks_validation, scenes_of_shard
 from storage.dataset.statistics import Statistics
 from storage.errors import EnvironmentFailure, TrilightError
 from storage.file_locks import WaitNotice
+from storage.machine import available_cores
 from storage.records.objects import Failure
 
 _MOST_CHILDREN = 4
@@ -67,54 +82,28 @@ class Run:
     """A dataset that has begun, with its objects frozen: the input of every later step."""
 
     options: GenerateOptions
-    settings: DatasetSettings
-    """The preset with the options' changes."""
-    scene_folder: SceneFolder | None
-    """The scene files, where scenes come from files."""
     publication: DatasetWriter
     """Writes the manifest and publishes finished shards."""
-    accepted: AcceptedObjects
-    """The frozen objects, textures, skies or scene files that scenes are made of."""
-    device: Device = "cpu"
-    """Device that renders, `cpu` or `gpu`."""
+    job: "ShardJob"
+    """Input that all tasks of the run share."""
+
+    @property
+    def accepted(self) -> AcceptedObjects:
+        return self.job.accepted
 
     def unfinished_shards(self) -> list[int]:
         return self.publication.unfinished_shards(self.options.shard_range())
 
-    def num_workers(self) -> int:
-        """Return the number of parallel tasks of one process; an executor may set another."""
-        if self.options.workers is not None:
-            return self.options.workers
-        if self.device == "cpu":
-            return 1
-        num_gpus = max(1, len(visible_gpus()))
-        return num_gpus * children_of_gpu(self.settings.renders.resolution, gpu_memory_bytes())
-
-    def job(self, num_at_once: int) -> "ShardJob":
-        """Return the job that all tasks of this run share; one process runs `num_at_once` tasks."""
-        manifest = self.publication.manifest
-        return ShardJob(
-            folder=self.publication.folder,
-            settings=self.settings,
-            environment={} if self.options.accept_environment else manifest.environment,
-            accepted=self.accepted,
-            lock_sha256=manifest.objects_lock_sha256,
-            num_at_once=num_at_once,
-            extensions=manifest.extensions,
-            device=self.device,
-        )
-
     def outcome(self, finished: Manifest | None, statistics: Statistics | None) -> "Outcome":
         """Return the result of the run; a finished dataset adds its digest and statistics."""
         writer = self.publication
-        listed = self.scene_folder
         notes: tuple[str, ...] = ()
         origin = self.accepted.origin
-        if listed and isinstance(origin, SceneFiles):
-            notes = (*origin.notes, *listed.notes(self.settings.scenes.num_views))
+        if isinstance(origin, SceneFiles):
+            notes = origin.notes
         elif statistics and self.options.revisits is None:
             notes = frozen_note(self.options.build, statistics)
-            splits = self.settings.splits
+            splits = self.job.settings.splits
             num_scenes = writer.manifest.num_scenes
             size_notes = (
                 keeps_scenes(num_scenes, self.options.scenes, splits),
@@ -125,7 +114,7 @@ class Run:
             digest=finished.dataset_digest if finished else "",
             num_objects_found=self.accepted.num_found,
             num_objects_used=self.accepted.num_objects,
-            num_scenes_given_up=writer.progress.given_up,
+            num_scenes_given_up=writer.given_up,
             failures=tuple(writer.failures),
             num_shards=len(finished.shards) if finished else writer.num_finished_shards(),
             num_shards_planned=writer.num_shards,
@@ -143,7 +132,7 @@ class Run:
         num_unusable = len(origin.unusable) if isinstance(origin, SceneFiles) else 0
         num_scenes = writer.manifest.num_scenes
         budget = self.options.failure_budget
-        given_up = writer.progress.given_up
+        given_up = writer.given_up
         if given_up > budget * num_scenes + num_unusable:
             writer.add_failures(writer.failures)
             raise TrilightError(
@@ -151,6 +140,16 @@ class Run:
                 f"made, more than the failure budget of {budget:.0%}. The reasons are in "
                 f"{writer.folder.failures.name}; fix them, or raise --failure-budget."
             )
+
+
+def num_workers(options: GenerateOptions, settings: DatasetSettings, device: Device) -> int:
+    """Return the number of parallel tasks of one process; an executor may set another."""
+    if options.workers is not None:
+        return options.workers
+    if device == "cpu":
+        return 1
+    num_gpus = max(1, len(visible_gpus()))
+    return num_gpus * children_of_gpu(settings.renders.resolution, gpu_memory_bytes())
 
 
 def children_of_gpu(resolution: int, memory_bytes: int) -> int:
@@ -228,30 +227,39 @@ Watcher = Callable[[Run, TaskResult], None]
 """Called after each task."""
 
 
-def resolve_settings(
+def resolve_inputs(
     options: GenerateOptions, folder: DatasetFolder
-) -> tuple[DatasetSettings, SceneFolder | None]:
-    """Return the dataset's settings, and the scene files if scenes come from files.
+) -> tuple[DatasetSettings, Accept]:
+    """Return the dataset's settings, and what freezes the objects or files of its scenes.
 
     Raises:
         TrilightError: the settings contradict each other, or the source or files are unusable.
     """
-    settings = preset_settings(
-        options.build,
-        seed=options.seed,
-        resolution=options.resolution,
-        noise_targets=options.noise_targets,
-        allow_licences=options.allow_licences,
-        changes=options.changes,
-    )
+    settings = options.settings()
     if options.revisits is not None or settings.revisit is not None:
-        return settings_for_revisit(settings, options.revisits), None
+        return resolve_revisit(settings, options.revisits)
+    licence = options.licence
+    if options.scenes_from is not None:
+        files = find_scene_files(options.scenes_from, options.albedo_over_one)
+        settings = settings_for_files(settings, files, options.views)
+        return settings, partial(accept_scene_files, files, licence, settings)
     source = object_source(settings, options.objects)
-    files = options.scenes_from
-    listed = None if files is None else find_scene_files(files, options.albedo_over_one)
-    if listed is None and not folder.manifest.exists():
-        check_source(source, allowed_licences=settings.allowed_licences, licence=options.licence)
-    return settings_for_files(settings, listed, options.views), listed
+    if not folder.manifest.exists():
+        check_source(source, allowed_licences=settings.allowed_licences, licence=licence)
+    maps = map_folders(options, settings)
+
+    def accept(writer: DatasetWriter) -> AcceptedObjects:
+        return ObjectLock(
+            source=source,
+            licence=licence,
+            settings=settings,
+            writer=writer,
+            workers=available_cores(),
+            map_folders=maps,
+            map_licence=options.map_licence,
+        ).accept()
+
+    return settings, accept
 
 
 def choose_dataset_variant(options: GenerateOptions, folder: DatasetFolder) -> Variant:
@@ -266,6 +274,55 @@ def choose_dataset_variant(options: GenerateOptions, folder: DatasetFolder) -> V
         default = device_of(read_head(folder.manifest).environment)
         device = default if device == "auto" else device
     return choose_variant(default, device=device)
+
+
+@contextlib.contextmanager
+def begin_run(options: GenerateOptions) -> Iterator[Run]:
+    """Join a dataset's workers and yield the run; the first worker freezes the objects."""
+    folder = dataset_folder(options.place)
+    folder = replace(folder, root=Path(os.path.realpath(folder.root)))
+    settings, accept = resolve_inputs(options, folder)  # refuses before anything is written
+    with hold_dataset_lock(folder):
+        variant = choose_dataset_variant(options, folder)
+        writer = begin_or_resume_dataset(
+            folder,
+            settings,
+            environment(variant),
+            options.num_scenes,
+            accept_environment=options.accept_environment,
+        )
+        requested = options.shard_range()
+        if requested is not None and requested.start >= writer.num_shards:
+            raise TrilightError(
+                f"--range is {options.shards!r}; expected one that begins below "
+                f"{writer.num_shards}, the shards of {writer.manifest.num_scenes} scenes."
+            )
+        if not writer.manifest.objects_lock_sha256:  # else other objects may be refused yet
+            _write_command(options, settings, writer)
+        accepted = accept(writer)
+        _write_command(options, settings, writer)
+        manifest = writer.manifest
+        job = ShardJob(
+            folder=folder,
+            settings=settings,
+            environment={} if options.accept_environment else manifest.environment,
+            accepted=accepted,
+            lock_sha256=manifest.objects_lock_sha256,
+            num_at_once=num_workers(options, settings, variant.device),
+            extensions=manifest.extensions,
+            device=variant.device,
+        )
+        yield Run(options=options, publication=writer, job=job)
+
+
+def _write_command(
+    options: GenerateOptions, settings: DatasetSettings, writer: DatasetWriter
+) -> None:
+    """Write down the command that makes the dataset, with the scenes that it keeps."""
+    num_scenes = writer.manifest.num_scenes
+    if keeps_scenes(num_scenes, options.scenes, settings.splits):
+        options = replace(options, scenes=num_scenes)
+    write_asked(writer.folder, generate_words(options))
 
 
 MAX_TASKS = 1000
@@ -312,6 +369,8 @@ class TaskCutter:
     ) -> Iterator[tuple[Piece, ...]]:
         """Yield the tasks that make some shards, but save a tenth of the tasks for later rounds.
 
+        Each is sized when it is requested.
+
         Raises:
             EnvironmentFailure: no task is left of the maximum over all rounds.
         """
@@ -321,33 +380,18 @@ class TaskCutter:
                 "claims on the missing scenes. What was finished is safe: run the same command "
                 "again."
             )
-        for task in self.iter_tasks(shards, splits, most=self._tasks_left - self._tasks_left // 10):
-            self._tasks_left -= 1
-            yield task
-
-    def iter_tasks(
-        self, shards: Sequence[int], splits: SplitSettings, *, most: int = MAX_TASKS
-    ) -> Iterator[tuple[Piece, ...]]:
-        """Yield at most `most` tasks that make some shards; each is sized when it is requested."""
+        most = self._tasks_left - self._tasks_left // 10
         scenes_left = sum(len(scenes_of_shard(index, splits)) for index in shards)
-        pieces: list[Piece] = []
-        room = self._next_size(scenes_left, most)
-        for index in shards:
-            scenes = scenes_of_shard(index, splits)
-            at = scenes.start
-            while at < scenes.stop:
-                last = min(scenes.stop, at + room)
-                pieces.append(Piece(shard_index=index, first=at, last=last))
-                room -= last - at
-                scenes_left -= last - at
-                at = last
-                if room == 0:
-                    yield tuple(pieces)
-                    pieces = []
-                    most -= 1
-                    room = self._next_size(scenes_left, most)
-        if pieces:
-            yield tuple(pieces)
+        scenes = ((index, scene) for index in shards for scene in scenes_of_shard(index, splits))
+        while task := list(itertools.islice(scenes, self._next_size(scenes_left, most))):
+            most -= 1
+            self._tasks_left -= 1
+            scenes_left -= len(task)
+            of_shards = itertools.groupby(task, key=itemgetter(0))
+            rows = ((index, [scene for _, scene in group]) for index, group in of_shards)
+            yield tuple(
+                Piece(shard_index=index, first=row[0], last=row[-1] + 1) for index, row in rows
+            )
 
     def _next_size(self, scenes_left: int, tasks_left: int) -> int:
         """Return the number of scenes of the next task, at least 1.
@@ -375,7 +419,7 @@ def wait_for_others(run: Run, pause_s: float) -> float:
         time.sleep(pause_s)
         pause_s = min(2 * pause_s, _LONGEST_PAUSE_S)
         missing = run.unfinished_shards()
-        splits = run.settings.splits
+        splits = run.job.settings.splits
         shards = [UnfinishedShard(writer.folder, splits, index) for index in missing]
         if not missing or any(shard.is_free() for shard in shards):
             return pause_s

@@ -81,13 +81,26 @@ def _facts(scene: Scene) -> dict[str, Any]:
     kinds = Counter(entry.kind for entry in scene.objects)
     licences = Counter(scene.licences)
     added = unread_columns(scene.materials, PUBLISHED_COLUMNS)
+    maps: dict[str, str] = {}
+    if scene.textures:
+        sizes = (
+            f"{each.source.name or each.sha256[:8]} {each.texels.shape[1]} x {each.texels.shape[0]}"
+            for each in scene.textures[:8]
+        )
+        maps["textures"] = f"{len(scene.textures)}: {', '.join(sizes)}"
+    if (sky := scene.environment) is not None:
+        height, width, _ = sky.radiance_rgb.shape
+        maps["environment"] = (
+            f"{sky.source.name or sky.sha256[:8]} {width} x {height}, greatest radiance "
+            f"{float(sky.radiance_rgb.max()):.4g}, {'seen' if sky.is_seen else 'hidden'}"
+        )
     return {
         "triangles": scene.num_triangles,
         "vertices": len(scene.vertex_positions),
         "objects": ", ".join(f"{count} {kind}" for kind, count in sorted(kinds.items())),
         "materials": len(scene.materials),
         **({"added_columns": ", ".join(added)} if added else {}),
-        **_maps(scene),
+        **maps,
         "lights": num_lights(scene),
         "cameras": ", ".join(f"{angle:.1f} deg" for angle in scene.fov_deg[:8]),
         "views": scene.num_views,
@@ -97,24 +110,6 @@ def _facts(scene: Scene) -> dict[str, Any]:
         "made_by": str(scene.provenance.get("template", "unknown")),
         "scene_digest": scene_digest(scene),
     }
-
-
-def _maps(scene: Scene) -> dict[str, Any]:
-    """Return facts about textures and environment, if there are any."""
-    facts: dict[str, Any] = {}
-    if scene.textures:
-        sizes = (
-            f"{each.source.name or each.sha256[:8]} {each.texels.shape[1]} x {each.texels.shape[0]}"
-            for each in scene.textures[:8]
-        )
-        facts["textures"] = f"{len(scene.textures)}: {', '.join(sizes)}"
-    if (sky := scene.environment) is not None:
-        height, width, _ = sky.radiance_rgb.shape
-        facts["environment"] = (
-            f"{sky.source.name or sky.sha256[:8]} {width} x {height}, greatest radiance "
-            f"{float(sky.radiance_rgb.max()):.4g}, {'seen' if sky.is_seen else 'hidden'}"
-        )
-    return facts
 
 
 def _turntable(scene: Scene, variant: Variant) -> NDArray[np.uint8]:
@@ -136,11 +131,9 @@ def _turntable(scene: Scene, variant: Variant) -> NDArray[np.uint8]:
     for pose in turntable_poses(scene):
         renderer = SceneRenderer(seen_into(scene, pose), settings)
         pictures.append(preview_srgb8(renderer.render_view(pose, _FOV_DEG, 0).radiance_rgb))
-    rows = [
-        np.concatenate(pictures[at * VIEWS // ROWS : (at + 1) * VIEWS // ROWS], axis=1)
-        for at in range(ROWS)
-    ]
-    return np.concatenate(rows, axis=0)
+    each = VIEWS // ROWS
+    rows = [pictures[first : first + each] for first in range(0, VIEWS, each)]
+    return np.concatenate([np.concatenate(row, axis=1) for row in rows], axis=0)
 
 
 def seen_into(scene: Scene, pose: NDArray[np.float32]) -> Scene:

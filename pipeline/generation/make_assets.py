@@ -25,7 +25,7 @@ from pipeline.generation.prepare_isolated import (
     UnreadNotes,
     asset_child,
     asset_store,
-    prepare_isolated,
+    mesh_stage,
     write_unread,
 )
 from pipeline.isolation import ChildFailed, call_with_retries, reach
@@ -131,9 +131,8 @@ def make_assets(
     )
     write_atomically(folder.summary, b"{}")  # from here on the folder is ours
     on_plan(len(listed.records))
-    prepared, rejected = prepare_isolated(
-        list(listed.records), settings, workers=workers, done=on_object
-    )
+    with mesh_stage(settings, workers) as prepare:
+        prepared, rejected = prepare(list(listed.records), on_object)
     store = asset_store()
     assets = [decode_asset(store.asset_path(each.asset_name).read_bytes()) for each in prepared]
     levels = [asset.levels[0] for asset in assets]
@@ -245,8 +244,7 @@ def _pairs(
         "Best": changed[-_PICTURES:],
     }
     pairs: dict[str, list[Pair]] = {name: [] for name in groups}
-    child = asset_child()
-    try:
+    with contextlib.closing(asset_child()) as child:
         for name, indices in groups.items():
             for i in indices:
                 path = prepared[i].record.path
@@ -256,6 +254,4 @@ def _pairs(
                         child, preview_source_and_level, path, settings, levels[i], _WIDTH_PX
                     )
                     pairs[name].append(Pair(row=rows[i], source=source, result=result))
-    finally:
-        child.close()
     return pairs

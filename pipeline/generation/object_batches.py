@@ -13,6 +13,7 @@ import uuid
 from collections.abc import Callable, Iterable, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import asdict, dataclass, field
+from operator import attrgetter
 from pathlib import Path
 from typing import Any
 
@@ -21,7 +22,7 @@ from pipeline.assets.settings import AssetSettings
 from pipeline.assets.stage import PreparedObject
 from pipeline.foreign.limits import SUFFIXES
 from pipeline.generation.dataset_writer import DatasetWriter
-from pipeline.generation.prepare_isolated import MeshWork
+from pipeline.generation.prepare_isolated import Prepare, mesh_stage
 from pipeline.isolation import is_transient
 from pipeline.objects.listing import Fetched
 from storage.atomic import write_atomically
@@ -64,25 +65,24 @@ class ObjectWork:
 
     def name(self, records: Sequence[ObjectRecord], *, are_here: bool) -> str:
         """Return the file name of a batch's result; `are_here` says that its files are local."""
-        of_objects = [self._facts(record, are_here) for record in records]
-        facts = [of_objects, asdict(self.settings), RECIPE, READERS]
-        digest = sha256_hex(canonical_json(facts))[:32]
-        return f"{digest[:2]}/{digest}.jsonl"
-
-    def _facts(self, record: ObjectRecord, is_here: bool) -> list[Any]:
-        """Return inputs of a result as JSON values: the record, and the state of a local file."""
-        facts = asdict(record)
-        path = Path(facts.pop("path"))
-        root = facts.pop("root")
-        if not is_here:
-            return [facts]
         with_pictures = self.settings.own_materials.keep
-        fetched = path.is_relative_to(cache_folder(""))  # its time is that of the download
-        suffix = path.suffix.lower()
-        alone = fetched or suffix in _SELF_CONTAINED or (suffix == ".ply" and not with_pictures)
-        folder = Path(root) if root and with_pictures else path.parent
-        neighbors = "" if alone else self._digest_neighbors(folder, suffix in _LAYERS)
-        return [facts, path.suffix, *_state(path, fetched), neighbors]
+        of_objects = list[list[Any]]()  # each record, and the state of its file if that is local
+        for record in records:
+            facts = asdict(record)
+            path = Path(facts.pop("path"))
+            root = facts.pop("root")
+            of_objects.append([facts])
+            if are_here:
+                fetched = path.is_relative_to(cache_folder(""))  # its time is of the download
+                suffix = path.suffix.lower()
+                alone = suffix in _SELF_CONTAINED or (suffix == ".ply" and not with_pictures)
+                folder = Path(root) if root and with_pictures else path.parent
+                is_layer = suffix in _LAYERS
+                near = "" if fetched or alone else self._digest_neighbors(folder, is_layer)
+                of_objects[-1] += [path.suffix, *_state(path, fetched), near]
+        inputs = [of_objects, asdict(self.settings), RECIPE, READERS]
+        digest = sha256_hex(canonical_json(inputs))[:32]
+        return f"{digest[:2]}/{digest}.jsonl"
 
     def _digest_neighbors(self, folder: Path, layers: bool) -> str:
         """Return a digest of the files of a folder that an object in it may refer to."""
@@ -123,7 +123,7 @@ class ObjectBatch:
             return self._read(self._cached) if self._cached else None
         return None
 
-    def make(self, meshes: MeshWork, done: Callable[[int], None]) -> bool:
+    def make(self, prepare: Prepare, done: Callable[[int], None]) -> bool:
         """Prepare the objects unless another worker does or has done so; return True if done here.
 
         Args:
@@ -133,12 +133,18 @@ class ObjectBatch:
         with writer.claim(self._file) as ours:
             if not ours or self.result() is not None:
                 return False
-            records, lost = self._fetch()
+            records = self.records
+            lost: list[Failure] = []
+            if self._work.fetch is not None:
+                fetched, lost = self._work.fetch(self.records)
+                records = sorted(fetched, key=attrgetter("uid"))
+                if not lost:
+                    self._cached = cache_folder(_CACHE) / self._work.name(records, are_here=True)
             done(len(lost))
             if result := self.result():
                 done(len(records))
             else:
-                assets, failures = meshes.prepare(records, lambda: done(1))
+                assets, failures = prepare(records, lambda: done(1))
                 result = assets, [*failures, *lost]
             is_final = not _may_change(result[1])
             data = _encode(result)
@@ -155,37 +161,25 @@ class ObjectBatch:
         if result is not None and _may_change(result[1]):
             self._file.unlink(missing_ok=True)
 
-    def _fetch(self) -> Fetched:
-        if self._work.fetch is None:
-            return self.records, []
-        records, lost = self._work.fetch(self.records)
-        records = sorted(records, key=lambda record: record.uid)
-        if not lost:
-            self._cached = cache_folder(_CACHE) / self._work.name(records, are_here=True)
-        return records, lost
-
     def _read(self, path: Path) -> PrepareResult | None:
+        prepared = list[PreparedObject]()
+        failures = list[Failure]()
         try:
-            return self._decode(read_json_lines(path.read_bytes(), dict[str, Any], str(path)))
+            for row in read_json_lines(path.read_bytes(), dict[str, Any], str(path)):
+                if "reason" in row:
+                    failures.append(Failure(**row))
+                else:
+                    record = self._by_uid[row.pop("uid")]
+                    unread = tuple(row.pop("unread", ()))
+                    prepared.append(PreparedObject(record=record, unread=unread, **row))
+            if len(prepared) + len(failures) != len(self.records):
+                raise ValueError("rows are missing")
+            return prepared, failures
         except FileNotFoundError:
             return None
         except (KeyError, TypeError, ValueError):
             path.unlink(missing_ok=True)  # damaged: it is made again
             return None
-
-    def _decode(self, rows: Iterable[dict[str, Any]]) -> PrepareResult:
-        prepared = list[PreparedObject]()
-        failures = list[Failure]()
-        for row in rows:
-            if "reason" in row:
-                failures.append(Failure(**row))
-            else:
-                record = self._by_uid[row.pop("uid")]
-                unread = tuple(row.pop("unread", ()))
-                prepared.append(PreparedObject(record=record, unread=unread, **row))
-        if len(prepared) + len(failures) != len(self.records):
-            raise ValueError("rows are missing")
-        return prepared, failures
 
 
 def cut_objects(records: Sequence[ObjectRecord]) -> list[list[ObjectRecord]]:
@@ -224,32 +218,33 @@ def prepare_in_batches(
         TrilightError: as `prepare_assets`, or the dataset cannot be written.
     """
     batches = [ObjectBatch(batch, work) for batch in cut_objects(records)]
-    if retry_transient:
-        for batch in batches:
-            batch.forget_transient()
+    for batch in batches if retry_transient else ():
+        batch.forget_transient()
     results: dict[int, PrepareResult] = {}
     ours: set[int] = set()
 
     def make(number: int) -> bool:
-        return not should_stop() and batches[number].make(meshes, done)
+        return not should_stop() and batches[number].make(prepare, done)
 
     # from a random first one: to find a claimed batch costs a look
     first = uuid.uuid4().int % max(len(batches), 1)
     order = [*range(first, len(batches)), *range(first)]
     at_once = 1 + -(-workers // _NUM_OBJECTS)  # no child waits for the last object of a batch
     # children end first: after Ctrl-C no thread waits for the objects that it has in hand
-    with ThreadPoolExecutor(at_once) as threads, MeshWork(work.settings, workers) as meshes:
+    with ThreadPoolExecutor(at_once) as threads, mesh_stage(work.settings, workers) as prepare:
         pause_s = _PAUSES_S[0]
         notice = WaitNotice()
         while True:
-            for number in _collect_results(batches, results) - ours:
-                done(len(batches[number].records))
+            for number, batch in enumerate(batches):
+                if number not in results and (result := batch.result()) is not None:
+                    results[number] = result
+                    done(0 if number in ours else len(batch.records))
             missing = [number for number in order if number not in results]
             if not missing or should_stop():
                 break
             tried = zip(missing, threads.map(make, missing), strict=True)
-            made = [number for number, is_ours in tried if is_ours]
-            ours.update(made)
+            made = {number for number, is_ours in tried if is_ours}
+            ours |= made
             if made:
                 pause_s = _PAUSES_S[0]
                 notice = WaitNotice()
@@ -261,16 +256,6 @@ def prepare_in_batches(
     return [one for some, _ in ordered for one in some], [f for _, some in ordered for f in some]
 
 
-def _collect_results(batches: Sequence[ObjectBatch], results: dict[int, PrepareResult]) -> set[int]:
-    """Add the results that are new to `results`; return the numbers of their batches."""
-    new = set()
-    for number, batch in enumerate(batches):
-        if number not in results and (result := batch.result()) is not None:
-            results[number] = result
-            new.add(number)
-    return new
-
-
 def _may_change(failures: Iterable[Failure]) -> bool:
     """Return True if a later run may succeed: after failed downloads and transient failures."""
     return any(failure.stage == "objects" or is_transient(failure.reason) for failure in failures)
@@ -279,14 +264,13 @@ def _may_change(failures: Iterable[Failure]) -> bool:
 def _encode(result: PrepareResult) -> bytes:
     """Return a result as a file; the digest in its name covers the rights of objects."""
     prepared, failures = result
-    rows = [*map(_row, prepared), *map(asdict, failures)]
+    rows = []
+    for one in prepared:
+        left_out = {"record"} if one.unread else {"record", "unread"}
+        row = {name: value for name, value in vars(one).items() if name not in left_out}
+        rows.append({"uid": one.record.uid, **row})
+    rows += map(asdict, failures)
     return b"".join(canonical_json(row) + b"\n" for row in rows)
-
-
-def _row(one: PreparedObject) -> dict[str, Any]:
-    left_out = {"record"} if one.unread else {"record", "unread"}
-    row = {name: value for name, value in vars(one).items() if name not in left_out}
-    return {"uid": one.record.uid, **row}
 
 
 def _state(path: Path, fetched: bool) -> list[int]:

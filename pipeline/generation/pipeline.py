@@ -23,21 +23,16 @@ bucket share batches of objects (storage.remote.store) and shards (pipeline.shar
 """
 
 import contextlib
-import os
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from dataclasses import replace
 from functools import partial
-from pathlib import Path
 from typing import Any
 
 from pipeline.documents.dataset_documents import write_documents
 from pipeline.documents.sheets import write_first_pictures
-from pipeline.generation.accept_maps import map_folders
-from pipeline.generation.accept_scene_files import accept_scene_files
-from pipeline.generation.dataset_writer import DatasetWriter, begin_or_resume_dataset
-from pipeline.generation.freeze_objects import ObjectLock
-from pipeline.generation.generate_options import GenerateOptions, generate_words
+from pipeline.generation.dataset_writer import DatasetWriter
+from pipeline.generation.generate_options import GenerateOptions
 from pipeline.generation.generation_run import (
     FIRST_PAUSE_S,
     Outcome,
@@ -48,32 +43,22 @@ from pipeline.generation.generation_run import (
     TaskCutter,
     TaskResult,
     Watcher,
-    choose_dataset_variant,
-    resolve_settings,
+    begin_run,
     wait_for_others,
 )
 from pipeline.generation.render_sample import failure_of
 from pipeline.generation.render_workers import (
     close_children,
     cores_of_child,
-    render_child,
+    job_children,
     restore_object,
-    scene_reader,
 )
-from pipeline.generation.revisited_scenes import accept_revisited
 from pipeline.generation.scene_worker import MAX_ATTEMPTS, SceneAttempt, SceneWorker
 from pipeline.isolation import ChildFailed, IsolatedChild, with_retries
-from pipeline.presets.registry import DATASET_PRESETS, object_source
-from pipeline.presets.settings import DatasetSettings
-from pipeline.renders.mitsuba_variant import environment
-from pipeline.shards.pack_shards import UnfinishedShard, hold_dataset_lock
-from storage.dataset.layout import dataset_folder
+from pipeline.shards.pack_shards import UnfinishedShard
 from storage.dataset.manifest import ShardEntry
-from storage.dataset.progress import write_asked
-from storage.dataset.splits import keeps_scenes
 from storage.dataset.statistics import Statistics
 from storage.errors import Rejected, TrilightError
-from storage.machine import available_cores
 from storage.records.objects import Failure
 from storage.records.sample import Sample, sample_key
 from storage.records.scene import Scene
@@ -92,7 +77,7 @@ def make_dataset(
     Raises:
         TrilightError: an error that the user can fix; finished scenes stay on disk.
     """
-    with _begin_run(options) as run:  # objects, meshes
+    with begin_run(options) as run:  # objects, meshes
         make_shards(run, runner, watch)  # scenes, renders, shards
         finished = run.publication.finish()
         run.require_within_budget()
@@ -104,72 +89,8 @@ def make_dataset(
 
 def prepare_dataset(options: GenerateOptions) -> Run:
     """Begin a dataset and freeze its objects, without rendering; raises as `make_dataset`."""
-    with _begin_run(options) as run:
+    with begin_run(options) as run:
         return run
-
-
-@contextlib.contextmanager
-def _begin_run(options: GenerateOptions) -> Iterator[Run]:
-    """Join a dataset's workers and yield the run; the first worker freezes the objects."""
-    folder = dataset_folder(options.place)
-    folder = replace(folder, root=Path(os.path.realpath(folder.root)))
-    settings, listed = resolve_settings(
-        options, folder
-    )  # refuses options before anything is written
-    with hold_dataset_lock(folder):
-        user_folders = map_folders(options, settings)
-        variant = choose_dataset_variant(options, folder)
-        writer = begin_or_resume_dataset(
-            folder,
-            settings,
-            environment(variant),
-            DATASET_PRESETS[options.build].num_scenes if options.scenes is None else options.scenes,
-            accept_environment=options.accept_environment,
-        )
-        requested = options.shard_range()
-        if requested is not None and requested.start >= writer.num_shards:
-            raise TrilightError(
-                f"--range is {options.shards!r}; expected one that begins below "
-                f"{writer.num_shards}, the shards of {writer.manifest.num_scenes} scenes."
-            )
-        if not writer.manifest.objects_lock_sha256:  # else other objects may be refused yet
-            _write_command(options, settings, writer)
-        if listed or options.revisits:
-            with folder.mutex("objects"):
-                writer.refresh()
-                accepted = (
-                    accept_scene_files(listed, options.licence, settings, writer)
-                    if listed
-                    else accept_revisited(options.revisits or "", settings, writer)
-                )
-        else:
-            accepted = ObjectLock(
-                source=object_source(settings, options.objects),
-                licence=options.licence,
-                settings=settings,
-                writer=writer,
-                workers=available_cores(),
-                user_folders=user_folders,
-            ).accept()
-        _write_command(options, settings, writer)
-        yield Run(
-            options=options,
-            settings=settings,
-            scene_folder=listed,
-            publication=writer,
-            accepted=accepted,
-            device=variant.device,
-        )
-
-
-def _write_command(
-    options: GenerateOptions, settings: DatasetSettings, writer: DatasetWriter
-) -> None:
-    """Write down the command that makes the dataset, with the scenes that it keeps."""
-    num_scenes = writer.manifest.num_scenes
-    if keeps_scenes(num_scenes, options.scenes, settings.splits):
-        options = replace(options, scenes=num_scenes)
-    write_asked(writer.folder, generate_words(options))
 
 
 def make_shards(run: Run, runner: Runner, watch: Watcher) -> None:
@@ -183,7 +104,7 @@ def make_shards(run: Run, runner: Runner, watch: Watcher) -> None:
         EnvironmentFailure: the run has submitted its maximum number of tasks.
     """
     writer = run.publication
-    job = run.job(runner.num_at_once or run.num_workers())
+    job = replace(run.job, num_at_once=runner.num_at_once or run.job.num_at_once)
     cutter = TaskCutter(at_once=runner.window or job.num_at_once)
     pause_s = FIRST_PAUSE_S
     try:
@@ -216,7 +137,7 @@ def make_task(job: ShardJob, pieces: tuple[Piece, ...]) -> TaskResult:
         TrilightError: the output cannot be written, or this machine would make other bytes.
     """
     started = time.monotonic()
-    with render_child(job) as child, scene_reader(job) as read:
+    with job_children(job) as (child, read):
         made = [make_piece(job, piece, child, read) for piece in pieces]
     seconds = time.monotonic() - started
     return TaskResult(

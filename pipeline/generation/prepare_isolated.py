@@ -28,6 +28,12 @@ _LIMITS = ChildLimits(memory_bytes=5 << 30, wall_s=300, cpu_s=60, calls_per_chil
 The wall time only ends idle waits; a busy machine does not decide which objects are accepted."""
 
 
+Prepare = Callable[
+    [list[ObjectRecord], Callable[[], None]], tuple[list[PreparedObject], list[Failure]]
+]
+"""Prepares objects, from any thread; arguments and errors as `prepare_assets`."""
+
+
 def asset_store() -> AssetStore:
     """Return the asset store of this user: below TRILIGHT_CACHE, or ~/.cache/trilight."""
     return AssetStore(cache_folder("assets"))
@@ -45,58 +51,32 @@ def preload_mesh_libraries() -> None:
     preload([module_name(name) for name in names])
 
 
-class MeshWork:
-    """Children for mesh work that several batches share; a context manager that ends them."""
+@contextlib.contextmanager
+def mesh_stage(settings: AssetSettings, workers: int) -> Iterator[Prepare]:
+    """Provide a function that prepares objects, in children that end with the block.
 
-    def __init__(self, settings: AssetSettings, workers: int) -> None:
-        """Configure the children; each starts when an object needs it.
-
-        Args:
-            workers: number of objects that are prepared at the same time.
-        """
-        self._settings = settings
-        self._workers = workers
-        self._pool = ChildPool(lambda _: asset_child(), workers)
+    Args:
+        workers: number of objects that are prepared at the same time.
+    """
 
     def prepare(
-        self, records: list[ObjectRecord], done: Callable[[], None]
+        records: list[ObjectRecord], done: Callable[[], None]
     ) -> tuple[list[PreparedObject], list[Failure]]:
-        """Prepare objects; arguments and errors as `prepare_assets`; from any thread."""
         paths = {path for one in records for path in (one.path, one.root) if path}
         all_files = reach(files=map(Path, sorted(paths)))
 
         @contextlib.contextmanager
         def borrow() -> Iterator[IsolatedChild]:
-            with self._pool.borrow() as child:
+            with pool.borrow() as child:
                 child.allow_files(all_files)  # all files at once: each new file replaces the child
                 yield child
 
         return prepare_assets(
-            records,
-            self._settings,
-            asset_store(),
-            borrow_child=borrow,
-            workers=self._workers,
-            done=done,
+            records, settings, asset_store(), borrow_child=borrow, workers=workers, done=done
         )
 
-    def __enter__(self) -> "MeshWork":
-        return self
-
-    def __exit__(self, *error: object) -> None:
-        self._pool.close()
-
-
-def prepare_isolated(
-    records: list[ObjectRecord],
-    settings: AssetSettings,
-    *,
-    workers: int,
-    done: Callable[[], None],
-) -> tuple[list[PreparedObject], list[Failure]]:
-    """Prepare objects in `workers` children; arguments and errors as `prepare_assets`."""
-    with MeshWork(settings, workers) as work:
-        return work.prepare(records, done)
+    with contextlib.closing(ChildPool(lambda _: asset_child(), workers)) as pool:
+        yield prepare
 
 
 def require_filters() -> None:

@@ -43,14 +43,11 @@ class ViewProgress:
         for step in steps:
             if not isinstance(step, Sampling):
                 return step
-            self._write(view, step)
+            if self._folder is not None and time.monotonic() - self._written_s >= _EVERY_S:
+                self._written_s = time.monotonic()
+                fraction = min(1.0, step.spp / step.expected_spp)
+                tell_views(self._folder, self._scene_index, view + fraction)
         raise AssertionError("a rendering yields its picture last")
-
-    def _write(self, view: int, now: Sampling) -> None:
-        if self._folder is not None and time.monotonic() - self._written_s >= _EVERY_S:
-            self._written_s = time.monotonic()
-            fraction = min(1.0, now.spp / now.expected_spp)
-            tell_views(self._folder, self._scene_index, view + fraction)
 
     def end(self) -> None:
         """Delete the progress of the scene."""
@@ -74,12 +71,8 @@ class RenderInput:
     """Packed files of the kept pictures, by suffix."""
 
 
-@dataclass(frozen=True, kw_only=True, eq=False)
-class _AcceptedView:
-    camera: ViewCamera
-    record: ViewRecord
-    pictures: Mapping[str, NDArray[np.float32]]
-    """`radiance_rgb`, `lights_rgb` if lights are apart, and parts by name."""
+_AcceptedView = tuple[ViewCamera, ViewRecord, Mapping[str, NDArray[np.float32]]]
+"""Camera, record, and pictures: `radiance_rgb`, `lights_rgb` if lights are apart, parts by name."""
 
 
 def failure_of(stage: str, item: str, rejection: Rejected, attempt: int = 0) -> Failure:
@@ -116,16 +109,15 @@ def render_sample(
         if render_input.kept_sample and view < render_input.kept_views:
             sample = render_input.kept_sample
             kept_pictures = {name: pictures[view] for name, pictures in _pictures(sample).items()}
-            camera = cameras_of(sample.scene)[view]
-            return _AcceptedView(camera=camera, record=sample.views[view], pictures=kept_pictures)
+            return cameras_of(sample.scene)[view], sample.views[view], kept_pictures
         assert renderer is not None
         for camera in cameras_of_view(scene, visibility, settings.scenes, view):
             seed = seed_for(settings.seed, "samples", int(key), view, camera.attempt)
             try:
                 steps = renderer.view_steps(camera.c2w, float(camera.fov_deg), seed)
-                return _accepted_view(
-                    camera, progress.render_view(view, steps), seed, visibility, settings
-                )
+                rendered = progress.render_view(view, steps)
+                record = _record(camera, rendered, seed, visibility, settings)
+                return camera, record, _pictures(rendered)
             except Rejected as rejection:
                 if view < render_input.kept_cameras:
                     raise Rejected(rejection.reason, f"view {view}: {rejection.message}") from None
@@ -133,7 +125,7 @@ def render_sample(
         raise AssertionError("cameras_of_view ends by raising Rejected")
 
     views = [render_view(view) for view in range(scene.num_views)]
-    seen = with_cameras(scene, [view.camera for view in views])
+    seen = with_cameras(scene, [camera for camera, _, _ in views])
     seen.check()
     return _stack_views(key, seen, views, settings, render_input.kept_members)
 
@@ -145,9 +137,8 @@ def _stack_views(
     settings: DatasetSettings,
     members: Mapping[str, bytes],
 ) -> Sample:
-    stacked = {
-        name: np.stack([view.pictures[name] for view in views]) for name in views[0].pictures
-    }
+    _, records, pictures = zip(*views, strict=True)
+    stacked = {name: np.stack([of[name] for of in pictures]) for name in pictures[0]}
     names = settings.storage.passes
     resolution = settings.renders.resolution
     rows = range(scene.num_views)
@@ -156,7 +147,7 @@ def _stack_views(
         key=key,
         scene=scene.with_provenance({**scene.provenance, "settings_sha256": settings.digest}),
         radiance_rgb=stacked.pop("radiance_rgb"),
-        views=tuple(view.record for view in views),
+        views=records,
         lights_rgb=stacked.pop("lights_rgb", None),
         parts_rgb=stacked or None,
         passes_exr=tuple(passes) if names else None,
@@ -169,16 +160,16 @@ def _pictures(of: Sample | RenderedView) -> dict[str, NDArray[np.float32]]:
     return {name: picture for name, picture in named.items() if picture is not None}
 
 
-def _accepted_view(
+def _record(
     camera: ViewCamera,
     rendered: RenderedView,
     seed: int,
     sight: Visibility,
     settings: DatasetSettings,
-) -> _AcceptedView:
+) -> ViewRecord:
     grid = settings.scenes.views.coverage_grid
     facts = sight.facts(camera.c2w, float(camera.fov_deg), grid)
-    record = ViewRecord(
+    return ViewRecord(
         spp=rendered.spp,
         noise_floor_db=round(rendered.noise_floor_db, 3),
         noise_floor_linear_db=round(rendered.noise_floor_linear_db, 3),
@@ -192,7 +183,6 @@ def _accepted_view(
         or None,
         lights=tuple(map(_part_floor, rendered.light_floors or ())) or None,
     )
-    return _AcceptedView(camera=camera, record=record, pictures=_pictures(rendered))
 
 
 def _part_floor(floor: MeasuredFloor) -> PartFloor:

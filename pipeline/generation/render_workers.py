@@ -13,13 +13,12 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
-from pipeline.assets.settings import AssetSettings
 from pipeline.exchange.scene_files import SceneFiles
-from pipeline.generation.freeze_objects import object_changed_error, require_tried
-from pipeline.generation.frozen_pool import ComposedScenes
+from pipeline.generation.freeze_objects import require_tried
+from pipeline.generation.frozen_pool import ComposedScenes, changed_error
 from pipeline.generation.generation_run import ShardJob
-from pipeline.generation.prepare_isolated import asset_child, asset_store, prepare_isolated
-from pipeline.generation.scene_worker import SceneRecipe, SceneWorker
+from pipeline.generation.prepare_isolated import asset_child, asset_store, mesh_stage
+from pipeline.generation.scene_worker import SceneWorker
 from pipeline.isolation import ChildLimits, ChildPool, IsolatedChild, call_with_retries, reach
 from pipeline.objects.sources import ListedObjects, list_objects
 from pipeline.presets.settings import differences
@@ -38,87 +37,81 @@ _RENDER_LIMITS = ChildLimits(memory_bytes=16 << 30, wall_s=3600, calls_per_child
 limits on memory and wall time end only a child that leaks or hangs. After 200 calls a fresh child
 starts, so that leaks stay bounded."""
 
-_pools: dict[tuple[str, ...], ChildPool] = {}
-_pools_lock = threading.RLock()
+
+class _JobChildren:
+    """The children that make the scenes of one job."""
+
+    def __init__(self, job: ShardJob) -> None:
+        self.num_users = 0
+        """Number of tasks that use them."""
+        self.renderers = _render_pool(job)
+        self.readers: ChildPool | None = None
+        if isinstance(files := job.accepted.origin, SceneFiles):
+            folder = reach(files=[files.root])
+            self.readers = ChildPool(lambda _: asset_child(folder), job.num_at_once)
+
+    def close(self) -> None:
+        self.renderers.close()
+        if self.readers:
+            self.readers.close()
+
+
+_jobs: dict[tuple[str, ...], _JobChildren] = {}
+_jobs_lock = threading.RLock()
 
 
 def close_children() -> None:
-    """End the render children of this process at once."""
-    with _pools_lock:
-        for pool in _pools.values():
-            pool.close()
-        _pools.clear()
+    """End the children of this process at once."""
+    with _jobs_lock:
+        for children in _jobs.values():
+            children.close()
+        _jobs.clear()
 
 
-def close_idle_children(keep: tuple[str, ...] = ()) -> None:
-    """End the render children that no task uses; not those of a job to keep, if it is given."""
-    with _pools_lock:
-        for key in [key for key, pool in _pools.items() if pool.num_users == 0]:
-            if not keep or key[: len(keep)] != keep:
-                _pools.pop(key).close()
-
-
-@contextlib.contextmanager
-def render_child(job: ShardJob) -> Iterator[IsolatedChild]:
-    """Lend a render child; the first task of a job creates its pool and ends idle ones."""
-    with _borrow_child((), job, _render_pool) as child:
-        yield child
+def close_idle_children() -> None:
+    """End the children of jobs of which no task is at work."""
+    with _jobs_lock:
+        for key in [key for key, children in _jobs.items() if not children.num_users]:
+            _jobs.pop(key).close()
 
 
 @contextlib.contextmanager
-def scene_reader(job: ShardJob) -> Iterator[Callable[[int], Scene] | None]:
-    """Lend a function that reads a scene file by its index; None if scenes are composed.
+def job_children(
+    job: ShardJob,
+) -> Iterator[tuple[IsolatedChild, Callable[[int], Scene] | None]]:
+    """Lend a render child, and a function that reads a scene file by its index.
 
-    The function raises as `SceneFiles.scene`, and ChildFailed.
+    The function is None if scenes are not read from files; it raises as `SceneFiles.scene`, and
+    ChildFailed. The first task of a job creates its children and ends idle ones.
     """
-    files = job.accepted.origin
-    settings = job.settings
-    if not isinstance(files, SceneFiles):
-        yield None
-        return
-    folder = reach(files=[files.root])
-
-    def new_pool(job: ShardJob) -> ChildPool:
-        return ChildPool(lambda _: asset_child(folder), job.num_at_once)
-
-    with _borrow_child(("files",), job, new_pool) as child:
-
-        def read(index: int) -> Scene:
-            num_views = settings.scenes.num_views
-            seed = settings.seed
-            arguments = (files, index, settings.assets, num_views, seed)
-            scene = call_with_retries(child, scene_of_file, *arguments)
-            scene.check()  # here: a compromised child may send anything
-            return scene
-
-        yield read
-
-
-def scene_of_file(
-    files: SceneFiles, scene_index: int, assets: AssetSettings, num_views: int, seed: int
-) -> Scene:
-    """Read a scene; runs only in child processes. Raises as `SceneFiles.scene`."""
-    return files.scene(scene_index, assets, num_views=num_views, seed=seed)
-
-
-@contextlib.contextmanager
-def _borrow_child(
-    kind: tuple[str, ...], job: ShardJob, make: Callable[[ShardJob], ChildPool]
-) -> Iterator[IsolatedChild]:
-    of_job = (str(job.folder.root), job.settings.digest, job.lock_sha256, job.device)
-    key = (*of_job, *kind)
-    with _pools_lock:
-        if key not in _pools:
-            close_idle_children(keep=of_job)
-            _pools[key] = make(job)
-        pool = _pools[key]
-        pool.num_users += 1
+    key = (str(job.folder.root), job.settings.digest, job.lock_sha256, job.device)
+    with _jobs_lock:
+        if key not in _jobs:
+            close_idle_children()
+            _jobs[key] = _JobChildren(job)
+        children = _jobs[key]
+        children.num_users += 1
     try:
-        with pool.borrow() as child:
-            yield child
+        with contextlib.ExitStack() as lent:
+            child = lent.enter_context(children.renderers.borrow())
+            read = None
+            if children.readers:
+                reader = lent.enter_context(children.readers.borrow())
+                read = functools.partial(_read_scene, job, reader)
+            yield child, read
     finally:
-        with _pools_lock:
-            pool.num_users -= 1
+        with _jobs_lock:
+            children.num_users -= 1
+
+
+def _read_scene(job: ShardJob, reader: IsolatedChild, index: int) -> Scene:
+    settings = job.settings
+    arguments = (settings.assets, settings.scenes.num_views, settings.seed)
+    scene: Scene = call_with_retries(
+        reader, SceneFiles.scene, job.accepted.origin, index, *arguments
+    )
+    scene.check()  # here: a compromised child may send anything
+    return scene
 
 
 def _render_pool(job: ShardJob) -> ChildPool:
@@ -128,18 +121,12 @@ def _render_pool(job: ShardJob) -> ChildPool:
         require_environment(job.environment, environment(variant))
     gpus = visible_gpus() if variant.device == "gpu" else ()
     memory_bytes = variant.address_space(_RENDER_LIMITS.memory_bytes)
+    limits = replace(_RENDER_LIMITS, memory_bytes=memory_bytes)
+    same = (job.settings, job.accepted.origin, asset_store(), variant, cores_of_child(job))
 
     def new_child(number: int) -> IsolatedChild:
-        recipe = SceneRecipe(
-            settings=job.settings,
-            variant=variant,
-            threads=cores_of_child(job),
-            gpu=gpus[number % len(gpus)] if gpus else None,
-            origin=job.accepted.origin,
-            folder=job.folder,
-        )
-        limits = replace(_RENDER_LIMITS, memory_bytes=memory_bytes)
-        return IsolatedChild(limits=limits, factory=SceneWorker, args=(recipe,))
+        gpu = gpus[number % len(gpus)] if gpus else None
+        return IsolatedChild(limits=limits, factory=SceneWorker, args=(*same, gpu, job.folder))
 
     return ChildPool(new_child, job.num_at_once)
 
@@ -172,7 +159,7 @@ def restore_object(job: ShardJob, uid: str, asset_name: str) -> None:
     frozen = job.accepted.origin
     assert isinstance(frozen, ComposedScenes), "only composed scenes draw objects"
     store = asset_store()
-    display_name = safe_url(frozen.source)
+    display_name = f"objects {safe_url(frozen.source)!r}"
     locked = LockRows(frozen.lock).find(uid)
     path = store.asset_path(asset_name)
     settings = job.settings
@@ -183,16 +170,13 @@ def restore_object(job: ShardJob, uid: str, asset_name: str) -> None:
     work_dir = job.folder.staged_objects
     record = find_object(frozen.source, frozen.licence, work_dir, settings.allowed_licences, uid)
     if record is None or locked is None:
-        raise object_changed_error(display_name, uid, "is missing or no longer usable")
-    prepared, rejected = prepare_isolated(
-        [record], settings.mesh_settings, workers=1, done=lambda: None
-    )
+        raise changed_error(display_name, uid, "is missing or no longer usable")
+    with mesh_stage(settings.mesh_settings, workers=1) as prepare:
+        prepared, rejected = prepare([record], lambda: None)
     if rejected:
         require_tried(display_name, rejected[0])
     if not prepared or prepared[0].asset_sha256 != locked.asset_sha256:
-        raise object_changed_error(
-            display_name, uid, "has changed" if prepared else "is no longer usable"
-        )
+        raise changed_error(display_name, uid, "has changed" if prepared else "is no longer usable")
     if prepared[0].asset_name != asset_name:  # a later recipe gives it another name
         write_atomically(path, store.asset_path(prepared[0].asset_name).read_bytes())
 

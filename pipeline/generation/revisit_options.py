@@ -18,7 +18,7 @@ from storage.errors import TrilightError
 from storage.settings.described import checked, settings_record
 from storage.settings.ranges import Seed, Share, Within
 
-_DRAWN = re.compile(r"(?P<layout>\w+):(?P<count>\d{1,6})")
+_DRAWN = re.compile(r"(?:(?P<layout>\w+):)?(?P<count>\d{1,6})", re.ASCII)
 _CAMERAS = (
     "expected keep; a number, such as 4, for so many views of each scene, those that it has first; "
     "new:4 for new cameras only; a layout and a number, such as plane:4; or a file with cameras"
@@ -105,19 +105,16 @@ def to_generate_options(options: RevisitOptions) -> GenerateOptions:
 def _cameras(words: str, num_views: int) -> dict[str, Any]:
     if words == "keep":
         return {"kept_cameras": num_views}
-    if words.isascii() and words.isdecimal():
-        count = int(words)
-        return {
-            "kept_cameras": min(count, num_views),
-            "new_cameras": max(0, count - num_views),
-        }
-    drawn = _DRAWN.fullmatch(words)
-    if drawn and drawn["layout"] == "new":
-        return {"kept_cameras": 0, "new_cameras": int(drawn["count"])}
-    if drawn and drawn["layout"] in TEMPLATES:
+    if drawn := _DRAWN.fullmatch(words):
         layout = drawn["layout"]
         count = int(drawn["count"])
-        return {"kept_cameras": 0, "new_cameras": count, "camera_layout": layout}
+        if layout is None:
+            num_kept = min(count, num_views)
+            return {"kept_cameras": num_kept, "new_cameras": count - num_kept}
+        if layout == "new":
+            return {"kept_cameras": 0, "new_cameras": count}
+        if layout in TEMPLATES:
+            return {"kept_cameras": 0, "new_cameras": count, "camera_layout": layout}
     if Path(words).is_file():
         c2w, fov_deg = load_cameras(scene_source(words))
         if len(c2w) > MOST_CAMERAS:

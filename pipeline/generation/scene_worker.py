@@ -4,15 +4,15 @@
 """
 
 import contextlib
+import functools
 import os
 from collections.abc import Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 
 from pipeline.assets.asset_store import AssetStore
 from pipeline.generation.frozen_pool import AssetMissing, ComposedScenes, SplitPool, user_maps
-from pipeline.generation.prepare_isolated import asset_store
 from pipeline.generation.render_sample import RenderInput, ViewProgress, failure_of, render_sample
-from pipeline.generation.revisited_scenes import RevisitedScenes, SceneOrigin
+from pipeline.generation.scene_origins import RevisitedScenes, SceneOrigin
 from pipeline.presets.settings import DatasetSettings
 from pipeline.renders.mitsuba_variant import Variant, activate
 from pipeline.renders.renderer import set_threads
@@ -31,23 +31,6 @@ MAX_ATTEMPTS = 16
 """Attempts at a scene before it is given up."""
 
 
-@dataclass(frozen=True, kw_only=True)
-class SceneRecipe:
-    """Configuration of a render child, sent once when it starts."""
-
-    settings: DatasetSettings
-    variant: Variant
-    """Mitsuba variant and denoiser device."""
-    threads: int
-    gpu: str | None = None
-    """GPU of this child, as CUDA_VISIBLE_DEVICES names it; None without one."""
-    origin: SceneOrigin
-    assets: AssetStore = field(default_factory=asset_store)
-    """Store of the objects' prepared files, as the worker sees it."""
-    folder: DatasetFolder | None = None
-    """Folder that gets the progress of a scene; None reports none."""
-
-
 @dataclass(frozen=True, kw_only=True, eq=False)
 class SceneAttempt:
     """The result of one attempt."""
@@ -63,15 +46,34 @@ class SceneAttempt:
 class SceneWorker:
     """Object that a render child holds: makes attempts at scenes, and opens each split once."""
 
-    def __init__(self, recipe: SceneRecipe) -> None:
-        """Prepare this process: its GPU, Mitsuba's variant, and its threads."""
-        if recipe.gpu is not None:
-            os.environ["CUDA_VISIBLE_DEVICES"] = recipe.gpu
-        activate(recipe.variant)
-        set_threads(recipe.threads)
-        self._recipe = recipe
-        self._pools: dict[str, Sequence[PooledAsset]] = {}
-        self._maps: dict[str, OwnMaps] = {}
+    def __init__(
+        self,
+        settings: DatasetSettings,
+        origin: SceneOrigin,
+        assets: AssetStore,
+        variant: Variant,
+        threads: int,
+        gpu: str | None = None,
+        folder: DatasetFolder | None = None,
+    ) -> None:
+        """Prepare this process: its GPU, Mitsuba's variant, and its threads.
+
+        Args:
+            assets: store of the objects' prepared files, as the worker sees it.
+            variant: Mitsuba variant and denoiser device.
+            gpu: GPU of this child, as CUDA_VISIBLE_DEVICES names it; None without one.
+            folder: gets the progress of a scene; None reports none.
+        """
+        if gpu is not None:
+            os.environ["CUDA_VISIBLE_DEVICES"] = gpu
+        activate(variant)
+        set_threads(threads)
+        self._settings = settings
+        self._origin = origin
+        self._assets = assets
+        self._folder = folder
+        self._pool = functools.cache(self._open_pool)
+        self._maps = functools.cache(self._open_maps)
 
     def attempt(
         self, split: str, scene_index: int, attempt: int, from_file: Scene | None = None
@@ -82,9 +84,9 @@ class SceneWorker:
             from_file: the scene if it comes from a file, which a confined child has read.
         """
         key = sample_key(scene_index)
-        settings = self._recipe.settings
+        settings = self._settings
         failures: list[Failure] = []
-        progress = ViewProgress(self._recipe.folder, scene_index)
+        progress = ViewProgress(self._folder, scene_index)
         stage = "scenes"
         try:
             render_input = self._render_input(split, scene_index, attempt, from_file)
@@ -119,32 +121,28 @@ class SceneWorker:
     def _render_input(
         self, split: str, scene_index: int, attempt: int, from_file: Scene | None
     ) -> RenderInput:
-        recipe = self._recipe
-        if isinstance(recipe.origin, RevisitedScenes):
-            return recipe.origin.scene(scene_index, attempt, recipe.settings)
+        settings = self._settings
+        if isinstance(self._origin, RevisitedScenes):
+            return self._origin.scene(scene_index, attempt, settings)
         if from_file is not None:
-            return RenderInput(scene=from_file, kept_cameras=recipe.settings.scenes.num_views)
+            return RenderInput(scene=from_file, kept_cameras=settings.scenes.num_views)
         scene = compose_scene(
-            recipe.settings.scenes,
+            settings.scenes,
             self._pool(split),
-            SceneKey(recipe.settings.seed, scene_index, attempt),
-            user_maps=self._maps_of(split),
+            SceneKey(settings.seed, scene_index, attempt),
+            user_maps=self._maps(split),
         )
         return RenderInput(scene=scene)
 
-    def _composed_scenes(self) -> ComposedScenes:
-        origin = self._recipe.origin
-        assert isinstance(origin, ComposedScenes), "only composed scenes draw objects"
-        return origin
+    @functools.cached_property
+    def _frozen(self) -> ComposedScenes:
+        assert isinstance(self._origin, ComposedScenes), "only composed scenes draw objects"
+        return self._origin
 
-    def _pool(self, split: str) -> Sequence[PooledAsset]:
+    def _open_pool(self, split: str) -> Sequence[PooledAsset]:
         """Return the objects of a split, sorted by uid; each is opened on first access."""
-        if split not in self._pools:
-            self._pools[split] = SplitPool(self._composed_scenes(), split, self._recipe.assets)
-        return self._pools[split]
+        return SplitPool(self._frozen, split, self._assets)
 
-    def _maps_of(self, split: str) -> OwnMaps:
+    def _open_maps(self, split: str) -> OwnMaps:
         """Return the user's textures and maps of a split; each is read when a scene takes it."""
-        if split not in self._maps:
-            self._maps[split] = user_maps(self._composed_scenes().maps, split)
-        return self._maps[split]
+        return user_maps(self._frozen.maps, split)

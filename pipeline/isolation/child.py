@@ -1,4 +1,4 @@
-"""`IsolatedChild`: the owner's side of a child process, which starts, calls and ends it.
+"""`IsolatedChild`: starts, calls and ends a child process, which answers by `serve`.
 
 A child runs calls one after another, so that slow imports and compiled kernels are paid once. It
 has limits on memory and wall time, is replaced after a number of calls, ignores Ctrl-C (the owner
@@ -7,13 +7,17 @@ child: the kernel ends it with its parent, the fork server, which ends with the 
 """
 
 import contextlib
+import ctypes
+import math
 import multiprocessing
 import os
 import queue
+import resource
 import signal
 import sys
 import tempfile
 import threading
+import traceback
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from multiprocessing.connection import Connection
@@ -22,12 +26,20 @@ from pathlib import Path
 from types import ModuleType
 from typing import Any
 
-from pipeline.isolation.answers import CallTime, TooLong, decode_answer, receive, send
+from pipeline.isolation.answers import (
+    CallTime,
+    TooLong,
+    decode_answer,
+    encode_error,
+    encode_result,
+    receive,
+    send,
+    wait_forever,
+)
 from pipeline.isolation.call_failures import ChildFailed, Result, with_retries
-from pipeline.isolation.child_main import CallKind, serve
 from pipeline.isolation.confinement import Reach, code_of, confine, should_confine
-from storage.errors import EnvironmentFailure
-from storage.extensions import load_same, loaded_files
+from storage.errors import EnvironmentFailure, Rejected, TrilightError
+from storage.extensions import load_same, loaded_files, mistake_in_extension
 from storage.installation import child_environment, order_installed_first
 from storage.remote.safe_url import escape_lines
 
@@ -115,25 +127,31 @@ class IsolatedChild:
             TrilightError: also where a new child cannot be set up.
             ChildClosed: `close` was called, perhaps by another thread.
         """
-        return self._call("function", function, args)
+        return self._call(function, function, args)
 
     def call_method(self, method: Callable[..., Result], *args: Any) -> Result:
         """Run a function whose first argument is the object that the child holds; as `call`."""
-        return self._call("method", method, args)
+        return self._call(method, call_held, (method, *args))
 
     def _call(
-        self, kind: CallKind, function: Callable[..., Result], args: tuple[Any, ...]
+        self,
+        declared: Callable[..., Result],
+        function: Callable[..., Any],
+        args: tuple[Any, ...],
     ) -> Result:
         if self._closed:
             raise ChildClosed
-        if self._reach is not None and not (code := code_of(function)) <= self._code:
+        if self._reach is not None and not (code := code_of(declared)) <= self._code:
             self._code |= code
             self.retire()
         try:
             if self._calls_left == 0:
-                self._start()
+                try:
+                    with_retries(self._launch_and_set_up)
+                except ChildFailed as failure:
+                    raise _cannot_be_set_up(failure) from failure
             self._calls_left -= 1
-            return self._exchange(kind, function, args, self._limits.wall_s)
+            return self._exchange(declared, function, args, self._limits.wall_s)
         except ChildFailed:
             self.retire()
             raise
@@ -154,12 +172,6 @@ class IsolatedChild:
         self._process = self._connection = None
         self._calls_left = 0
 
-    def _start(self) -> None:
-        try:
-            with_retries(self._launch_and_set_up)
-        except ChildFailed as failure:
-            raise _cannot_be_set_up(failure) from failure
-
     def _launch_and_set_up(self) -> None:
         self.retire()
         self._process, self._connection = _launch(self._limits)
@@ -169,11 +181,11 @@ class IsolatedChild:
                 code = self._code | {Path(path).parent for path, _ in files}
                 if self._factory is not None:
                     code |= code_of(self._factory)
-                self._exchange("function", confine, (self._reach, code), _START_UP_S)
+                self._exchange(confine, confine, (self._reach, code), _START_UP_S)
             if files:  # first: the factory may use their definitions
-                self._exchange("function", load_same, (files,), _START_UP_S)
+                self._exchange(load_same, load_same, (files,), _START_UP_S)
             if self._factory is not None:
-                self._exchange("factory", self._factory, self._args, _START_UP_S)
+                self._exchange(hold, hold, (self._factory, *self._args), _START_UP_S)
         except ChildFailed as failure:
             if self._closed:
                 raise ChildClosed from failure
@@ -184,21 +196,20 @@ class IsolatedChild:
 
     def _exchange(
         self,
-        kind: CallKind,
-        function: Callable[..., Result],
+        declared: Callable[..., Result],
+        function: Callable[..., Any],
         args: tuple[Any, ...],
         wall_s: float,
     ) -> Result:
+        """Send a call, and return the result, checked by the type that `declared` returns."""
         from pipeline.isolation.result_schema import result_reader  # children do without
 
         assert self._connection is not None
-        # a factory's object stays in the child, which answers None
-        declared: Callable[..., Any] = _no_result if kind == "factory" else function
         result_reader(declared)  # raises first if the declared result type cannot be checked
         file = self._connection.fileno()
         wait = CallTime(self._process.pid, wall_s)
         try:
-            send(file, [ForkingPickler.dumps((kind, function, args))], wait)
+            send(file, [ForkingPickler.dumps((function, args))], wait)
             answer = receive(file, wait, min(self._limits.memory_bytes, _MOST_BYTES))
             result: Result = decode_answer(answer, declared)
             return result
@@ -223,10 +234,6 @@ class IsolatedChild:
         return ChildFailed("killed", f"ended by {name}{hint}")
 
 
-def _no_result() -> None:
-    """Declare the answer to a factory."""
-
-
 def _cannot_be_set_up(failure: ChildFailed) -> EnvironmentFailure:
     return EnvironmentFailure(
         f"a child process cannot be set up ({failure}); see `trilight doctor`."
@@ -247,7 +254,7 @@ def _launch(limits: ChildLimits) -> tuple[Any, Connection]:
             target=serve, args=(theirs, output_sink, limits.memory_bytes, limits.cpu_s), daemon=True
         )
         try:
-            with _without_main(), _outside_working_folder():
+            with _apart_from_program():
                 process.start()
         except (EOFError, OSError) as error:
             ours.close()
@@ -274,47 +281,39 @@ def _print_output(output: Connection) -> None:
 
 
 @contextlib.contextmanager
-def _without_main() -> Iterator[None]:
-    """Hide a program that runs from a file: multiprocessing would run it again in the child.
+def _apart_from_program() -> Iterator[None]:
+    """Keep the program and modules of the working folder out of a child, and of its servers.
 
+    A program that runs from a file is hidden: multiprocessing would run it again in the child.
     Children import the functions that they call by name, and do not need the program. A user's
     program without `if __name__ == "__main__"` would start children there. A program run by
     `python -m` is a module, whose functions a child may import.
+
+    A file of the working folder that is named like one of Python's modules would be run before the
+    child is confined. The socket of the fork server is below /tmp if TMPDIR is too long for one.
     """
     with _one_start:
         program = sys.modules["__main__"]
+        environment = os.environ.copy()
+        paths = sys.path
+        temporary = tempfile.tempdir
         if program.__spec__ is None:
             sys.modules["__main__"] = ModuleType("__main__")
+        os.environ.update(child_environment())
+        sys.path = order_installed_first(paths)
+        if len(os.fsencode(tempfile.gettempdir())) > _LONGEST_FOLDER:
+            tempfile.tempdir = "/tmp"
         try:
             yield
         finally:
             sys.modules["__main__"] = program
-
-
-@contextlib.contextmanager
-def _outside_working_folder() -> Iterator[None]:
-    """Keep modules of the working folder out of a child, and out of the servers that start it.
-
-    A file named like one of Python's modules would be run there, before the child is confined. The
-    socket of the fork server is below /tmp if TMPDIR is too long for one.
-    """
-    environment = os.environ.copy()
-    paths = sys.path
-    temporary = tempfile.tempdir
-    os.environ.update(child_environment())
-    sys.path = order_installed_first(paths)
-    if len(os.fsencode(tempfile.gettempdir())) > _LONGEST_FOLDER:
-        tempfile.tempdir = "/tmp"
-    try:
-        yield
-    finally:
-        sys.path = paths
-        tempfile.tempdir = temporary
-        for name in ("PYTHONSAFEPATH", "PYTHONPATH"):
-            if name in environment:
-                os.environ[name] = environment[name]
-            else:
-                del os.environ[name]
+            sys.path = paths
+            tempfile.tempdir = temporary
+            for name in ("PYTHONSAFEPATH", "PYTHONPATH"):
+                if name in environment:
+                    os.environ[name] = environment[name]
+                else:
+                    del os.environ[name]
 
 
 def preload(modules: list[str]) -> None:
@@ -348,8 +347,6 @@ class ChildPool:
         self._free: queue.SimpleQueue[IsolatedChild] = queue.SimpleQueue()
         for child in self._children:
             self._free.put(child)
-        self.num_users = 0
-        """Number of tasks that use the pool; counted by the owner of several pools."""
 
     @contextlib.contextmanager
     def borrow(self) -> Iterator[IsolatedChild]:
@@ -364,3 +361,92 @@ class ChildPool:
         """End all children at once."""
         for child in self._children:
             child.close()
+
+
+_PR_SET_PDEATHSIG = 1
+
+
+def die_with_parent() -> None:
+    """Ask the kernel to kill this process when its parent ends, for any reason (Linux only)."""
+    if sys.platform == "linux":
+        ctypes.CDLL(None).prctl(_PR_SET_PDEATHSIG, signal.SIGKILL)
+
+
+def _leave_owner(connection: Connection, output: Connection) -> None:
+    """Close all inherited files except the connection to the owner.
+
+    So a child has no terminal. And no child keeps the fork server alive: it ends with the owner,
+    for any reason, and its children end with it.
+    """
+    nothing = os.open(os.devnull, os.O_RDWR)
+    needed_files = {1, 2, nothing, connection.fileno()}
+    for standard in (1, 2):
+        os.dup2(output.fileno(), standard)
+    for file in set(map(int, os.listdir("/dev/fd"))) - needed_files:
+        os.dup2(
+            nothing, file, inheritable=file == 0
+        )  # if closed, another file could get its number
+    die_with_parent()
+
+
+_held: Any = None
+"""The object that this child holds."""
+
+
+def hold(factory: Callable[..., object], *args: Any) -> None:
+    """Make the object that this child holds."""
+    global _held
+    _held = factory(*args)
+
+
+def call_held(method: Callable[..., Any], *args: Any) -> Any:
+    """Call a function with the object that this child holds, and further arguments."""
+    return method(_held, *args)
+
+
+def serve(connection: Connection, output: Connection, memory_bytes: int, cpu_s: int | None) -> None:
+    """Answer calls until the owner closes the connection; ignores Ctrl-C: the owner decides.
+
+    Args:
+        output: receives standard output and standard error.
+        cpu_s: most CPU seconds of one call, or None for no limit.
+    """
+    _leave_owner(connection, output)
+    signal.signal(signal.SIGINT, signal.SIG_IGN)
+    resource.setrlimit(resource.RLIMIT_CORE, (0, 0))
+    most = resource.getrlimit(resource.RLIMIT_AS)[1]
+    if most != resource.RLIM_INFINITY:  # a limit of the shell, which no process can raise
+        memory_bytes = min(memory_bytes, most)
+    resource.setrlimit(resource.RLIMIT_AS, (memory_bytes, memory_bytes))
+    file = connection.fileno()
+    while True:
+        try:
+            # pickle: the child trusts its owner; the owner never unpickles a child's bytes
+            (message,) = receive(file, wait_forever, sys.maxsize)
+            function, args = ForkingPickler.loads(message.data)
+        except EOFError:
+            os._exit(0)  # the parent has died: skip the destructors of native libraries
+        if cpu_s is not None:  # after so many more, the kernel ends this process in any code
+            used = resource.getrusage(resource.RUSAGE_SELF)
+            soft = math.ceil(used.ru_utime + used.ru_stime) + cpu_s
+            hard = resource.getrlimit(resource.RLIMIT_CPU)[1]
+            resource.setrlimit(resource.RLIMIT_CPU, (soft, hard))
+        send(file, _answer(function, args), wait_forever)
+
+
+def _answer(function: Callable[..., Any], args: tuple[Any, ...]) -> list[bytes | memoryview]:
+    try:
+        return encode_result(function(*args))
+    except Rejected as rejection:
+        return encode_error("rejected", rejection.reason, rejection.message)
+    except TrilightError as mistake:
+        kind = EnvironmentFailure if isinstance(mistake, EnvironmentFailure) else TrilightError
+        return encode_error(kind.__name__, str(mistake))
+    except MemoryError:
+        return encode_error("out_of_memory", "an allocation went over the limit of the child")
+    except Exception as error:
+        its_author = mistake_in_extension(error)
+        if its_author is not None:  # a retry would fail too
+            return encode_error("TrilightError", str(its_author))
+        lines = traceback.format_exc(limit=-1).strip().splitlines()[1:]  # innermost call, error
+        return encode_error("exception", " | ".join(map(str.strip, lines)))

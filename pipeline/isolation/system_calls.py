@@ -76,8 +76,15 @@ def restrict_files(
     Raises:
         OSError: the kernel refuses, or `landlock_version` is 0.
     """
-    rights = (1 << _NUM_RIGHTS.get(landlock_version(), 16)) - 1
-    ruleset = _new_ruleset(rights)
+    version = landlock_version()
+    rights = (1 << _NUM_RIGHTS.get(version, 16)) - 1
+    fields = [rights]
+    if version >= _NET_SINCE:
+        fields.append(_BIND_AND_CONNECT)
+    if version >= _SCOPES_SINCE:
+        fields.append(_SCOPES)
+    attributes = struct.pack(f"={len(fields)}Q", *fields)
+    ruleset = _require(_libc().syscall(_CREATE, attributes, ctypes.c_size_t(len(attributes)), 0))
     try:
         for paths, access in (
             (lists, LIST),
@@ -89,17 +96,6 @@ def restrict_files(
         _require(_libc().syscall(_RESTRICT, ruleset, 0))
     finally:
         os.close(ruleset)
-
-
-def _new_ruleset(rights: int) -> int:
-    version = landlock_version()
-    fields = [rights]
-    if version >= _NET_SINCE:
-        fields.append(_BIND_AND_CONNECT)
-    if version >= _SCOPES_SINCE:
-        fields.append(_SCOPES)
-    attributes = struct.pack(f"={len(fields)}Q", *fields)
-    return _require(_libc().syscall(_CREATE, attributes, ctypes.c_size_t(len(attributes)), 0))
 
 
 def _allow(ruleset: int, path: Path, rights: int) -> None:

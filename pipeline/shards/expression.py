@@ -7,7 +7,7 @@ called. Type errors are reported before any scene is read.
 
 import ast
 import operator
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from typing import Any, Literal, NoReturn
 
@@ -34,19 +34,26 @@ _COMPARISONS: Mapping[type, Callable[[Any, Any], Any]] = {
     ast.Lt: operator.lt, ast.LtE: operator.le, ast.Gt: operator.gt, ast.GtE: operator.ge,
     ast.Eq: operator.eq, ast.NotEq: operator.ne,
 }  # fmt: skip
-_ARITHMETIC: Mapping[type, Callable[[Any, Any], Any]] = {
-    ast.Add: operator.add, ast.Sub: operator.sub, ast.Mult: operator.mul,
-    ast.Div: lambda a, b: np.float64(a) / b,
-}  # fmt: skip
-_REDUCTIONS: Mapping[str, tuple[Kind, Kind, Callable[[Any], Any]]] = {
+_OPERATIONS: Mapping[Any, tuple[Kind, Kind, Callable[..., Any]]] = {
+    ast.And: ("truth", "truth", lambda *truths: all(truths)),
+    ast.Or: ("truth", "truth", lambda *truths: any(truths)),
+    ast.Not: ("truth", "truth", operator.not_),
+    ast.USub: ("number", "number", operator.neg),
+    ast.Add: ("number", "number", operator.add),
+    ast.Sub: ("number", "number", operator.sub),
+    ast.Mult: ("number", "number", operator.mul),
+    ast.Div: ("number", "number", lambda a, b: np.float64(a) / b),
+    ast.List: ("text", "texts", lambda *texts: texts),
+    ast.Tuple: ("text", "texts", lambda *texts: texts),
     "min": ("numbers", "number", lambda values: min(values, default=np.nan)),
     "max": ("numbers", "number", lambda values: max(values, default=np.nan)),
     "mean": ("numbers", "number", lambda values: np.mean(values) if len(values) else np.nan),
     "any": ("truths", "truth", any),
     "all": ("truths", "truth", all),
 }
-"""Type of argument and result of each function. The result for no values is NaN, and no comparison
-with it holds."""
+"""Type of all arguments, type of the result, and function of each operator, list or named function.
+The result of a function for no values is NaN, and no comparison with it holds."""
+_FUNCTIONS = [name for name in _OPERATIONS if isinstance(name, str)]
 
 Values = Mapping[str, Any]
 """Values of one scene, by name."""
@@ -101,7 +108,7 @@ def condition(text: str) -> Condition:
     return Condition(
         text=text,
         names=frozenset(node.id for node in ast.walk(tree) if isinstance(node, ast.Name))
-        - set(_REDUCTIONS),
+        - {*_FUNCTIONS},
         holds=lambda values: bool(part.of(values)),
     )
 
@@ -118,39 +125,40 @@ class _Reader:
         raise TrilightError(f"--where: {part!r:.60} is {_article(got)}; expected {expected}.")
 
     def read(self, node: ast.expr) -> _Term:
+        operation: Any = None
+        parts: list[ast.expr] = []
         match node:
             case ast.Constant(value=bool() | int() | float() | str() as value):
                 kinds: Mapping[type, Kind] = {bool: "truth", str: "text"}
                 return _Term(kind=kinds.get(type(value), "number"), of=lambda _: value)
             case ast.Name(id=name):
                 return self._read_name(node, name)
-            case ast.Tuple(elts=parts) | ast.List(elts=parts):
-                each = [self._read_kind(part, "text").of for part in parts]
-                return _Term(kind="texts", of=lambda values: [of(values) for of in each])
-            case ast.BoolOp(op=op, values=parts):
-                truths = [self._read_kind(part, "truth").of for part in parts]
-                every = all if isinstance(op, ast.And) else any
-                return _Term(kind="truth", of=lambda values: every(of(values) for of in truths))
-            case ast.UnaryOp(op=ast.Not(), operand=inner):
-                truth = self._read_kind(inner, "truth").of
-                return _Term(kind="truth", of=lambda values: not truth(values))
-            case ast.UnaryOp(op=ast.USub(), operand=inner):
-                number = self._read_kind(inner, "number").of
-                return _Term(kind="number", of=lambda values: -number(values))
-            case ast.BinOp(op=op, left=left, right=right) if type(op) in _ARITHMETIC:
-                a, b = (self._read_kind(side, "number").of for side in (left, right))
-                count = _ARITHMETIC[type(op)]
-                return _Term(kind="number", of=lambda values: count(a(values), b(values)))
             case ast.Compare(left=left, ops=ops, comparators=others):
-                return self._read_comparison([left, *others], ops)
-            case ast.Call(func=ast.Name(id=name), args=[inner], keywords=[]) if name in _REDUCTIONS:
-                takes, gives, reduce = _REDUCTIONS[name]
-                several = self._read_kind(inner, takes).of
-                return _Term(kind=gives, of=lambda values: reduce(several(values)))
-        self.refuse(
-            node, "nothing that a condition may hold", f"{', '.join(_REDUCTIONS)}, comparisons, "
-            "and, or, not, + - * /, numbers, texts and names"
-        )  # fmt: skip
+                terms = [self.read(side) for side in (left, *others)]
+                pairs = zip(others, terms, terms[1:], ops, strict=False)
+                tests = [self._test(*pair) for pair in pairs]
+                return _Term(kind="truth", of=lambda values: all(test(values) for test in tests))
+            case ast.BoolOp(op=op, values=parts):
+                operation = type(op)
+            case ast.UnaryOp(op=unary, operand=part):
+                operation = type(unary)
+                parts = [part]
+            case ast.BinOp(op=binary, left=left, right=right):
+                operation = type(binary)
+                parts = [left, right]
+            case ast.Tuple(elts=parts) | ast.List(elts=parts):
+                operation = type(node)
+            case ast.Call(func=ast.Name(id=name), args=[part], keywords=[]):
+                operation = name
+                parts = [part]
+        if operation not in _OPERATIONS:
+            self.refuse(
+                node, "nothing that a condition may hold", f"{', '.join(_FUNCTIONS)}, comparisons, "
+                "and, or, not, + - * /, numbers, texts and names"
+            )  # fmt: skip
+        takes, gives, function = _OPERATIONS[operation]
+        each = [self._read_kind(part, takes).of for part in parts]
+        return _Term(kind=gives, of=lambda values: function(*(of(values) for of in each)))
 
     def _read_name(self, node: ast.expr, name: str) -> _Term:
         kind = kind_of(name)
@@ -163,12 +171,6 @@ class _Reader:
         if part.kind != kind:
             self.refuse(node, part.kind, _HINTS.get((part.kind, kind), _article(kind)))
         return part
-
-    def _read_comparison(self, nodes: Sequence[ast.expr], ops: Sequence[ast.cmpop]) -> _Term:
-        parts = [self.read(node) for node in nodes]
-        pairs = list(zip(nodes[1:], parts, parts[1:], ops, strict=False))
-        tests = [self._test(*pair) for pair in pairs]
-        return _Term(kind="truth", of=lambda values: all(test(values) for test in tests))
 
     def _test(
         self, node: ast.expr, first: _Term, second: _Term, op: ast.cmpop

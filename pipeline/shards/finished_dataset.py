@@ -88,34 +88,30 @@ def read_facts(
         with dataset.open_shard(shard, checked=True) as opened:
             for key in opened.samples:
                 members = opened.members(key, lambda suffix: suffix in ("json", PLAIN, PACKED))
-                yield _facts(shard, key, members, names)
+                values: Mapping[str, Any] = {}
+                if names:
+                    values = condition_values(decode_scene(key, members), shard.split, names)
+                try:
+                    record = json.loads(members["json"])
+                    rows = ((str(row["kind"]), str(row["uid"])) for row in record["objects"])
+                    floors_db = [float(view["noise_floor_db"]) for view in record["views"]]
+                    provenance = record["provenance"]
+                    facts = SceneFacts(
+                        shard=shard,
+                        key=key,
+                        template=str(provenance.get("template", "unknown")),
+                        noise_floor_db=min(floors_db),
+                        uids=tuple(locked_uids(rows, provenance)),
+                        arrays_sha256=sha256_hex(unpack_arrays(members)),
+                        values=values,
+                    )
+                except (KeyError, TypeError, ValueError, RecursionError) as error:
+                    raise TrilightError(
+                        f"{shard.name}: sample {key} is not as expected ({error!r}); run "
+                        "`trilight verify`."
+                    ) from error
+                yield facts
         shard_done()
-
-
-def _facts(
-    shard: ShardEntry, key: str, members: Mapping[str, bytes], names: Collection[str]
-) -> SceneFacts:
-    values = condition_values(decode_scene(key, members), shard.split, names) if names else {}
-    try:
-        record = json.loads(members["json"])
-        return SceneFacts(
-            shard=shard,
-            key=key,
-            template=str(record["provenance"].get("template", "unknown")),
-            noise_floor_db=min(float(view["noise_floor_db"]) for view in record["views"]),
-            uids=tuple(
-                locked_uids(
-                    ((str(row["kind"]), str(row["uid"])) for row in record["objects"]),
-                    record["provenance"],
-                )
-            ),
-            arrays_sha256=sha256_hex(unpack_arrays(members)),
-            values=values,
-        )
-    except (KeyError, TypeError, ValueError, RecursionError) as error:
-        raise TrilightError(
-            f"{shard.name}: sample {key} is not as expected ({error!r}); run `trilight verify`."
-        ) from error
 
 
 def condition_values(record: SceneRecord, split: str, names: Collection[str]) -> Mapping[str, Any]:

@@ -23,7 +23,7 @@ import os
 import shutil
 import time
 from collections.abc import Iterator, Mapping, Sequence
-from functools import partial
+from functools import cached_property, partial
 from pathlib import Path
 from typing import BinaryIO
 
@@ -56,6 +56,7 @@ from storage.dataset.shard_notes import (
     ShardNote,
     encode_note,
     fetch_notes,
+    name_of_note,
     note_of,
     note_shard,
     noted_shard,
@@ -127,18 +128,16 @@ def _pack(folder: DatasetFolder, name: str, scene_indices: range, *, grows: bool
     path = folder.shard(name)
     rejections = rejections_of_shard(folder, name)
     write_failures(rejections, failures)
-    if not grows:
-        write_shard(path, samples)
-        shutil.rmtree(staged_folder, ignore_errors=True)  # leftovers are never read
-        return index_shard(path)
-    written = folder.staging / path.name
-    written.unlink(missing_ok=True)
+    written = folder.staging / path.name if grows else path
+    if grows:
+        written.unlink(missing_ok=True)
     write_shard(written, samples)
     shard = index_shard(written)
-    note_shard(folder, ShardNote(shard=shard, failures=tuple(failures)))  # until it has the name,
-    os.replace(written, path)  # the old one can be read
-    write_failures(rejections, failures)
-    write_manifest(folder.manifest, read_manifest(folder.manifest).with_grown(shard))
+    if grows:
+        note_shard(folder, ShardNote(shard=shard, failures=tuple(failures)))  # until it has the
+        os.replace(written, path)  # name, the old one can be read
+        write_failures(rejections, failures)
+        write_manifest(folder.manifest, read_manifest(folder.manifest).with_grown(shard))
     shutil.rmtree(staged_folder, ignore_errors=True)  # leftovers are never read
     return shard
 
@@ -176,8 +175,12 @@ class PublishedShards:
     def __init__(self, folder: DatasetFolder, store: Store) -> None:
         self._folder = folder
         self._store = store
-        self._names_listed: set[str] | None = None
         self._unpacked = set[str]()
+
+    @cached_property
+    def _names_listed(self) -> set[str]:
+        """The shards that the bucket's manifest lists: of a grown or copied dataset."""
+        return {shard.name for shard in published_manifest(self._store).shards}
 
     def names_in_part(self, part: int, ends: Mapping[str, range]) -> Iterator[str]:
         """Yield the names of the published shards of a part of the dataset, growing ones too.
@@ -195,11 +198,16 @@ class PublishedShards:
         place = place_of_part(part)
         notes = self._store.list(f"{self._folder.name_of(self._folder.staged_entries)}/{place}")
         for name in filter(SHARD_NAME.fullmatch, self._store.list(place)):
-            noted = self._folder.name_of(note_of(self._folder, name)) in notes
-            if self._folder.is_sent(name) or not (noted or name in self._manifest_names()):
+            noted = name_of_note(name) in notes
+            if self._folder.is_sent(name) or not (noted or name in self._names_listed):
                 continue
             if scenes := ends.get(name):
-                note = self._read_note(name) or self._note_of_list(name)
+                note = self._read_note(name)
+                if note is None:  # as in a copied dataset
+                    theirs = published_manifest(self._store)
+                    shard = {entry.name: entry for entry in theirs.shards}[name]
+                    planned = planned_scenes_of(theirs, shard)
+                    note = ShardNote(shard=shard, failures=(), scenes=planned)
                 if (note.scenes or MOST_SCENES) < len(scenes):
                     self._unpack(note, scenes[: note.scenes])
                     continue
@@ -219,21 +227,13 @@ class PublishedShards:
                     unpack_shard(self._folder, note, scenes, tar)
         self._unpacked.add(note.shard.name)
 
-    def _manifest_names(self) -> set[str]:
-        """Return the shards that the bucket's manifest lists: of a grown or copied dataset."""
-        if self._names_listed is None:
-            self._names_listed = {shard.name for shard in published_manifest(self._store).shards}
-        return self._names_listed
-
     def notes(self, names: Sequence[str]) -> list[ShardNote]:
         """Return the notes on finished shards: from the folder, or else from the bucket."""
         folder = self._folder
         local_names = {
             name for name in names if note_of(folder, name).exists() or folder.shard(name).exists()
         }
-        remote_names = (
-            self._folder.name_of(note_of(folder, name)) for name in names if name not in local_names
-        )
+        remote_names = (name_of_note(name) for name in names if name not in local_names)
         noted = [noted_shard(folder, name) for name in names if name in local_names]
         return noted + fetch_notes(self._store.get, remote_names, folder.display_name)
 
@@ -282,11 +282,14 @@ class PublishedShards:
         name = made.shard.name
         folder = self._folder
         log = folder.root / log_name(name)
-        note = self._folder.name_of(note_of(folder, name))
+        note = name_of_note(name)
         first = self._store.create_if_absent(name, folder.shard(name))
         theirs = None if first else self._read_note(name)
         if not first and theirs is None:
-            theirs = dataclasses.replace(made, shard=self._index_remote(name))
+            assert isinstance(self._store, RemoteStore)
+            url = self._store.url.child(name)
+            with shard_cache().open(url, num_bytes=None, sha256=None) as stream:
+                theirs = dataclasses.replace(made, shard=index_stream(stream, Path(name).name))
             if theirs.shard.num_samples < made.shard.num_samples:
                 theirs = dataclasses.replace(theirs, scenes=0)
             elif not self._store.create_if_absent(note, encode_note(theirs)):
@@ -362,7 +365,7 @@ class PublishedShards:
         shutil.rmtree(self._folder.staged_sent, ignore_errors=True)  # it is looked at again
         if theirs is None:
             return
-        publish_plan(self._store, theirs.num_scenes)
+        self._store.put(f"{PLANNED}{theirs.num_scenes:012d}", b"\n")
         if own_head:  # as the shards here were packed
             theirs = dataclasses.replace(
                 theirs, num_scenes=own_head.num_scenes, growing=own_head.growing
@@ -373,22 +376,10 @@ class PublishedShards:
         write_manifest(self._folder.manifest, theirs)
 
     def _read_note(self, name: str) -> ShardNote | None:
-        data = self._store.get(note := self._folder.name_of(note_of(self._folder, name)))
+        data = self._store.get(note := name_of_note(name))
         if data is None:
             return None
         return fetch_notes(lambda _: data, [note], self._folder.display_name)[0]
-
-    def _note_of_list(self, name: str) -> ShardNote:
-        """Return a note made of the manifest's entry of a shard, as in a copied dataset."""
-        theirs = published_manifest(self._store)
-        shard = {entry.name: entry for entry in theirs.shards}[name]
-        return ShardNote(shard=shard, failures=(), scenes=planned_scenes_of(theirs, shard))
-
-    def _index_remote(self, name: str) -> ShardEntry:
-        assert isinstance(self._store, RemoteStore)
-        url = self._store.url.child(name)
-        with shard_cache().open(url, num_bytes=None, sha256=None) as stream:
-            return index_stream(stream, Path(name).name)
 
     def _mark_sent(self, name: str) -> None:
         path = self._folder.staged_sent / name
@@ -424,12 +415,6 @@ def _forget_unused(folder: DatasetFolder) -> None:
         folder.objects_lock.unlink(missing_ok=True)  # a kill came before the manifest named it
         if not folder.shard_files() and not any(folder.staged_samples.rglob("*.tar")):
             folder.manifest.unlink()
-
-
-def publish_plan(store: Store, num_scenes: int) -> None:
-    """Publish a requested number of scenes; in a folder the manifest does so."""
-    if not store.is_here:
-        store.put(f"{PLANNED}{num_scenes:012d}", b"\n")
 
 
 log = logging.getLogger("trilight.scenes")

@@ -19,7 +19,7 @@ from model.open import BUILTIN, BUILTIN_NETWORKS
 from pipeline.assets.recipe import RECIPE
 from pipeline.assets.settings import AssetSettings, OwnMaterialSettings
 from pipeline.exchange.usd.write_usd import write_usd
-from pipeline.generation.prepare_isolated import asset_store, prepare_isolated
+from pipeline.generation.prepare_isolated import asset_store, mesh_stage
 from pipeline.generation.scene_worker import MAX_ATTEMPTS
 from pipeline.objects.generated import generate_objects
 from pipeline.objects.local.folder import list_folder
@@ -75,7 +75,8 @@ def benchmark_digests() -> dict[str, str]:
 
 def _pool(settings: DatasetSettings, folder: Path) -> list[PooledAsset]:
     records = generate_objects(str(settings.source), folder)
-    prepared, rejected = prepare_isolated(records, settings.assets, workers=2, done=lambda: None)
+    with mesh_stage(settings.assets, workers=2) as prepare:
+        prepared, rejected = prepare(records, lambda: None)
     assert not rejected
     pool = []
     for asset in prepared:
@@ -142,7 +143,8 @@ def mesh_digests() -> dict[str, Any]:
 
 
 def _outcome_digest(records: list[ObjectRecord], settings: AssetSettings) -> str:
-    prepared, failures = prepare_isolated(records, settings, workers=2, done=lambda: None)
+    with mesh_stage(settings, workers=2) as prepare:
+        prepared, failures = prepare(records, lambda: None)
     outcomes = {asset.record.uid: asset.asset_sha256 for asset in prepared}
     outcomes |= {failure.item: failure.reason for failure in failures}
     return f"{len(outcomes)} outcomes {sha256_hex(canonical_json(outcomes))}"

@@ -128,7 +128,7 @@ def test_existing_scenes_become_a_dataset(
     with (scenes / "objects/cbox/tall-box.obj").open("a") as stream:
         stream.write("\n")
     changed = refused("generate", "smoke", "--scenes-from", "scenes", "--out", "set", *EXACT)
-    assert "scene file objects/cbox/tall-box.obj: has changed" in changed
+    assert "scene files: 'objects/cbox/tall-box.obj' has changed" in changed
     assert DatasetFolder(tmp_path / "set").shard(shard.name).exists()
 
 

@@ -22,7 +22,7 @@ from infra.setup.generated_pages import ROOTS, reachable
 from model.config import BaseWidths, ModelConfig, smoke, tiny
 from pipeline.assets.settings import AssetSettings, GateSettings, OwnMaterialSettings
 from pipeline.flows.forms import DatasetInRuns
-from pipeline.generation.price import CorePrice
+from pipeline.generation.generate_options import CorePrice
 from pipeline.generation.revisit_options import RevisitOptions
 from pipeline.presets.registry import preset_settings
 from pipeline.presets.settings import DatasetSettings, GivenCamera, RevisitSettings

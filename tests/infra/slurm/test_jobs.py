@@ -214,8 +214,7 @@ RUN = SubmittedRun(
 
 def seen(state: str, **more: Any) -> RunStatus:
     plain: dict[str, Any] = {"message": "", "percent": 50.0, "tables": {}}
-    ended = state in ("Completed", "Crashed")
-    told = {**plain, "is_final": ended, "is_completed": state == "Completed", **more}
+    told = {**plain, "is_completed": state == "Completed", **more}
     return RunStatus(state=state, **told)
 
 

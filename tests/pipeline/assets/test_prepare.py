@@ -22,7 +22,7 @@ from pipeline.assets.quality.measure import Surface
 from pipeline.assets.recipe import RECIPE, methods_of
 from pipeline.assets.settings import AssetSettings, GateSettings
 from pipeline.foreign.mesh import TriangleMesh
-from pipeline.generation.prepare_isolated import prepare_isolated
+from pipeline.generation.prepare_isolated import mesh_stage
 from pipeline.objects.generated import generate_objects
 from pipeline.objects.sources import find_objects
 from pipeline.presets.registry import preset_settings
@@ -274,7 +274,8 @@ def test_an_outcome_changes_only_with_the_number(
     monkeypatch.setenv("TRILIGHT_CACHE", str(tmp_path / "cache"))
     records = generate_objects("builtin:4", tmp_path)
     two = AssetSettings(budgets=(340, 240))
-    prepared, failures = prepare_isolated(records, two, workers=1, done=lambda: None)
+    with mesh_stage(two, workers=1) as prepare:
+        prepared, failures = prepare(records, lambda: None)
     outcomes = [[asset.record.uid, asset.asset_sha256] for asset in prepared]
     digest = sha256_hex(canonical_json([outcomes, [failure.reason for failure in failures]]))
     known = OUTCOMES.get((RECIPE.split()[0], vector_extension()), digest)

@@ -13,13 +13,14 @@ import pytest
 
 from pipeline.exchange.scene_files import SceneFiles, find_scene_files
 from pipeline.generation import render_workers
-from pipeline.generation.accept_scene_files import (
+from pipeline.generation.dataset_writer import begin_or_resume_dataset
+from pipeline.generation.generate_options import GenerateOptions
+from pipeline.generation.scene_origins import (
     accept_scene_files,
     build_once,
     settings_for_files,
 )
-from pipeline.generation.dataset_writer import begin_or_resume_dataset
-from pipeline.generation.generate_options import GenerateOptions
+from pipeline.isolation import ChildPool
 from pipeline.presets.registry import preset_settings
 from pipeline.presets.settings import DatasetSettings
 from storage.dataset.layout import DatasetFolder
@@ -37,7 +38,7 @@ CAMERA = {"position": [0, -2, 0], "look_at": [0, 0, 0], "up": [0, 0, 1], "fov": 
 def no_child(monkeypatch: pytest.MonkeyPatch) -> None:
     """Accept files without a child, of which each costs seconds."""
     here = SimpleNamespace(call=lambda function, *args: function(*args), close=lambda: None)
-    child = "pipeline.generation.accept_scene_files.asset_child"
+    child = "pipeline.generation.scene_origins.asset_child"
     monkeypatch.setattr(child, lambda confined_to: here)
 
 
@@ -93,9 +94,7 @@ def _scene(files: SceneFiles, scene_index: int, settings: DatasetSettings) -> Sc
 
 def _accept(folder: Path, out: Path, licence: str | None = None) -> object:
     found, settings = find_scene_files(str(folder)), _settings(folder)
-    publication = begin_or_resume_dataset(
-        DatasetFolder(out), settings, {}, 1, accept_environment=False
-    )
+    publication = begin_or_resume_dataset(DatasetFolder(out), settings, {}, 1)
     return accept_scene_files(found, licence, settings, publication).origin
 
 
@@ -196,11 +195,11 @@ def test_files_are_frozen_by_digest(folder: Path, tmp_path: Path) -> None:
     mesh = folder / "meshes/green.obj"
     before = mesh.read_bytes()
     mesh.write_bytes(before + b"\n")
-    with pytest.raises(TrilightError, match="scene file meshes/green.obj: has changed"):
+    with pytest.raises(TrilightError, match="scene files: 'meshes/green.obj' has changed"):
         _accept(folder, out)
     mesh.write_bytes(before)
     _change(folder, "b.json", remesh=False)
-    with pytest.raises(TrilightError, match="scene file b.json: has changed"):
+    with pytest.raises(TrilightError, match="scene files: 'b.json' has changed"):
         _accept(folder, out)
     shutil.copy(folder / "a.json", folder / "c.json")
     with pytest.raises(TrilightError, match="listed_scenes was 2, now 3"):
@@ -224,12 +223,14 @@ def test_a_run_reads_files_in_a_confined_child(
     settings = _settings(folder)
     (folder / "c.json").write_text((folder / "a.json").read_text())
     files = _files(folder, "a.json", "c.json", **{"c.json": "it is not wanted"})
+    no_renderer = cast(Any, lambda number: SimpleNamespace(close=lambda: None))
+    monkeypatch.setattr(render_workers, "_render_pool", lambda job: ChildPool(no_renderer, 1))
     job = cast(Any, SimpleNamespace(
         folder=DatasetFolder(tmp_path / "set"), settings=settings, lock_sha256="",
         accepted=SimpleNamespace(origin=files), num_at_once=1, device="",
     ))  # fmt: skip
     try:
-        with render_workers.scene_reader(job) as read:
+        with render_workers.job_children(job) as (_, read):
             assert read is not None
             scene, expected = read(0), _scene(files, 0, settings)
             assert scene.provenance == expected.provenance
@@ -241,12 +242,14 @@ def test_a_run_reads_files_in_a_confined_child(
                 patch.setattr(render_workers, "call_with_retries", lambda *asked: wrong)
                 with pytest.raises(TrilightError):
                     read(0)
-            (child,) = next(iter(render_workers._pools.values()))._children
+            (children,) = render_workers._jobs.values()
+            assert children.readers is not None
+            (child,) = children.readers._children
             assert child._reach is not None and child._reach.reads == {folder.resolve()}
     finally:
         render_workers.close_children()
     job.accepted.origin = NO_OBJECTS.origin
-    with render_workers.scene_reader(job) as nothing:
+    with render_workers.job_children(job) as (_, nothing):
         assert nothing is None
 
 

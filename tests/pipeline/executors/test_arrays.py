@@ -274,8 +274,7 @@ def test_what_an_executor_is_and_has_no_use_for() -> None:
         find_executor("thread", None, None)
     assert set(EXECUTORS) == {"threads", "slurm", "kubernetes", "prefect", "dask"}
     for name in ("executors.threads:make", "executors.threads:make_slurm",
-                 "executors.threads:make_kubernetes", "flows.flow_executors:make_on_prefect",
-                 "flows.flow_executors:make"):  # fmt: skip
+                 "executors.threads:make_kubernetes", "flows.flow_executors:make"):  # fmt: skip
         home, _, function = name.partition(":")
         make = getattr(import_module(f"pipeline.{home}"), function)
         assert make.__code__.co_varnames[: make.__code__.co_argcount] == ("options", "address")

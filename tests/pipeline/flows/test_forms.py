@@ -2,7 +2,6 @@
 
 import base64
 import contextlib
-import dataclasses
 import io
 import json
 import logging
@@ -27,8 +26,6 @@ from pipeline.executors.slurm_and_kubernetes import (
     options_from_environment,
 )
 from pipeline.flows import flow_executors, prefect_flows, prefect_runner
-from pipeline.flows import prefect_flows as building
-from pipeline.flows import prefect_runner as runner
 from pipeline.flows.forms import DatasetInRuns, DatasetOverrides, changed_values, options_of_form
 from pipeline.flows.prefect_flows import (
     build_dataset,
@@ -38,16 +35,16 @@ from pipeline.flows.prefect_flows import (
 )
 from pipeline.flows.prefect_runner import (
     PrefectRunner,
-    RunArtifacts,
+    RunPage,
     is_retryable,
+    make_with_page,
     report_url,
     small_picture,
     usd_per_core_hour,
 )
 from pipeline.flows.prefect_server import GPU_LIMIT, run_to_end
-from pipeline.generation.dataset_writer import DatasetProgress
 from pipeline.generation.generate_options import GenerateOptions
-from pipeline.generation.generation_run import TaskResult, shard_ranges
+from pipeline.generation.generation_run import TaskResult
 from pipeline.presets.settings import DatasetSettings
 from storage.errors import EnvironmentFailure, TrilightError
 from tests.for_each import for_each
@@ -63,8 +60,9 @@ FLOWS = {
 }
 
 
-def _defaults(**given: Any) -> dict[str, Any]:
-    plain = {field.name: field.default for field in dataclasses.fields(GenerateOptions)}
+def _parameters(kind: Any = GenerateOptions, **given: Any) -> dict[str, Any]:
+    """Return the parameters of a flow that takes the options of a class."""
+    plain = {name: getattr(kind(), name) for name in kind.__dataclass_fields__}
     return {**plain, "changes": None, **given}
 
 
@@ -104,9 +102,9 @@ def test_changes_become_dotted_names() -> None:
     form = DatasetOverrides(**{"renders": {"max_spp": 64}, "storage": {"profile": "lossless"}})
     expected = {"renders.max_spp": 64, "storage.profile": "lossless"}
     assert changed_values(form) == expected
-    order = options_of_form(_defaults(scenes=3, changes=form), GenerateOptions)
+    order = options_of_form(_parameters(scenes=3, changes=form), GenerateOptions)
     assert order == GenerateOptions(scenes=3, changes=expected)
-    assert options_of_form(_defaults(), GenerateOptions) == GenerateOptions()
+    assert options_of_form(_parameters(), GenerateOptions) == GenerateOptions()
 
 
 @for_each(
@@ -170,7 +168,7 @@ def test_a_place_that_cannot_be_written_is_refused_by_name() -> None:
     """Before anything is begun: a flow makes its order first."""
     for out in ("https://host/set", "hf://datasets/ada/set", "ftp://host/set"):
         with pytest.raises(TrilightError, match=f"^out '{out}'"):
-            options_of_form(_defaults(out=out), GenerateOptions)
+            options_of_form(_parameters(out=out), GenerateOptions)
 
 
 def test_only_what_can_pass_is_tried_again() -> None:
@@ -193,12 +191,6 @@ def test_only_what_can_pass_is_tried_again() -> None:
     assert list(outcomes.values()) == [True, True, False, False]
 
 
-def _parameters(**given: Any) -> dict[str, Any]:
-    example = DatasetInRuns()
-    plain = {name: getattr(example, name) for name in DatasetInRuns.__dataclass_fields__}
-    return {**plain, "changes": None, **given}
-
-
 @pytest.fixture
 def made(monkeypatch: pytest.MonkeyPatch) -> list[str | None]:
     """Which ranges are made, those of other runs first; nothing is."""
@@ -208,25 +200,22 @@ def made(monkeypatch: pytest.MonkeyPatch) -> list[str | None]:
         ranges.append(f"{deployment} {parameters['shards']}")
 
     status = SimpleNamespace(shards_planned=10)
-    monkeypatch.setattr(building, "prepare_assets", lambda **given: None)
-    monkeypatch.setattr(building, "read_status", lambda out: status)
-    monkeypatch.setattr(building, "run_deployment", started)
-    monkeypatch.setattr(building, "generate_scenes", lambda **given: ranges.append(given["shards"]))
+    monkeypatch.setattr(prefect_flows, "prepare_assets", lambda **given: None)
+    monkeypatch.setattr(prefect_flows, "read_status", lambda out: status)
+    monkeypatch.setattr(prefect_flows, "run_deployment", started)
+    monkeypatch.setattr(
+        prefect_flows, "generate_scenes", lambda **given: ranges.append(given["shards"])
+    )
     return ranges
 
 
 def test_so_many_flow_runs_are_so_many_in_all(made: list[str | None]) -> None:
-    flow: Any = building.build_dataset
-    flow.fn(**_parameters(flow_runs=3, deployment="d/x"))
+    flow: Any = prefect_flows.build_dataset
+    flow.fn(**_parameters(DatasetInRuns, flow_runs=3, deployment="d/x"))
     assert made == ["d/x 3:6", "d/x 6:10", "0:3", None]
     made.clear()
-    flow.fn(**_parameters())
+    flow.fn(**_parameters(DatasetInRuns))
     assert made == [None]
-
-
-def test_there_are_no_more_ranges_than_shards() -> None:
-    assert shard_ranges(2, 5) == ["0:1", "1:2"]
-    assert shard_ranges(7, 1) == ["0:7"]
 
 
 @for_each(
@@ -239,7 +228,7 @@ def test_there_are_no_more_ranges_than_shards() -> None:
 )
 def test_wrong_numbers_of_runs_are_named(given: dict[str, Any], message: str) -> None:
     with pytest.raises(TrilightError, match=message):
-        options_of_form(_parameters(**given), DatasetInRuns)
+        options_of_form(_parameters(DatasetInRuns, **given), DatasetInRuns)
 
 
 @for_each(("device", "held"), [("gpu", [1]), ("cpu", [])])
@@ -254,18 +243,20 @@ def test_rendering_on_a_gpu_takes_its_limit(
         taken.append(occupy)
         yield
 
-    monkeypatch.setattr(runner, "concurrency", limit)
-    monkeypatch.setattr(runner, "make_task", lambda job, pieces: (job, pieces, list(taken)))
-    monkeypatch.setattr(runner.make_scenes, "submit", cast(Any, runner.make_scenes).fn)
+    monkeypatch.setattr(prefect_runner, "concurrency", limit)
+    monkeypatch.setattr(prefect_runner, "make_task", lambda job, pieces: (job, pieces, list(taken)))
+    monkeypatch.setattr(
+        prefect_runner.make_scenes, "submit", cast(Any, prefect_runner.make_scenes).fn
+    )
     job, pieces = SimpleNamespace(device=device), (SimpleNamespace(shard_index=0, first=0),)
-    submit = cast(Any, runner.PrefectRunner().submit)
+    submit = cast(Any, prefect_runner.PrefectRunner().submit)
     assert submit(pieces, job) == (job, pieces, held)
 
 
 def test_documents_are_tried_again_where_that_can_help() -> None:
-    task = cast(Any, runner.write_documents_task)
-    assert task.retries == cast(Any, runner.make_scenes).retries > 0
-    assert task.retry_condition_fn is runner.is_retryable
+    task = cast(Any, prefect_runner.write_documents_task)
+    assert task.retries == cast(Any, prefect_runner.make_scenes).retries > 0
+    assert task.retry_condition_fn is prefect_runner.is_retryable
 
 
 def test_a_dask_worker_that_sees_another_folder_is_named_before_any_work(tmp_path: Path) -> None:
@@ -377,34 +368,17 @@ def shown(monkeypatch: pytest.MonkeyPatch) -> Shown:
     return _shown(monkeypatch)
 
 
-def _task(scenes: int, seconds: float) -> TaskResult:
-    return TaskResult(shards=(), scenes=scenes, seconds=seconds, core_s=seconds)
-
-
 def test_a_page_that_cannot_be_shown_does_not_end_the_run(
     tables: Any, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
 ) -> None:
     _cannot_show(monkeypatch)
-    watched = RunArtifacts(GenerateOptions(out=str(tmp_path)))
-    watched.record_task(None, _task(1, 1.0))  # type: ignore[arg-type]
-    watched.show_failure(ValueError("x"))
+    page = RunPage(str(tmp_path))
+    page.record_task(cast(Any, None), TaskResult(shards=(), scenes=1, seconds=1.0, core_s=1.0))
+    page.show_failure(ValueError("x"))
     assert [record.levelname for record in caplog.records] == ["WARNING"]
 
 
-def test_the_rate_begins_with_the_first_scene(
-    tables: Any, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    """An hour of preparing objects, then 4 scenes in 20 s."""
-    now = 0.0
-    monkeypatch.setattr(prefect_runner.time, "monotonic", lambda: now)
-    watched = RunArtifacts(GenerateOptions(out=str(tmp_path)))
-    assert watched.scenes_per_s() == 0
-    now = 3620.0
-    watched.record_task(None, _task(4, 20.0))  # type: ignore[arg-type]
-    assert watched.scenes_per_s() == 4 / 20
-
-
-def test_a_page_shows_the_scenes_and_where_their_report_is(
+def test_a_page_shows_the_progress_the_scenes_and_where_their_report_is(
     tables: Shown, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     pictures: list[str] = []
@@ -412,43 +386,27 @@ def test_a_page_shows_the_scenes_and_where_their_report_is(
         prefect_runner, "create_image_artifact", lambda url, **named: pictures.append(url)
     )
     monkeypatch.delenv("TRILIGHT_PUBLIC_URL", raising=False)
+    without_rendering(monkeypatch)
     out = tmp_path / "set"
-    out.mkdir()
+    make_with_page(tiny_order(out=str(out), scenes=8), Undocumented())
+    assert [key for key, _ in tables] == ["progress", "summary"]  # the second task: too soon
+    assert (tables[0][1]["shards"], tables[0][1]["scenes in shards"]) == ("1 of 2", "4 of 8")
+    assert tables[1][1]["shards"] == "2 of 2"
+    assert "core-hours" in tables[1][1]["cost"]
+    (out / "README.md").write_text("# A set")  # the last document
     Image.effect_noise((1200, 800), 80).save(out / "contact_sheet.png")
-    statistics = SimpleNamespace(lines=lambda: [("views", "16")])
-    outcome: Any = SimpleNamespace(
-        num_shards=1, num_shards_planned=1, digest="d", statistics=statistics
-    )
-    RunArtifacts(GenerateOptions(out=str(out))).show_result(outcome)
-    ((_, rows),) = tables
+    statistics: Any = SimpleNamespace(lines=lambda: [("views", "16")])
+    RunPage(str(out)).show_result(statistics)
+    rows = tables[-1][1]
     assert (rows["report"], rows["views"]) == (f"{out}/report.html", "16")
-    (url,) = pictures
+    assert len(rows["dataset digest"]) > 8
+    url = pictures[-1]
     assert url == small_picture(out / "contact_sheet.png")
     kind, _, data = url.partition(",")
     with Image.open(io.BytesIO(base64.b64decode(data))) as shown:
         assert (kind, shown.format, shown.size) == (
             "data:image/jpeg;base64", "JPEG", (1024, 683)
         )  # fmt: skip
-
-
-def test_the_page_ends_with_how_far_everything_is(
-    tables: Shown, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.setattr(prefect_runner.time, "monotonic", lambda: 0.0)
-    watched = RunArtifacts(GenerateOptions(out=str(tmp_path)))
-    done = DatasetProgress(shards=1, scenes=4, shards_requested=2, scenes_requested=8)
-    publication = SimpleNamespace(progress=done, manifest=SimpleNamespace(num_views=2))
-    run: Any = SimpleNamespace(publication=publication)
-    watched.record_task(run, _task(4, 1.0))
-    publication.progress = DatasetProgress(
-        shards=2, scenes=8, shards_requested=2, scenes_requested=8, given_up=1
-    )
-    watched.record_task(run, _task(4, 1.0))  # too soon for another table
-    outcome: Any = SimpleNamespace(num_shards=2, num_shards_planned=2, digest="d", statistics=None)
-    watched.show_result(outcome)
-    assert [key for key, _ in tables] == ["progress", "progress", "summary"]
-    shown = [(rows["shards"], rows["scenes in shards"]) for _, rows in tables[:2]]
-    assert shown == [("1 of 2", "4 of 8"), ("2 of 2", "7 of 8")]
 
 
 def test_a_run_that_fails_says_so_in_its_summary(
@@ -459,12 +417,11 @@ def test_a_run_that_fails_says_so_in_its_summary(
 
     monkeypatch.setattr(prefect_runner, "make_dataset", full)
     with pytest.raises(TrilightError):
-        prefect_runner.make_with_artifacts(GenerateOptions(out=str(tmp_path)), PrefectRunner())
+        make_with_page(GenerateOptions(out=str(tmp_path)), PrefectRunner())
     ((key, rows),) = tables
     assert key == "summary"
     assert rows["failed"].startswith("TrilightError: the disk is full")
     assert "secret" not in rows["failed"]
-    assert "core-hours" in rows["cost of this run"]
 
 
 @for_each("text", ["cheap", "-1", "nan", "inf", ""])
@@ -475,7 +432,7 @@ def test_a_price_that_is_none_is_named_at_the_start(
     assert usd_per_core_hour() == 0.5
     monkeypatch.setenv("TRILIGHT_USD_PER_CORE_HOUR", text)
     with pytest.raises(TrilightError, match=rf"TRILIGHT_USD_PER_CORE_HOUR is '{text}'; expected"):
-        RunArtifacts(GenerateOptions())
+        RunPage("data/smoke")
 
 
 @pytest.fixture
@@ -502,15 +459,9 @@ def cluster(monkeypatch: pytest.MonkeyPatch) -> list[list[int]]:
 
 
 def run(**given: Any) -> None:
-    plain = {
-        each.name: getattr(tiny_order(), each.name) for each in dataclasses.fields(GenerateOptions)
-    }
-    own = {name: DatasetByArray.__dataclass_fields__[name].default for name in _OWN}
     flow: Any = make_by_array
-    checked = flow.validate_parameters(
-        {**plain, **own, "changes": {"scenes": {"num_views": 2}}, **given}
-    )
-    flow.fn(**checked)
+    tiny = {"resolution": 16, "changes": {"scenes": {"num_views": 2}}}
+    flow.fn(**flow.validate_parameters(_parameters(DatasetByArray, **tiny, **given)))
 
 
 _OWN = set(DatasetByArray.__dataclass_fields__) - set(GenerateOptions.__dataclass_fields__)
@@ -539,18 +490,6 @@ def test_who_watches_alone_asks_for_nothing_and_waits_so_long(
     with pytest.raises(TrilightError, match=r"no new scene for 0\.0001 hours \(none made\)"):
         run(out=str(tmp_path / "set"), scheduler="none", quiet_hours=0.0001)
     assert cluster == [] and shown == []
-
-
-def test_a_page_that_cannot_be_shown_does_not_end_an_array(
-    shown: Shown,
-    cluster: list[list[int]],
-    tmp_path: Path,
-    monkeypatch: pytest.MonkeyPatch,
-    caplog: pytest.LogCaptureFixture,
-) -> None:
-    _cannot_show(monkeypatch)
-    run(out=str(tmp_path / "set"), scenes=4)
-    assert [record.levelname for record in caplog.records].count("WARNING") == 1
 
 
 def test_machines_are_those_of_the_worker(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

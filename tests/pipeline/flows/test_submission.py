@@ -125,14 +125,13 @@ def test_a_run_is_looked_at_until_it_has_ended_and_one_that_failed_is_no_success
     slept: list[float] = []
     seen = list(poll_run(served, uuid4(), slept.append))  # type: ignore[arg-type]
     assert [look.state for look in seen] == ["Scheduled", "Running", "Completed"]
-    assert [look.is_final for look in seen] == [False, False, True]
     assert seen[-1].is_completed and seen[-1].message == "all there"
     assert seen[-1].percent == 75.0
     assert seen[-1].tables == {"progress": [("scenes in shards", "3 of 4")]}
     assert len(slept) == 2
     served = Server(["local"], (Failed(message="no space"),))
     (last,) = poll_run(served, uuid4())  # type: ignore[arg-type]
-    assert (last.is_final, last.is_completed, last.message) == (True, False, "no space")
+    assert (last.is_completed, last.message) == (False, "no space")
 
 
 def test_no_server_a_closed_port_and_a_password() -> None:

@@ -91,9 +91,7 @@ class Machines:
         folder = dataset_folder(OUT)
         build = preset_settings("smoke", changes=changes) if changes else _build()
         with hold_dataset_lock(folder):
-            yield begin_or_resume_dataset(
-                folder, build, ENVIRONMENT, scenes, accept_environment=False
-            )
+            yield begin_or_resume_dataset(folder, build, ENVIRONMENT, scenes)
 
 
 def other_shard(writer: DatasetWriter) -> Any:

@@ -1,5 +1,6 @@
 """Objects that no mesh stage has made: files and assets by hand, and what stands for the stage."""
 
+import contextlib
 import dataclasses
 import functools
 import hashlib
@@ -11,10 +12,11 @@ import pytest
 
 from pipeline.assets.stage import PreparedObject
 from pipeline.generation import object_batches
+from pipeline.generation.accept_maps import AcceptedMaps
 from pipeline.generation.dataset_writer import DatasetWriter, begin_or_resume_dataset
 from pipeline.generation.freeze_objects import ObjectLock
 from pipeline.generation.prepare_isolated import asset_store
-from pipeline.generation.revisited_scenes import AcceptedObjects
+from pipeline.generation.scene_origins import AcceptedObjects
 from pipeline.presets.registry import preset_settings
 from pipeline.presets.settings import DatasetSettings
 from storage.dataset.layout import DatasetFolder
@@ -62,9 +64,7 @@ def prepared(number: int) -> PreparedObject:
 
 def begun(root: Path) -> DatasetWriter:
     """Begin a dataset of four scenes."""
-    return begin_or_resume_dataset(
-        DatasetFolder(root), build(), ENVIRONMENT, 4, accept_environment=False
-    )
+    return begin_or_resume_dataset(DatasetFolder(root), build(), ENVIRONMENT, 4)
 
 
 def asked(writer: DatasetWriter, source: str = SOURCE, licence: str | None = None) -> ObjectLock:
@@ -74,7 +74,7 @@ def asked(writer: DatasetWriter, source: str = SOURCE, licence: str | None = Non
 
 def frozen(writer: DatasetWriter, objects: Sequence[PreparedObject]) -> AcceptedObjects:
     """Freeze objects, as after the mesh stage."""
-    return asked(writer).freeze_prepared([*objects], [], len(objects))
+    return asked(writer).freeze_prepared([*objects], [], len(objects), AcceptedMaps())
 
 
 class Mesher:
@@ -102,19 +102,14 @@ class Mesher:
             done()
         return assets, failures
 
-    def __enter__(self) -> "Mesher":
-        return self
-
-    def __exit__(self, *error: object) -> None:
-        """Hold nothing."""
-
 
 def use_mesher(monkeypatch: pytest.MonkeyPatch, *, batch: int) -> Mesher:
     """Replace the mesh stage, with batches of so many objects and short pauses."""
     mesher = Mesher()
     monkeypatch.setattr(object_batches, "_NUM_OBJECTS", batch)
     monkeypatch.setattr(object_batches, "_PAUSES_S", (0.001, 0.05))
-    monkeypatch.setattr(object_batches, "MeshWork", lambda settings, workers: mesher)
+    stage = contextlib.nullcontext(mesher.prepare)
+    monkeypatch.setattr(object_batches, "mesh_stage", lambda settings, workers: stage)
     return mesher
 
 

@@ -6,7 +6,6 @@ import re
 from pathlib import Path
 
 import pytest
-from prefect.exceptions import ParameterTypeError
 
 from infra.repair import repair
 from pipeline.exchange.reader import file_child
@@ -46,7 +45,7 @@ TRAP = "from pathlib import Path\nPath(__file__).with_suffix('.ran').touch()\n"
 
 def _begin(root: Path) -> None:
     build = preset_settings("smoke")
-    begin_or_resume_dataset(DatasetFolder(root), build, ENVIRONMENT, 4, accept_environment=False)
+    begin_or_resume_dataset(DatasetFolder(root), build, ENVIRONMENT, 4)
 
 
 def test_the_manifest_records_what_had_part_in_a_dataset(tmp_path: Path) -> None:
@@ -172,15 +171,6 @@ def test_a_dataset_never_causes_an_import(
     assert not list(tmp_path.rglob("*.ran"))
 
 
-def test_a_form_cannot_name_a_file(tmp_path: Path) -> None:
-    from pipeline.flows.prefect_flows import generate_scenes
-
-    trap = written(tmp_path, TRAP)
-    with pytest.raises(ParameterTypeError, match="build"):
-        generate_scenes.validate_parameters({"build": f"{trap}:f"})
-    assert not list(tmp_path.rglob("*.ran"))
-
-
 def test_families_are_chosen_by_name() -> None:
     with loaded(EXAMPLES / "family.py"):
         for names in ("crowd", ["crowd", "plane-single"]):
@@ -302,9 +292,7 @@ def test_what_was_only_begun_is_begun_anew(tmp_path: Path, monkeypatch: pytest.M
     without_rendering(monkeypatch)
     folder = DatasetFolder(tmp_path / "set")
     with folder.hold_shared_lock():
-        begin_or_resume_dataset(
-            folder, preset_settings("smoke", seed=5), {}, 24, accept_environment=False
-        )
+        begin_or_resume_dataset(folder, preset_settings("smoke", seed=5), {}, 24)
     run = prepare_dataset(tiny_order(out=str(folder.root), scenes=4, seed=7))
     assert run.publication.manifest.settings["seed"] == 7
     assert run.publication.manifest.num_scenes == 4
@@ -343,9 +331,7 @@ def test_what_has_objects_or_scenes_is_not(tmp_path: Path, monkeypatch: pytest.M
 def test_nobody_forgets_while_another_is_at_work(tmp_path: Path) -> None:
     folder = DatasetFolder(tmp_path / "set")
     with hold_dataset_lock(folder):
-        begin_or_resume_dataset(
-            folder, preset_settings("smoke", seed=5), {}, 4, accept_environment=False
-        )
+        begin_or_resume_dataset(folder, preset_settings("smoke", seed=5), {}, 4)
         with hold_dataset_lock(folder):
             assert read_manifest(folder.manifest).settings["seed"] == 5
 
@@ -354,13 +340,9 @@ def test_who_was_replaced_all_the_same_stops(tmp_path: Path) -> None:
     """Locks do not reach every machine: a maker whose manifest has become another's says so."""
     folder = DatasetFolder(tmp_path / "set")
     with folder.hold_shared_lock():
-        mine = begin_or_resume_dataset(
-            folder, preset_settings("smoke", seed=5), {}, 4, accept_environment=False
-        )
+        mine = begin_or_resume_dataset(folder, preset_settings("smoke", seed=5), {}, 4)
         folder.manifest.unlink()
-        begin_or_resume_dataset(
-            folder, preset_settings("smoke", seed=7), {}, 4, accept_environment=False
-        )
+        begin_or_resume_dataset(folder, preset_settings("smoke", seed=7), {}, 4)
         with pytest.raises(TrilightError, match="another dataset has been begun here"):
             mine.lock_objects([])
 

@@ -14,13 +14,18 @@ import pytest
 from pipeline.documents.rights import encode_attribution
 from pipeline.generation import accept_maps as accepting
 from pipeline.generation import freeze_objects, frozen_pool, pipeline, render_workers
-from pipeline.generation.accept_maps import AcceptedMaps, MapFolders, accept_maps, map_folders
+from pipeline.generation.accept_maps import AcceptedMaps, accept_maps, map_folders
 from pipeline.generation.dataset_writer import DatasetWriter
-from pipeline.generation.freeze_objects import require_same
-from pipeline.generation.frozen_pool import AssetMissing, ComposedScenes, SplitPool, user_maps
+from pipeline.generation.frozen_pool import (
+    AssetMissing,
+    ComposedScenes,
+    SplitPool,
+    require_same,
+    user_maps,
+)
 from pipeline.generation.generate_options import GenerateOptions
 from pipeline.generation.prepare_isolated import asset_store
-from pipeline.generation.revisited_scenes import AcceptedObjects
+from pipeline.generation.scene_origins import AcceptedObjects
 from pipeline.generation.scene_worker import SceneAttempt
 from pipeline.objects.maps.prepared import prepare_map
 from pipeline.presets.registry import preset_settings
@@ -118,7 +123,7 @@ def test_only_a_few_objects_are_open(
     for row in (0, 1, 2, 0, 3, 0, 1):
         assert pool[row].locked.uid == read_objects_lock_uids(made[0])[row]
     assert len(read) == 5  # 0, 1, 2, 3, and 1 again
-    assert len(pool._open) == 3
+    assert pool._open.cache_info().currsize == 3
     for row in (-1, len(pool)):
         with pytest.raises(IndexError):
             pool[row]
@@ -225,7 +230,9 @@ def test_an_object_that_is_there_again_is_found(tmp_path: Path) -> None:
 
 def test_a_frozen_row_that_is_gone_or_has_changed_is_named() -> None:
     row = locked("texture:cloth", kind=TEXTURE)
-    require_same("textures", {row.uid: row}, [row, locked("a")])
+    require_same("textures", {row.uid: row}, [row])
+    with pytest.raises(TrilightError, match="'a' is new"):
+        require_same("textures", {row.uid: row}, [row, locked("a")])
     with pytest.raises(TrilightError, match="'texture:cloth' is missing or no longer usable"):
         require_same("textures", {row.uid: row}, [])
     with pytest.raises(TrilightError, match="'texture:cloth' has changed"):
@@ -259,11 +266,11 @@ def accepted(settings: DatasetSettings, tmp_path_factory: pytest.TempPathFactory
     png(root / "textures" / "copy.bmp", noise(12))
     exr(root / "skies" / "copy.exr", sun_map(12))
     exr(root / "skies" / "bad.exr", np.full((2, 4, 3), np.nan, np.float32))
-    folders = ((TEXTURE, str(root / "textures")), (SKY, str(root / "skies")))
+    folders = {TEXTURE: str(root / "textures"), SKY: str(root / "skies")}
     with pytest.MonkeyPatch.context() as patch:
         patch.setenv("TRILIGHT_CACHE", str(root / "cache"))
         patch.setattr(accepting, "IsolatedChild", ChildHere)
-        return accept_maps(MapFolders(folders=folders), settings, workers=1)
+        return accept_maps(folders, None, settings, workers=1)
 
 
 def test_rows_have_splits_by_content_and_copies_stay_together(accepted: AcceptedMaps) -> None:
@@ -373,7 +380,7 @@ def test_folders_and_shares_belong_together() -> None:
         map_folders(GenerateOptions(textures="t"), preset_settings("smoke", changes=SHARES))
     with pytest.raises(TrilightError, match=r"--textures is given, but .*own_share 0"):
         map_folders(GenerateOptions(textures="t"), preset_settings("smoke"))
-    with pytest.raises(TrilightError, match="only where scenes are composed"):
+    with pytest.raises(TrilightError, match="--scenes-from scenes was given with --textures"):
         GenerateOptions(textures="t", scenes_from="scenes")
     with pytest.raises(TrilightError, match="only with --textures or --skies"):
         GenerateOptions(map_licence="MIT")

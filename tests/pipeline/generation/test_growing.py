@@ -292,7 +292,9 @@ def test_every_scene_is_in_one_task(
     shards: list[int], per_shard: int, seconds: float, most: int
 ) -> None:
     splits = SplitSettings(scenes_per_shard=per_shard)
-    tasks = list(_cutter(1, seconds).iter_tasks(shards, splits, most=most))
+    cutter = _cutter(1, seconds)
+    cutter._tasks_left = most
+    tasks = list(cutter.cut_round(shards, splits))
     expected = [scene for shard in shards for scene in scenes_of_shard(shard, splits)]
     assert _scenes(tasks) == expected
     assert len(tasks) <= most
@@ -306,16 +308,15 @@ def test_a_task_takes_the_time_that_it_should() -> None:
     """At 10 s a scene 24 of them: half a shard of 48, or six of 4."""
     cutter = _cutter(3, 30.0)
     for per_shard, pieces in ((48, 1), (4, 6)):
-        tasks = list(cutter.iter_tasks(range(24), SplitSettings(scenes_per_shard=per_shard)))
+        tasks = list(cutter.cut_round(range(24), SplitSettings(scenes_per_shard=per_shard)))
         assert len(_scenes(tasks[:1])) == TASK_S / 10
         assert len(tasks[0]) == pieces
 
 
 def test_sizes_follow_what_is_measured_on_the_way() -> None:
     cutter = TaskCutter()
-    tasks = cutter.iter_tasks(range(100), SplitSettings(scenes_per_shard=4))
+    tasks = cutter.cut_round(range(100), SplitSettings(scenes_per_shard=4))
     assert len(_scenes([next(tasks)])) == 4
-    next(tasks)  # was cut when the first was handed out
     cutter.record(TaskResult(shards=(), scenes=4, seconds=4.0, core_s=4.0))
     assert len(_scenes([next(tasks)])) == TASK_S
 
@@ -324,7 +325,7 @@ def test_sizes_follow_what_is_measured_on_the_way() -> None:
 def test_several_at_once_all_have_work_until_the_end(at_once: int) -> None:
     """Fast scenes, of which one task could take all: nobody gets more than half of a share."""
     left = 256
-    for task in _cutter(4, 1.0, at_once).iter_tasks(range(64), SplitSettings(scenes_per_shard=4)):
+    for task in _cutter(4, 1.0, at_once).cut_round(range(64), SplitSettings(scenes_per_shard=4)):
         size = len(_scenes([task]))
         assert size <= max(1, left / (2 * at_once))
         left -= size
@@ -348,7 +349,7 @@ def test_all_rounds_of_a_run_are_at_most_a_thousand_tasks() -> None:
         ({"failure_budget": 1.5}, "failure_budget is 1.5"),
         ({"shards": "4:4"}, "shards is '4:4'"),
         ({"views": 2}, "--views is 2"),
-        ({"scenes_from": "a", "scenes": 3}, "expected neither"),
+        ({"scenes_from": "a", "scenes": 3}, "given with --scenes; expected it without"),
     ],
 )
 def test_wrong_orders_are_named(changes: dict[str, object], message: str) -> None:

@@ -138,7 +138,7 @@ def test_meshes_that_are_away_are_made_again_where_a_scene_draws_them(
     was = mesh.read_bytes()
     write_obj(mesh, knot(segments=40))
     (workshop / poison.DEATHS).write_text("0")
-    with pytest.raises(TrilightError, match="'knot0' has changed; expected the objects that"):
+    with pytest.raises(TrilightError, match="'knot0' has changed; expected what"):
         make(workshop, tmp_path / "set")
     mesh.write_bytes(was)
     outcome = make(workshop, tmp_path / "set")

@@ -19,7 +19,7 @@ from pipeline.generation.generate_options import GenerateOptions
 from pipeline.generation.generation_run import Piece, Run, Runner, ShardJob, TaskResult
 from pipeline.generation.pipeline import make_dataset, make_piece
 from pipeline.generation.scene_worker import SceneAttempt
-from pipeline.isolation import ChildFailed, ChildPool, IsolatedChild
+from pipeline.isolation import ChildFailed, IsolatedChild
 from pipeline.shards import pack_shards as pack
 from pipeline.shards.pack_shards import UnfinishedShard, pack_shard
 from storage import file_locks
@@ -40,7 +40,7 @@ from tests.pipeline.generation.test_dataset_writer import (
     begin_tiny,
     make_tiny_shard,
 )
-from tests.pipeline.generation.tiny_scenes_kit import NO_OBJECTS, shard_job
+from tests.pipeline.generation.tiny_scenes_kit import shard_job
 
 NAME = "train-000000.tar"
 
@@ -123,9 +123,8 @@ def test_who_waits_for_others_says_for_whom(
     monkeypatch.setattr(file_locks, "_SILENT_S", 0.0)
     folder, missing = DatasetFolder(tmp_path), [[0], [0], []]
     writer = SimpleNamespace(folder=folder)
-    settings = SimpleNamespace(splits=_build().splits)
     run: Any = SimpleNamespace(
-        publication=writer, settings=settings, unfinished_shards=lambda: missing.pop(0)
+        publication=writer, job=shard_job(tmp_path), unfinished_shards=lambda: missing.pop(0)
     )
     _make(tmp_path, 1, 4, Counter())
     with hold_lock(folder.staged_shard(NAME) / f"{sample_key(0)}.claim"):
@@ -234,10 +233,8 @@ class Idle(Runner[Any]):
 def _run(root: Path, scenes: int) -> Run:
     return Run(
         options=GenerateOptions(out=str(root), scenes=scenes),
-        settings=_build(),
-        scene_folder=None,
         publication=begin_tiny(root, scenes),
-        accepted=NO_OBJECTS,
+        job=shard_job(root),
     )
 
 
@@ -311,7 +308,7 @@ def test_a_rerun_does_not_escape_the_failure_budget(
     with pytest.raises(TrilightError, match=r"4 of 4 .*The reasons are in failures\.jsonl"):
         run.require_within_budget()  # while it is made
     assert [row.item for row in read_failures(folder.failures)] == [*map(sample_key, range(4))]
-    monkeypatch.setattr(pipeline, "_begin_run", lambda order: contextlib.nullcontext(run))
+    monkeypatch.setattr(pipeline, "begin_run", lambda order: contextlib.nullcontext(run))
     with pytest.raises(TrilightError, match="4 of 4 scenes could not be made"):
         make_dataset(run.options, Idle())
 
@@ -320,7 +317,7 @@ def test_scenes_that_are_given_up_are_not_counted_as_made(tmp_path: Path) -> Non
     """While they wait, in a shard that is not listed, and in a finished dataset."""
     run = _run(tmp_path, 4)
     folder = run.publication.folder
-    shard = UnfinishedShard(folder, run.settings.splits, 0)
+    shard = UnfinishedShard(folder, run.job.settings.splits, 0)
     for scene in range(4):
         made = _sample(scene) if scene else None
         shard.stage(scene, made, [], "lossless", began=0.0, cores=1)
@@ -343,17 +340,20 @@ def test_only_children_that_nobody_uses_are_closed(monkeypatch: pytest.MonkeyPat
     """Another run may be at work on the same Dask worker."""
     closed: list[str] = []
 
-    def pool(name: str) -> ChildPool:
-        child = SimpleNamespace(close=lambda: closed.append(name))
-        return ChildPool(lambda number: cast(IsolatedChild, child), 1)
+    def children(name: str) -> SimpleNamespace:
+        lent = SimpleNamespace(borrow=lambda: contextlib.nullcontext("child"))
+        return SimpleNamespace(
+            num_users=0, renderers=lent, readers=None, close=lambda: closed.append(name)
+        )
 
     job = cast(Any, SimpleNamespace(
         folder=DatasetFolder(Path("a")), settings=SimpleNamespace(digest="d"), lock_sha256="l",
         device="cpu",
     ))  # fmt: skip
-    monkeypatch.setattr(render_workers, "_pools", {("b", "d", "l"): pool("other")})
-    monkeypatch.setattr(render_workers, "_render_pool", lambda job: pool("ours"))
-    with render_workers.render_child(job):
+    monkeypatch.setattr(render_workers, "_jobs", {("b", "d", "l"): children("other")})
+    monkeypatch.setattr(render_workers, "_JobChildren", lambda job: children("ours"))
+    with render_workers.job_children(job) as lent:
+        assert lent == ("child", None)
         assert closed == ["other"]
         render_workers.close_idle_children()
         assert closed == ["other"]

@@ -200,7 +200,7 @@ def test_a_server_that_ignores_the_condition_is_refused_before_anything_is_begun
         pytest.raises(TrilightError, match="^out 'gs://shards/made': .*conditional writes"),
         hold_dataset_lock(folder),
     ):
-        begin_or_resume_dataset(folder, _build(), ENVIRONMENT, 8, accept_environment=False)
+        begin_or_resume_dataset(folder, _build(), ENVIRONMENT, 8)
     assert RemoteStore(place("gs://shards/made")).list_all() == {".staging/once"}
     assert not folder.manifest.exists()
 

@@ -1,29 +1,40 @@
-"""`RevisitedScenes`: reads scenes of a finished dataset and adds new cameras, lights, materials.
+"""Where scenes come from: layouts of frozen objects, scene files, or a finished dataset.
 
-A revisit takes scenes, objects and splits of a new dataset from the finished one.
+Scene files are checked and frozen by their digests. A revisit takes scenes, objects and splits of a
+new dataset from a finished one, and adds new cameras, lights and materials.
 """
 
+import contextlib
 import dataclasses
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
-from functools import cached_property
+from functools import cached_property, partial
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from pipeline.exchange.scene_files import SceneFiles
+from pipeline.assets.settings import AssetSettings
+from pipeline.exchange.from_description import AlbedoOverOne, scaled_albedo_notes
+from pipeline.exchange.scene_files import SceneFiles, SceneFolder, build_scene, require_usable
 from pipeline.generation.dataset_writer import DatasetWriter
-from pipeline.generation.frozen_pool import ComposedScenes
+from pipeline.generation.frozen_pool import ComposedScenes, require_same
+from pipeline.generation.prepare_isolated import asset_child
 from pipeline.generation.render_sample import RenderInput
+from pipeline.isolation import ChildFailed, IsolatedChild, call_with_retries, reach
+from pipeline.objects.licences import stated_licence
 from pipeline.presets.settings import DatasetSettings, RevisitSettings
 from pipeline.scenes.redrawn import with_new_lights, with_new_materials
 from pipeline.scenes.views import ViewCamera, cameras_of, require_valid, with_first_cameras
 from pipeline.shards.finished_dataset import FinishedDataset, open_finished
+from storage.dataset.layout import DatasetFolder
 from storage.dataset.manifest import ShardEntry
+from storage.dataset.progress import announce_objects, count_object
 from storage.dataset.settings import ListedShard
+from storage.dataset.splits import JUDGED_SPLIT
 from storage.digests import canonical_json
-from storage.errors import TrilightError
-from storage.records.objects import OBJECT
+from storage.errors import EnvironmentFailure, TrilightError
+from storage.records.objects import OBJECT, LockedObject
 from storage.records.sample import decode_sample
 from storage.records.scene import Scene
 from storage.seeds import SceneKey
@@ -57,7 +68,13 @@ class RevisitedScenes:
             members = opened.members(key)
         sample = decode_sample(key, members)
         origin = self._origin(sample.scene, key, revisit, settings.seed, attempt)
-        scene = _redraw(sample.scene.with_provenance(origin), index, attempt, settings)
+        scene = sample.scene.with_provenance(origin)
+        ranges = settings.scenes.of_scene(origin["scene_index"])
+        scene_key = SceneKey(settings.seed, index, attempt)
+        if revisit.materials == "new":
+            scene = with_new_materials(scene, ranges.materials, scene_key)
+        if revisit.lights == "new":
+            scene = with_new_lights(scene, ranges.lights, revisit.num_lights, scene_key)
         given_cameras = [
             ViewCamera(
                 c2w=np.array(camera.c2w, np.float32).reshape(4, 4),
@@ -68,7 +85,7 @@ class RevisitedScenes:
         ]
         scene = with_first_cameras(
             scene,
-            settings.scenes.of_scene(origin["scene_index"]),
+            ranges,
             first_cameras=[*cameras_of(sample.scene)[: revisit.kept_cameras], *given_cameras],
         )
         if not revisit.keeps_light:
@@ -130,18 +147,6 @@ def require_digest(dataset: FinishedDataset, digest: str) -> None:
         )
 
 
-def _redraw(scene: Scene, index: int, attempt: int, settings: DatasetSettings) -> Scene:
-    revisit = settings.revisit
-    scene_key = SceneKey(settings.seed, index, attempt)
-    assert revisit is not None
-    ranges = settings.scenes.of_scene(scene.provenance["scene_index"])
-    if revisit.materials == "new":
-        scene = with_new_materials(scene, ranges.materials, scene_key)
-    if revisit.lights == "new":
-        scene = with_new_lights(scene, ranges.lights, revisit.num_lights, scene_key)
-    return scene
-
-
 SceneOrigin = ComposedScenes | SceneFiles | RevisitedScenes
 """Layouts, scene files (then the objects are the files), or the scenes of a finished dataset."""
 
@@ -157,18 +162,18 @@ class AcceptedObjects:
     origin: SceneOrigin
 
 
-def settings_for_revisit(settings: DatasetSettings, path: str | None) -> DatasetSettings:
-    """Return the settings of a dataset that has the views and shards of a finished one.
+Accept = Callable[[DatasetWriter], AcceptedObjects]
+"""Freezes the inputs of a dataset's scenes, or requires that they are those that were frozen."""
 
-    Without a path, the settings stay as they are.
+
+def resolve_revisit(settings: DatasetSettings, path: str | None) -> tuple[DatasetSettings, Accept]:
+    """Return the settings of a dataset that has the views and shards of a finished one.
 
     Raises:
         TrilightError: only one of path and `settings.revisit` is given, the dataset at the path is
             unfinished or another one, or its scenes have fewer cameras than `kept_cameras`.
     """
     revisit = settings.revisit
-    if path is None and revisit is None:
-        return settings
     if path is None or revisit is None:
         raise TrilightError(
             f"revisits is {path!r} and the settings of a revisit are "
@@ -198,30 +203,158 @@ def settings_for_revisit(settings: DatasetSettings, path: str | None) -> Dataset
         for shard in shards_with_scenes(source)
     )
     splits = dataclasses.replace(settings.splits, listed_shards=listed)
-    return dataclasses.replace(settings, scenes=scenes, splits=splits)
+    settings = dataclasses.replace(settings, scenes=scenes, splits=splits)
+    return settings, partial(_accept_objects, source)
 
 
-def accept_revisited(
-    path: str, settings: DatasetSettings, writer: DatasetWriter
-) -> AcceptedObjects:
-    """Freeze the objects of a finished dataset for the new one, with their licences and splits.
-
-    Raises:
-        TrilightError: it is not the dataset that the new one was begun with.
-    """
-    source = open_finished(path)
-    assert settings.revisit is not None
-    require_digest(source, settings.revisit.source_digest)
+def _accept_objects(source: FinishedDataset, writer: DatasetWriter) -> AcceptedObjects:
+    """Freeze the objects of a finished dataset for the new one, with their licences and splits."""
     locked = sorted(
         (entry for entries in source.objects.values() for entry in entries),
         key=lambda entry: canonical_json(dataclasses.asdict(entry)),
     )
-    if writer.frozen_objects() is None:
-        writer.add_failures(())
-        writer.lock_objects(locked)
+    with writer.hold_lock("objects"):
+        if writer.frozen_objects() is None:
+            writer.add_failures(())
+            writer.lock_objects(locked)
     root = source.folder.root.resolve()
     return AcceptedObjects(
         num_objects=sum(entry.kind == OBJECT for entry in locked),
         num_found=len(locked),
         origin=RevisitedScenes(root=root, digest=source.manifest.dataset_digest),
     )
+
+
+def settings_for_files(
+    settings: DatasetSettings, folder: SceneFolder, views: int | None
+) -> DatasetSettings:
+    """Return the preset's settings with the number of scenes and views of a folder.
+
+    Raises:
+        TrilightError: a file has fewer cameras than `views`.
+    """
+    return dataclasses.replace(
+        settings,
+        scenes=dataclasses.replace(settings.scenes, num_views=folder.views(views)),
+        splits=dataclasses.replace(
+            settings.splits, one_split=True, listed_scenes=len(folder.names)
+        ),
+    )
+
+
+def accept_scene_files(
+    folder: SceneFolder,
+    licence: str | None,
+    settings: DatasetSettings,
+    writer: DatasetWriter,
+) -> AcceptedObjects:
+    """Build every scene once, without rendering; the first run freezes their files.
+
+    A file that cannot become a scene is noted, and the files that it names are not frozen for it.
+
+    Raises:
+        TrilightError: no scene at all can be built, the licence is not allowed, or the files are
+            not those that the dataset was begun with.
+    """
+    stated = stated_licence(licence)
+    if stated.licence.casefold() not in {name.casefold() for name in settings.allowed_licences}:
+        raise TrilightError(
+            f"--licence is {stated.licence}, which is not on the allow-list; if you may use the "
+            f"scenes, add --allow-licence '{stated.licence}'."
+        )
+    with writer.hold_lock("objects"):
+        files = _build_all(folder, stated.licence, settings, writer.folder)
+        locked = [
+            LockedObject(
+                uid=uid,
+                asset_sha256=digest,
+                split=JUDGED_SPLIT,
+                licence=stated.licence,
+                licence_source=stated.licence_source,
+                title=uid,
+                attribution="",
+                source_url="",
+            )
+            for uid, digest in sorted(files.sha256.items())
+        ]
+        frozen = writer.frozen_objects()
+        if frozen is None:
+            writer.lock_objects(locked)
+        else:
+            require_same("scene files", frozen, locked)
+    return AcceptedObjects(num_objects=len(locked), num_found=len(locked), origin=files)
+
+
+def _build_all(
+    folder: SceneFolder, licence: str, settings: DatasetSettings, out: DatasetFolder
+) -> SceneFiles:
+    """Build every scene; return digests of the usable files, and errors of the others."""
+    announce_objects(out, len(folder.names))
+    num_views = settings.scenes.num_views
+    sha256: dict[str, str] = {}
+    notes: list[str] = []
+    unusable = dict(folder.unusable)
+    with contextlib.closing(asset_child(reach(files=[folder.root]))) as child:
+        for name in folder.names:
+            if name not in unusable:
+                try:
+                    digests, words = _build_in_child(child, folder, name, settings)
+                    sha256 |= digests
+                    notes += words
+                except EnvironmentFailure:
+                    raise
+                except TrilightError as mistake:
+                    unusable[name] = str(mistake)
+            count_object(out)
+    require_usable(folder.names, unusable)
+    left_out = (f"{name} is left out: {why.rstrip('.')}" for name, why in unusable.items())
+    return SceneFiles(
+        root=folder.root,
+        names=folder.names,
+        sha256=sha256,
+        unusable=unusable,
+        licence=licence,
+        albedo_over_one=folder.albedo_over_one,
+        notes=(*notes, *left_out, *folder.notes(num_views)),
+    )
+
+
+def build_once(
+    root: Path, name: str, settings: AssetSettings, num_views: int, over_one: AlbedoOverOne
+) -> tuple[Mapping[str, str], tuple[str, ...]]:
+    """Build a scene once as a check; return the digests of its files, and notes for the user.
+
+    Files are named by their path below the folder. Runs only in child processes; raises as
+    `build_scene`.
+    """
+    unread: list[str] = []
+    scene, sha256 = build_scene(
+        root,
+        name,
+        settings,
+        licence="",
+        num_views=num_views,
+        scene_index=0,
+        seed=0,
+        albedo_over_one=over_one,
+        notes=unread,
+    )
+    return sha256, tuple(f"{name}: {text}" for text in (*unread, *scaled_albedo_notes(scene)))
+
+
+def _build_in_child(
+    child: IsolatedChild, folder: SceneFolder, name: str, settings: DatasetSettings
+) -> tuple[Mapping[str, str], tuple[str, ...]]:
+    """Build a scene in a child; raises TrilightError, or EnvironmentFailure for the machine."""
+    arguments = (settings.assets, settings.scenes.num_views, folder.albedo_over_one)
+    try:
+        return call_with_retries(child, build_once, folder.root, name, *arguments)
+    except ChildFailed as failure:
+        if failure.is_verdict:
+            raise TrilightError(
+                f"{name}: its meshes cannot be read ({failure}); fix or remove the file."
+            ) from failure
+        raise EnvironmentFailure(
+            f"{name}: its meshes could not be read this time ({failure}). Run the same command "
+            "again; if that does not help, see `trilight doctor`."
+        ) from failure
