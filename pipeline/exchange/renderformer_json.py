@@ -15,8 +15,9 @@ import dataclasses
 import json
 import re
 from collections import Counter
+from collections.abc import Collection, Mapping
 from dataclasses import dataclass
-from typing import Any, NoReturn
+from typing import Any, Literal, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -26,6 +27,7 @@ from pipeline.exchange.from_description import (
     SMOOTH_ANGLE_DEG,
     DescribedCamera,
     DescribedObject,
+    PrintableText,
     SceneDescription,
     require_at_most,
 )
@@ -39,6 +41,8 @@ from storage.records.scene import ARRAY_FIELDS, Scene
 from storage.settings.fields import describe_fields
 from storage.typed_json import read_json
 
+Record = TypeVar("Record")
+
 MAX_BYTES = 4 << 20
 """Maximum size of a file; an object takes about 1 KiB."""
 
@@ -48,13 +52,24 @@ MAX_OBJECTS = 8192
 MAX_CAMERAS = 1000
 """Maximum number of cameras in a file."""
 
-_VERSION = "1.0"
-_MAX_TEXT = 200
-"""Maximum number of characters of a text, such as the name of an object."""
 _MAX_SHOWN = 120
 """Maximum number of characters of a value in a message."""
-_OUR_NAMES = {"rotation": "rotation_deg", "fov": "fov_deg"}
-"""Our names of fields, by those of the file, where they differ."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class _CameraFile:
+    """What a list of cameras states, and a scene file too."""
+
+    cameras: tuple[Any, ...]
+
+
+@dataclass(frozen=True, kw_only=True)
+class _SceneFile(_CameraFile):
+    """A scene file whose objects and cameras are not read yet."""
+
+    scene_name: PrintableText
+    version: Literal["1.0"]
+    objects: Mapping[str, Any]
 
 
 def read_renderformer_json(data: bytes, name: str) -> SceneDescription:
@@ -66,26 +81,18 @@ def read_renderformer_json(data: bytes, name: str) -> SceneDescription:
             field (with the object's name), value and expected value.
     """
     reader = _Reader(name)
-    tree = reader.read_tree(data)
-    scene_name = reader.text(reader.field(tree, "scene_name"), "scene_name")
-    version = reader.text(reader.field(tree, "version"), "version")
-    if version != _VERSION:
-        raise TrilightError(f"{name}: version is {version!r}; expected {_VERSION!r}.")
-    objects = reader.field(tree, "objects")
-    if not isinstance(objects, dict):
-        reader.refuse("objects", objects, "a JSON object")
-    if not 1 <= len(objects) <= MAX_OBJECTS:
-        raise TrilightError(f"{name}: {len(objects)} objects; expected 1 to {MAX_OBJECTS}.")
-    described = tuple(reader.object(key, entry) for key, entry in objects.items())
-    cameras = reader.cameras(tree)
-    known = ("scene_name", "version", "objects", "cameras")
-    reader.unknown += [_to_text(key) for key in tree if key not in known]
+    file = reader.record(_SceneFile, _parse_json(data, name))
+    unknown = reader.take_unknown()
+    _require_count(name, "objects", file.objects, MAX_OBJECTS)
     return SceneDescription(
         file=name,
-        scene_name=scene_name,
-        objects=described,
-        cameras=cameras,
-        unknown_fields=tuple(reader.unknown),
+        scene_name=file.scene_name,
+        objects=tuple(
+            reader.record(DescribedObject, entry, f"objects.{key}", name=key)
+            for key, entry in file.objects.items()
+        ),
+        cameras=reader.cameras(file),
+        unknown_fields=(*reader.take_unknown(), *unknown),
     )
 
 
@@ -96,90 +103,60 @@ def read_cameras(data: bytes, name: str) -> tuple[DescribedCamera, ...]:
         TrilightError: as `read_renderformer_json`, for the cameras alone.
     """
     reader = _Reader(name)
-    return reader.cameras(reader.read_tree(data))
+    return reader.cameras(reader.record(_CameraFile, _parse_json(data, name)))
 
 
 class _Reader:
-    """Reads the records of one file; `unknown` collects fields that none of them has.
+    """Reads the records of one file, and collects the names of fields that none of them has.
 
     So a misspelt option is reported instead of ignored.
     """
 
     def __init__(self, file: str) -> None:
         self._file = file
-        self.unknown: list[str] = []
+        self._unknown: list[str] = []
 
-    def read_tree(self, data: bytes) -> dict[str, Any]:
-        """Return the JSON object of the whole file."""
-        if len(data) > MAX_BYTES:
-            raise TrilightError(f"{self._file}: {len(data)} bytes; expected at most {MAX_BYTES}.")
-        tree = _parse_json(data, self._file)
-        if not isinstance(tree, dict):
-            self.refuse("the file", tree, "a JSON object")
-        return tree
+    def take_unknown(self) -> list[str]:
+        """Return the unknown fields since the last call."""
+        unknown, self._unknown = self._unknown, []
+        return unknown
 
-    def field(self, tree: dict[str, Any], name: str) -> Any:
-        """Return a field of the file, which must exist."""
-        if name not in tree:
-            raise TrilightError(f"{self._file}: {name} is missing; add it.")
-        return tree[name]
-
-    def cameras(self, tree: dict[str, Any]) -> tuple[DescribedCamera, ...]:
-        rows = self.field(tree, "cameras")
-        if not isinstance(rows, list) or not 1 <= len(rows) <= MAX_CAMERAS:
-            self.refuse("cameras", rows, f"a list of 1 to {MAX_CAMERAS} JSON objects")
+    def cameras(self, file: _CameraFile) -> tuple[DescribedCamera, ...]:
+        """Return the cameras of a file."""
+        _require_count(self._file, "cameras", file.cameras, MAX_CAMERAS)
         return tuple(
-            self._record(DescribedCamera, row, f"cameras[{at}]") for at, row in enumerate(rows)
+            self.record(DescribedCamera, row, f"cameras[{at}]")
+            for at, row in enumerate(file.cameras)
         )
 
-    def object(self, key: str, entry: Any) -> DescribedObject:
-        where = f"objects.{key}"
-        if not key or len(key) > _MAX_TEXT or not key.isprintable():
-            self.refuse(where, key, f"a printable name of 1 to {_MAX_TEXT} letters")
-        described: DescribedObject = self._record(DescribedObject, entry, where, name=key)
-        self.text(described.mesh_path, f"{where}.mesh_path")
-        return described
-
-    def text(self, value: Any, where: str) -> str:
-        if not isinstance(value, str) or len(value) > _MAX_TEXT or not value.isprintable():
-            self.refuse(where, value, f"printable text of up to {_MAX_TEXT} letters")
-        return value
-
-    def _record(self, kind: Any, value: Any, where: str, **more: str) -> Any:
+    def record(self, kind: type[Record], value: Any, where: str = "", **more: str) -> Record:
         """Return a JSON object as a record; `more` are fields that the file states elsewhere."""
-        if not isinstance(value, dict):
-            self.refuse(where, value, "a JSON object")
+        source = f"{self._file}: {_to_text(where)}" if where else self._file
         known = self._take_known(kind, value, where, more)
         try:
-            return read_json(json.dumps(known), kind, f"{self._file}: {_to_text(where)}")
-        except RecursionError:
-            self.refuse(where, "nested too deeply", "the fields of a scene")
-        except TrilightError as error:
-            text = str(error)
-            for name, ours in _OUR_NAMES.items():
-                text = text.replace(ours, name)
-            raise TrilightError(text) from error
+            return read_json(json.dumps(known), kind, source)
+        except RecursionError as error:
+            raise TrilightError(f"{source}: nested too deeply; expected a scene.") from error
 
-    def _take_known(self, kind: Any, value: Any, where: str, more: dict[str, str]) -> Any:
-        """Return the fields of a record, renamed, and those of records in it; note the others."""
+    def _take_known(self, kind: Any, value: Any, where: str, more: Mapping[str, str]) -> Any:
+        """Return the fields of a record, and those of records in it; note the others."""
         is_record = dataclasses.is_dataclass(kind) and isinstance(value, dict)
         if not is_record:
             return value
         hints = {each.name: each.hint for each in describe_fields(kind) if each.name not in more}
         known: dict[str, Any] = dict(more)
         for key, inner in value.items():
-            name = _OUR_NAMES.get(key, key)
-            if name not in hints or key in _OUR_NAMES.values():
-                self.unknown.append(_to_text(f"{where}.{key}"))
+            path = f"{where}.{key}" if where else key
+            if key in hints:
+                known[key] = self._take_known(hints[key], inner, path, {})
             else:
-                known[name] = self._take_known(hints[name], inner, f"{where}.{key}", {})
+                self._unknown.append(_to_text(path))
         return known
 
-    def refuse(self, where: str, value: Any, expected: str) -> NoReturn:
-        """Raise TrilightError about a value."""
-        raise TrilightError(
-            f"{self._file}: {_to_text(where)} is {_to_text(value)}; expected {expected}."
-        )
+
+def _require_count(file: str, what: str, entries: Collection[Any], most: int) -> None:
+    if not 1 <= len(entries) <= most:
+        raise TrilightError(f"{file}: {len(entries)} {what}; expected 1 to {most}.")
 
 
 def _to_text(value: Any) -> str:
@@ -189,6 +166,8 @@ def _to_text(value: Any) -> str:
 
 
 def _parse_json(data: bytes, name: str) -> Any:
+    if len(data) > MAX_BYTES:
+        raise TrilightError(f"{name}: {len(data)} bytes; expected at most {MAX_BYTES}.")
     try:
         return json.loads(
             data.decode("utf-8-sig"),

@@ -14,14 +14,8 @@ from numpy.typing import NDArray
 from pipeline.exchange.part_materials import Part, PartConverter, drop_empty, unit_normals
 from pipeline.exchange.pictures import decode_values
 from pipeline.exchange.textured_triangles import TexturedTriangles, join_triangles
-from pipeline.exchange.usd.held_materials import (
-    keep_exact,
-    name_lost_columns,
-    read_column,
-    read_held_material,
-    restore_exact,
-)
-from pipeline.exchange.usd.prim_names import added_column
+from pipeline.exchange.usd.held_materials import HeldMaterial, keep_exact, read_columns
+from pipeline.exchange.usd.prim_names import MATERIAL_ATTRIBUTES
 from pipeline.foreign.usd.materials import MeshMaterials
 from pipeline.foreign.usd.object_source import UsdStage, read_stage_materials
 from pipeline.foreign.usd.placed import PlacedPrim
@@ -101,7 +95,7 @@ class _Extras:
 
     name: str
     """Name of its prim, which its textures get."""
-    added: Mapping[str, NDArray[np.float64]]
+    added: Mapping[str, NDArray[np.float32]]
     """Values of columns beyond the published ones."""
     exact: Mapping[str, Texture] | None
     """Exact values of unchanged columns; None for a material of another program."""
@@ -206,43 +200,21 @@ class StageSurfaces:
 
     def _read(self, material: Any) -> StatedMaterial | None:
         """Return the inputs of a material; None, with a note, where none are understood."""
-        held = read_held_material(material, self._time, self._opened, self._written)
+        columns = read_columns(material.GetPrim(), self._time, self._lost)
+        held = None
+        if columns.keys() >= MATERIAL_ATTRIBUTES.keys():
+            held = HeldMaterial(material, columns, self._written, self._time, self._opened)
         known = () if held is None else ("specular",)  # Blender writes its specular level there
         stated = read_material(material, self._time, self._opened, known)
         exact = None
         if held is not None:
-            self._lost += [_HELD, *name_lost_columns(material)]
-            stated, exact = restore_exact(held, stated, material, self._time, self._opened)
+            self._lost.append(_HELD)
+            stated, exact = held.restore(stated)
         if stated is None:
             self._lost.append(
                 f"{material.GetPath()}: no supported shader; its display color is used"
             )
             return None
-        added = _read_added_columns(material, self._time, self._lost)
+        added = {name: columns[name] for name in columns.keys() - MATERIAL_ATTRIBUTES.keys()}
         self._extras.append(_Extras(name=stated.name, added=added, exact=exact))
         return stated
-
-
-def _read_added_columns(
-    material: Any, time: Any, lost: list[str]
-) -> dict[str, NDArray[np.float64]]:
-    """Return the columns beyond the published ones from the attributes that Trilight writes."""
-    declared = {column.name: column for column, _ in laid_out()}
-    values = {}
-    for attribute in material.GetPrim().GetAttributes():
-        name = added_column(attribute.GetName())
-        if name is None:
-            continue
-        if name not in declared:
-            lost.append(f"{attribute.GetPath()}: this material column is not declared here")
-            continue
-        column = declared[name]
-        value = read_column(attribute, column, time)
-        if value is not None:
-            values[name] = value
-        else:
-            lost.append(
-                f"{attribute.GetPath()}: expected {column.width} numbers {column.within}; "
-                "the default is used"
-            )
-    return values

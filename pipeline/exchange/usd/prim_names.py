@@ -104,10 +104,11 @@ def column_attribute(column: str) -> str:
     return MATERIAL_ATTRIBUTES.get(column, _ADDED_COLUMN + column)
 
 
-def added_column(attribute: str) -> str | None:
-    """Return the added column of an attribute name; None for other attributes."""
-    column = attribute.removeprefix(_ADDED_COLUMN)
-    return None if column == attribute else column
+def column_of(attribute: str) -> str | None:
+    """Return the material column of an attribute name; None for other attributes."""
+    published = {name: column for column, name in MATERIAL_ATTRIBUTES.items()}
+    added = attribute.removeprefix(_ADDED_COLUMN)
+    return published.get(attribute, None if added == attribute else added)
 
 
 def texture_attribute(column: str) -> str:

@@ -347,8 +347,8 @@ def _read_materials(folder: Any, opened: OpenedStage) -> dict[str, Any]:
     """Return the fields of a scene on materials and textures; raises UndeclaredColumn."""
     prims = _list_by_row(folder, names.material_name)
     rows = default_rows(len(prims))
-    added = (names.added_column(attribute.name) for attribute in prims[0].attributes)
-    columns = {*PUBLISHED_COLUMNS, *(declared_column(name).name for name in added if name)}
+    stored = (names.column_of(attribute.name) for attribute in prims[0].attributes)
+    columns = {*PUBLISHED_COLUMNS, *(declared_column(name).name for name in stored if name)}
     index = np.full((len(prims), len(SHADERS)), CONSTANT, np.int32)
     textures: dict[int, Texture] = {}
     for row, prim in enumerate(prims):

@@ -46,6 +46,7 @@ from pipeline.foreign.usd.shaders import (
 from pipeline.foreign.usd.stage import OpenedStage
 from pipeline.foreign.usd.texture_nodes import convert_to_rec709, find_sources, is_output
 from storage.errors import TrilightError
+from storage.records.environment import Environment
 from storage.records.exr import MAX_RESOLUTION, channel_names, decode_channels, encode_channels
 from storage.records.material import (
     DIFFUSE,
@@ -70,12 +71,7 @@ PREVIEW_INPUTS = {
 }
 """Input of the preview for each published column."""
 
-SHADERS = {
-    "diffuse": "DiffuseTexture",
-    "specular": "SpecularTexture",
-    "roughness": "RoughnessTexture",
-    NORMAL: "NormalTexture",
-}
+SHADERS = {name: f"{name.capitalize()}Texture" for name in (*TEXTURED, NORMAL)}
 """Name of the texture shader of each column, and of the normal map."""
 
 ST = "primvars:st"
@@ -104,8 +100,6 @@ _TO_VECTORS: Attributes = {
 
 _CHANNELS = {1: "Y", 3: "RGB"}
 """OpenEXR channel names by channel count: a number or a color."""
-
-Color = tuple[float, float, float]
 
 Used = Mapping[str, tuple[int, Texture]]
 """Row and texture of each textured column of a material, and of its normal map."""
@@ -175,7 +169,7 @@ def material_tables(
 
     The row has all declared columns; `columns` names the stored ones, and `used` its textures.
     """
-    diffuse, specular, emission = (_rgb(values[part]) for part in (DIFFUSE, SPECULAR, EMISSION))
+    diffuse, specular, emission = (values[part].tolist() for part in (DIFFUSE, SPECULAR, EMISSION))
     roughness = float(values[ROUGHNESS])
     material = _exact_attributes(values, columns)
     for name, (_, texture) in used.items():
@@ -225,7 +219,7 @@ def _exact_attributes(values: NDArray[np.float32], columns: Sequence[str]) -> _T
     for column, part in laid_out():
         if column.name in columns:
             kind = "color3f" if column.is_colour else "float" if column.width == 1 else "float[]"
-            value = _rgb(values[part]) if column.is_colour else values[part]
+            value = values[part].tolist() if column.is_colour else values[part]
             attributes[names.column_attribute(column.name)] = (
                 kind,
                 float(value[0]) if kind == "float" else value,
@@ -233,11 +227,6 @@ def _exact_attributes(values: NDArray[np.float32], columns: Sequence[str]) -> _T
     if added := [name for name in columns if name not in names.MATERIAL_ATTRIBUTES]:
         attributes[names.ADDED_COLUMNS] = ("string", " ".join(added))
     return attributes
-
-
-def _rgb(values: NDArray[np.float32]) -> Color:
-    red, green, blue = (float(value) for value in values)
-    return red, green, blue
 
 
 def _texture_table(row: int, texture: Texture) -> _Table:
@@ -254,9 +243,15 @@ def _texture_table(row: int, texture: Texture) -> _Table:
     }
 
 
-def texture_files(scene: Scene) -> dict[str, bytes]:
-    """Return the texture files of a scene by name; raises TrilightError."""
-    return {texture_file(texture): encode_texture(texture) for texture in scene.textures}
+def map_files(scene: Scene) -> dict[str, bytes]:
+    """Return the files of the textures and the sky of a scene by name; raises TrilightError."""
+    files = {
+        texture_file(texture): _encode_map(texture.texels[::-1], "texture")
+        for texture in scene.textures
+    }
+    if (sky := scene.environment) is not None:
+        files[sky_file(sky)] = _encode_map(sky.radiance_rgb, "environment")
+    return files
 
 
 def texture_file(texture: Texture) -> str:
@@ -265,30 +260,35 @@ def texture_file(texture: Texture) -> str:
     return f"texture-{texture.sha256[:16]}.{suffix}"
 
 
-def encode_texture(texture: Texture) -> bytes:
-    """Return the bytes of a texture's file; they contain no time stamp.
+def sky_file(sky: Environment) -> str:
+    """Return the file name of a map; equal maps share a file."""
+    return f"sky-{sky.sha256[:16]}.exr"
+
+
+def _encode_map(texels: NDArray[Any], what: str) -> bytes:
+    """Return the bytes of a picture [H, W, C], the top row first; they contain no time stamp.
 
     Raises:
-        TrilightError: the texture is larger than the USD reader accepts.
+        TrilightError: the picture, which the message calls `what`, is larger than the USD reader
+            accepts.
     """
-    height, width, channels = texture.texels.shape
+    height, width, channels = texels.shape
     if max(height, width) > MAX_RESOLUTION:
         raise TrilightError(
-            f"texture: {width} x {height} texels; expected at most {MAX_RESOLUTION} each way in "
+            f"{what}: {width} x {height} texels; expected at most {MAX_RESOLUTION} each way in "
             "USD. Write it as .safetensors, or make it smaller."
         )
-    picture: NDArray[Any] = np.ascontiguousarray(texture.texels[::-1])
+    picture = np.ascontiguousarray(texels if channels == 3 else texels[..., 0])
     if picture.dtype == np.float32:
-        values = picture if channels == 3 else picture[..., 0]
-        return encode_channels({_CHANNELS[channels]: np.ascontiguousarray(values)})
-    return encode_png(picture if channels == 3 else picture[..., 0])
+        return encode_channels({_CHANNELS[channels]: picture})
+    return encode_png(picture)
 
 
 def decode_texture(data: bytes, *, is_exr: bool, is_srgb: bool, source: MapSource) -> Texture:
-    """Decode a file of `encode_texture`.
+    """Decode the file of a texture.
 
     Raises:
-        LookupError: `encode_texture` did not write the file.
+        LookupError: `map_files` did not write the file.
     """
     try:
         texels: NDArray[Any] = _exr_texels(data) if is_exr else _png_texels(data)
@@ -317,30 +317,31 @@ def _png_texels(data: bytes) -> NDArray[np.uint8]:
 
 
 def openpbr_inputs(
-    diffuse: Color, specular: Color, roughness: float, emission: Color
+    diffuse: Sequence[float],
+    specular: Sequence[float],
+    roughness: float,
+    emission: Sequence[float],
 ) -> Attributes:
     """Return the attributes of the shader of a material's columns."""
-    max_specular = max(specular)
-    max_emission = max(emission)
-    root = math.sqrt(min(max_specular, _MOST_REFLECTING))
+    root = math.sqrt(min(max(specular), _MOST_REFLECTING))
     return {
         "info:id": ("uniform token", _OPENPBR_SHADER),
         "inputs:base_color": ("color3f", diffuse),
         "inputs:base_weight": ("float", 1.0),
         "inputs:base_diffuse_roughness": ("float", 0.0),
-        "inputs:specular_weight": ("float", 1.0 if max_specular > 0 else 0.0),
-        "inputs:specular_color": ("color3f", _divide_by_largest(specular, max_specular)),
+        "inputs:specular_weight": ("float", 1.0 if max(specular) > 0 else 0.0),
+        "inputs:specular_color": ("color3f", _divide_by_largest(specular)),
         "inputs:specular_roughness": ("float", roughness),
-        "inputs:specular_ior": ("float", _round_to_float32((1 + root) / (1 - root))),
-        "inputs:emission_luminance": ("float", max_emission),
-        "inputs:emission_color": ("color3f", _divide_by_largest(emission, max_emission)),
+        "inputs:specular_ior": ("float", float(np.float32((1 + root) / (1 - root)))),
+        "inputs:emission_luminance": ("float", max(emission)),
+        "inputs:emission_color": ("color3f", _divide_by_largest(emission)),
     }
 
 
 def written_columns(columns: Mapping[str, NDArray]) -> dict[str, NDArray[np.float64]]:
     """Return the columns [3] that the shader written for a material's columns states."""
     diffuse, specular, roughness, emission = (
-        tuple(np.maximum(columns[name], 0).tolist()) for name in _INPUTS
+        np.maximum(columns[name], 0).tolist() for name in _INPUTS
     )
     table = openpbr_inputs(diffuse, specular, roughness[0], emission)
     constants = {name.removeprefix("inputs:"): value for name, (_, value, *_) in table.items()}
@@ -388,13 +389,7 @@ def _multiply(values: Mapping[str, Any]) -> dict[str, NDArray[np.float64]]:
     return columns
 
 
-def _divide_by_largest(rgb: Color, largest: float) -> Color:
+def _divide_by_largest(rgb: Sequence[float]) -> list[float]:
     """Return a color divided by its largest channel; white for black."""
-    if largest <= 0:
-        return 1.0, 1.0, 1.0
-    red, green, blue = (_round_to_float32(value / largest) for value in rgb)
-    return red, green, blue
-
-
-def _round_to_float32(value: float) -> float:
-    return float(np.float32(value))
+    scaled = np.array(rgb) / max(rgb) if max(rgb) > 0 else np.ones(3)
+    return [float(value) for value in scaled.astype(np.float32)]

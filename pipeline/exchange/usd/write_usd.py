@@ -34,13 +34,12 @@ from pipeline.exchange.usd.authoring import (
     add_relationship,
     text_attributes,
 )
-from pipeline.exchange.usd.write_materials import ST, add_materials, texture_files
+from pipeline.exchange.usd.write_materials import ST, add_materials, map_files, sky_file
 from storage.atomic import write_atomically
 from storage.conventions import SCHEMA_VERSION
 from storage.digests import canonical_json
 from storage.errors import TrilightError
 from storage.records.environment import Environment
-from storage.records.exr import MAX_RESOLUTION, encode_channels
 from storage.records.retextured import without_constant_textures
 from storage.records.scene import ARRAY_FIELDS, Scene
 from storage.records.scene_file import scene_digest
@@ -121,7 +120,7 @@ def _add_scene(layer: Any, path: str, scene: Scene) -> dict[str, bytes]:
         if "\0" in text or any("\ud800" <= letter <= "\udfff" for letter in text):
             raise TrilightError(f"names: {text!r:.80} has a character that USD cannot store.")
     author_scene(layer, path, scene)
-    return texture_files(scene) | _map_files(scene.environment)
+    return map_files(scene)
 
 
 def author_scene(layer: Any, path: str, scene: Scene) -> Any:
@@ -158,16 +157,15 @@ def new_layer(suffix: str, root: str) -> Any:
 
 
 def _save(path: Path, layer: Any, files: Mapping[str, bytes]) -> None:
-    with tempfile.TemporaryDirectory(dir=path.parent if path.parent.is_dir() else None) as folder:
-        plain = Path(folder) / "scene.usdc"
-        if (
-            path.suffix.lower() == ".usda"
-        ):  # Export would change file modes, which a confined child may not
-            data = layer.ExportToString().encode()
-        elif layer.Export(str(plain)):
+    if path.suffix.lower() == ".usda":  # Export would change file modes, which a child may not
+        data = layer.ExportToString().encode()
+    else:
+        within = path.parent if path.parent.is_dir() else None
+        with tempfile.TemporaryDirectory(dir=within) as folder:
+            plain = Path(folder) / _LAYER_NAME
+            if not layer.Export(str(plain)):
+                raise TrilightError(f"{path.name}: USD could not write the scene.")
             data = plain.read_bytes()
-        else:
-            raise TrilightError(f"{path.name}: USD could not write the scene.")
     if path.suffix.lower() == ".usdz":
         write_atomically(path, encode_usdz(data, files))
         return
@@ -288,27 +286,6 @@ def _mesh_arrays(scene: Scene, faces: NDArray[np.intp]) -> Attributes:
     }
 
 
-def _map_files(sky: Environment | None) -> dict[str, bytes]:
-    """Return the map file of an environment by name.
-
-    Raises:
-        TrilightError: the map is larger than the OpenEXR reader accepts.
-    """
-    if sky is None:
-        return {}
-    if max(sky.radiance_rgb.shape) > MAX_RESOLUTION:
-        raise TrilightError(
-            f"environment: {sky.radiance_rgb.shape[1]} texels wide; expected at most "
-            f"{MAX_RESOLUTION} in USD. Write it as .safetensors, or make it smaller."
-        )
-    return {_map_file(sky): encode_channels({"RGB": sky.radiance_rgb})}
-
-
-def _map_file(sky: Environment) -> str:
-    """Return the file name of a map; equal maps share a file."""
-    return f"sky-{sky.sha256[:16]}.exr"
-
-
 def _dome_attributes(sky: Environment) -> Attributes:
     """Return the attributes of the prim of an environment."""
     to_world = np.eye(4)
@@ -316,7 +293,7 @@ def _dome_attributes(sky: Environment) -> Attributes:
     return {
         "xformOp:transform": ("matrix4d", to_world.T.tolist()),  # USD multiplies from the left
         "xformOpOrder": ("uniform token[]", ("xformOp:transform",)),
-        names.MAP_PATH: ("asset", f"./{_map_file(sky)}"),
+        names.MAP_PATH: ("asset", f"./{sky_file(sky)}"),
         "inputs:texture:format": ("token", "latlong"),
         "inputs:intensity": ("float", 1.0),
         names.VISIBLE_TO_CAMERA: ("bool", sky.is_seen),
