@@ -214,14 +214,14 @@ def read_renderformer_h5(path: Path, *, pictures: bool = True) -> LoadedScene:
     lost: list[str] = []
     with open_h5(path) as file:
         lost += _list_unknown(file)
-        triangles = read_whole(plain_array(file, "triangles", (None, 3, 3), MAX_TRIANGLES))
+        triangles = read_whole(file, "triangles", (None, 3, 3), MAX_TRIANGLES)
         count = len(triangles)
-        normals = read_whole(plain_array(file, "vn", (count, 3, 3), MAX_TRIANGLES))
+        normals = read_whole(file, "vn", (count, 3, 3), MAX_TRIANGLES)
         second = _is_second_version(file)
         rows, varies = (_read_grey_rows if second else _read_rows)(file, count, lost)
         sky = _read_sky(file, lost) if second else None
-        c2w = read_whole(plain_array(file, "c2w", (None, 4, 4), MAX_VIEWS))
-        fov_deg = read_whole(plain_array(file, "fov", (len(c2w),), MAX_VIEWS))
+        c2w = read_whole(file, "c2w", (None, 4, 4), MAX_VIEWS)
+        fov_deg = read_whole(file, "fov", (len(c2w),), MAX_VIEWS)
         radiance_rgb = _pictures(file, len(c2w), lost) if "img" in list_names(file) else None
         positions, normals, faces = index_corners(triangles, _normalize(triangles, normals, lost))
         scene = Scene(
@@ -250,8 +250,8 @@ def _list_unknown(file: Any) -> list[str]:
 
 
 def _pictures(file: Any, num_views: int, lost: list[str]) -> NDArray[np.float32]:
-    array = plain_array(file, "img", (num_views, None, None, 4), MAX_RESOLUTION)
-    rgba = read_whole(array, MAX_PICTURE_BYTES)
+    shape = (num_views, None, None, 4)
+    rgba = read_whole(file, "img", shape, MAX_RESOLUTION, MAX_PICTURE_BYTES)
     if (rgba[..., 3] != 1).any():
         lost.append("alpha of pictures: composited over black")
     return rgba[..., :3].copy()
@@ -391,7 +391,7 @@ def _read_grey_rows(
     file: Any, count: int, lost: list[str]
 ) -> tuple[NDArray[np.float32], NDArray[np.bool_]]:
     """Return grey surfaces with the emission of a successor's file, as `_read_rows`."""
-    light = read_whole(plain_array(file, "light_strength", (count, 3), MAX_TRIANGLES))
+    light = read_whole(file, "light_strength", (count, 3), MAX_TRIANGLES)
     rows = np.zeros((count, CHANNELS), np.float32)
     rows[:, DIFFUSE] = _GREY
     rows[:, ROUGHNESS] = 1
@@ -415,7 +415,7 @@ def _read_sky(file: Any, lost: list[str]) -> Environment | None:
     """
     if "env_map" not in list_names(file):
         return None
-    values = read_whole(plain_array(file, "env_map", (None, None, None), MAX_RESOLUTION))
+    values = read_whole(file, "env_map", (None, None, None), MAX_RESOLUTION)
     if 3 not in (values.shape[0], values.shape[2]):
         raise TrilightError(
             f"env_map has shape {values.shape}; expected (3, H, 2 H) or (H, 2 H, 3)."
@@ -440,9 +440,9 @@ def _read_small(file: Any, name: str) -> NDArray[np.float32]:
     if name not in list_names(file):
         return np.zeros(0, np.float32)
     try:
-        return read_whole(plain_array(file, name, (), 1))
+        return read_whole(file, name, (), 1)
     except TrilightError:
-        return read_whole(plain_array(file, name, (None,), 16))
+        return read_whole(file, name, (None,), 16)
 
 
 CELLS = 32

@@ -8,7 +8,6 @@ with limits (pipeline.isolation).
 """
 
 import contextlib
-import itertools
 import math
 import zlib
 from collections.abc import Iterator, Sequence
@@ -125,13 +124,20 @@ def iterate_blocks(array: Any) -> Iterator[tuple[tuple[slice, ...], NDArray]]:
         yield where, array[where]
 
 
-def read_whole(array: Any, most_bytes: int = MAX_BLOCK_BYTES) -> NDArray[np.float32]:
-    """Read a whole array as float32.
+def read_whole(
+    group: Any,
+    name: str,
+    shape: Sequence[int | None],
+    longest: int,
+    most_bytes: int = MAX_BLOCK_BYTES,
+) -> NDArray[np.float32]:
+    """Read a whole array of a group as float32.
 
     Raises:
-        TrilightError: a block is unusable (`iterate_blocks`), the array takes more than
-            `most_bytes`, or a value is not finite.
+        TrilightError: the array or a block is unusable (`plain_array`, `iterate_blocks`), it takes
+            more than `most_bytes`, or a value is not finite.
     """
+    array = plain_array(group, name, shape, longest)
     _require_memory(array, math.prod(array.shape) * 4, most_bytes)
     values = np.zeros(array.shape, np.float32)
     for where, block in iterate_blocks(array):
@@ -162,17 +168,13 @@ def _iterate_chunks(array: Any, plan: Any) -> Iterator[tuple[tuple[slice, ...], 
             f"{_name(array)}: has {math.prod(counts)} chunks; expected up to {MAX_CHUNKS}."
         )
     stored_offsets = _list_chunk_offsets(array)
-    for at in itertools.product(*(range(count) for count in counts)):
-        offset = tuple(i * chunk for i, chunk in zip(at, size, strict=True))
+    for where in array.iter_chunks():
+        offset = tuple(part.start for part in where)
         if offset not in stored_offsets:
             raise TrilightError(f"{_name(array)}: the chunk at {list(offset)} is missing.")
         _, packed = array.id.read_direct_chunk(offset)
         values = np.frombuffer(_unpack(array, packed, filters), array.dtype).reshape(size)
-        where = tuple(
-            slice(start, min(start + chunk, length))
-            for start, chunk, length in zip(offset, size, array.shape, strict=True)
-        )
-        yield where, values[tuple(slice(0, part.stop - part.start) for part in where)]
+        yield where, values[tuple(slice(part.stop - part.start) for part in where)]
 
 
 def _list_chunk_offsets(array: Any) -> set[tuple[int, ...]]:
@@ -195,9 +197,8 @@ def _unpack(array: Any, packed: bytes, filters: list[int]) -> bytes:
     if _DEFLATE in filters:
         inflater = zlib.decompressobj()
         try:
-            packed = inflater.decompress(
-                packed, num_bytes + 1
-            )  # one byte more than expected, whatever the data claims
+            # one byte more than expected, whatever the data claims
+            packed = inflater.decompress(packed, num_bytes + 1)
         except zlib.error as error:
             raise TrilightError(f"{_name(array)}: a chunk is damaged.") from error
         if not inflater.eof:

@@ -1,6 +1,5 @@
 """Builds a `Scene` from the placed prims of a USD stage."""
 
-import itertools
 import math
 from collections.abc import Mapping, Sequence
 from typing import Any
@@ -31,8 +30,8 @@ from storage.records.environment import Environment
 from storage.records.material import EMISSION
 from storage.records.scene import Scene, SceneObject
 
-_MOST_NOTED = 200
-"""Maximum characters of all notes in the message on a stage without light."""
+_MOST_NOTED = 2
+"""Maximum number of notes in the message on a stage without light."""
 
 
 def build_stage_scene(
@@ -83,15 +82,11 @@ def build_stage_scene(
 
 
 def _name_lights(notes: Sequence[str]) -> str:
-    """Return the notes on lights, as many whole ones as are short enough."""
+    """Return the first notes on lights, and the number of others."""
     unread = [note for note in notes if "light" in note.replace("Trilight", "").lower()]
-    listed = [
-        note
-        for note, length in zip(unread, itertools.accumulate(map(len, unread)), strict=True)
-        if length <= _MOST_NOTED
-    ]
-    more = len(unread) - len(listed)
-    return "; ".join([*listed, f"{more} more of lights"] if more else listed) or "none is seen"
+    more = len(unread) - _MOST_NOTED
+    named = [f"{note:.100}" for note in unread[:_MOST_NOTED]]
+    return "; ".join(named + [f"{more} more of lights"] * (more > 0)) or "none is seen"
 
 
 def _read_row(each: PlacedPrim) -> float:

@@ -20,7 +20,7 @@ from pipeline.exchange.linear_maps import (
     constant_map,
     linear_map,
 )
-from pipeline.exchange.pictures import MAX_BYTES, MAX_PIXELS
+from pipeline.exchange.pictures import MAX_BYTES
 from pipeline.exchange.textured_triangles import NO_TEXTURES, TexturedTriangles
 from pipeline.exchange.usd import prim_names as names
 from pipeline.exchange.usd.write_materials import (
@@ -31,7 +31,6 @@ from pipeline.exchange.usd.write_materials import (
     read_openpbr,
     written_columns,
 )
-from pipeline.foreign.picture import decode_image
 from pipeline.foreign.usd.shaders import (
     DEFAULTS,
     IOR_OF_CONSTANT_ALBEDOS,
@@ -47,8 +46,6 @@ from pipeline.foreign.usd.texture_nodes import (
     is_output,
     read_texture_node,
 )
-from storage.errors import Rejected
-from storage.records.exr import MAGIC
 from storage.records.material import (
     DIFFUSE,
     SPECULAR,
@@ -283,16 +280,10 @@ class HeldMaterial:
         if column not in self._maps or not is_used_alike or data is None:
             return None
         sha256, source = self._maps[column]
+        is_srgb = node.color_space == "sRGB"
         try:
-            if data.startswith(MAGIC):
-                texture = decode_texture(data, is_exr=True, is_srgb=False, source=source)
-            else:
-                values = decode_image(data, node.named, MAX_PIXELS, [])
-                chosen = values[..., :3] if column != "roughness" else values[..., :1]
-                is_srgb = node.color_space == "sRGB"
-                texels = np.ascontiguousarray(chosen)
-                texture = Texture(texels=texels, is_srgb=is_srgb, source=source)
-        except (LookupError, Rejected):
+            texture = decode_texture(data, node.named, column, is_srgb=is_srgb, source=source)
+        except LookupError:
             return None
         return texture if texture.sha256 == sha256 else None
 

@@ -355,13 +355,13 @@ def _read_materials(folder: Any, opened: OpenedStage) -> dict[str, Any]:
         for column, part in laid_out():
             if column.name in columns:
                 rows[row, part] = prim.attributes[names.column_attribute(column.name)].default
-        for place, shader in enumerate(SHADERS.values()):
+        for place, (name, shader) in enumerate(SHADERS.items()):
             if shader in prim.nameChildren:
                 node = prim.nameChildren[shader]
                 texture = node.attributes[names.TEXTURE_ROW].default
                 index[row, place] = texture
                 if texture not in textures:
-                    textures[texture] = _read_texture(node, opened)
+                    textures[texture] = _read_texture(node, name, opened)
     normals = index[:, len(TEXTURED)].copy()
     return {
         "materials": rows,
@@ -371,10 +371,11 @@ def _read_materials(folder: Any, opened: OpenedStage) -> dict[str, Any]:
     }
 
 
-def _read_texture(node: Any, opened: OpenedStage) -> Texture:
+def _read_texture(node: Any, column: str, opened: OpenedStage) -> Texture:
     return decode_texture(
         _read_asset(node, "inputs:file", opened),
-        is_exr=node.attributes["inputs:file"].default.path.endswith(".exr"),
+        node.attributes["inputs:file"].default.path,
+        column,
         is_srgb=node.attributes["inputs:sourceColorSpace"].default == "sRGB",
         source=MapSource(**_read_texts(node, names.MAP_TEXTS)),
     )

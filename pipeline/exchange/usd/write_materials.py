@@ -19,7 +19,6 @@ Picture files begin with the top row, textures of a scene with the bottom row. E
 a file.
 """
 
-import io
 import math
 from collections.abc import Mapping, Sequence
 from typing import Any
@@ -28,6 +27,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pipeline.documents.png import encode_png
+from pipeline.exchange.pictures import MAX_PIXELS
 from pipeline.exchange.usd import prim_names as names
 from pipeline.exchange.usd.authoring import (
     Attributes,
@@ -36,6 +36,7 @@ from pipeline.exchange.usd.authoring import (
     text_attributes,
     usd_value,
 )
+from pipeline.foreign.picture import decode_image
 from pipeline.foreign.usd.shaders import (
     IOR_OF_CONSTANT_ALBEDOS,
     note_unsupported,
@@ -45,9 +46,9 @@ from pipeline.foreign.usd.shaders import (
 )
 from pipeline.foreign.usd.stage import OpenedStage
 from pipeline.foreign.usd.texture_nodes import convert_to_rec709, find_sources, is_output
-from storage.errors import TrilightError
+from storage.errors import Rejected, TrilightError
 from storage.records.environment import Environment
-from storage.records.exr import MAX_RESOLUTION, channel_names, decode_channels, encode_channels
+from storage.records.exr import MAGIC, MAX_RESOLUTION, decode_channels, encode_channels
 from storage.records.material import (
     DIFFUSE,
     EMISSION,
@@ -284,36 +285,29 @@ def _encode_map(texels: NDArray[Any], what: str) -> bytes:
     return encode_png(picture)
 
 
-def decode_texture(data: bytes, *, is_exr: bool, is_srgb: bool, source: MapSource) -> Texture:
-    """Decode the file of a texture.
+def decode_texture(
+    data: bytes, name: str, column: str, *, is_srgb: bool, source: MapSource
+) -> Texture:
+    """Decode the file of the texture of a material's column, or of its normal map.
 
     Raises:
         LookupError: `map_files` did not write the file.
     """
+    channels = 1 if column == "roughness" else 3
+    is_exr = data.startswith(MAGIC)
     try:
-        texels: NDArray[Any] = _exr_texels(data) if is_exr else _png_texels(data)
-        texture = Texture(texels=np.ascontiguousarray(texels), is_srgb=is_srgb, source=source)
+        if is_exr:
+            pixels = decode_channels(data, _CHANNELS[channels])[_CHANNELS[channels]]
+            texels = pixels.reshape(*pixels.shape[:2], -1)[::-1]
+        else:
+            texels = decode_image(data, name, MAX_PIXELS, [])[..., :channels]
+        is_encoded = is_srgb and not is_exr
+        texels = np.ascontiguousarray(texels)
+        texture = Texture(texels=texels, is_srgb=is_encoded, source=source)
         texture.check("texture")
-    except (TrilightError, OSError, SyntaxError, ValueError) as error:
+    except (TrilightError, Rejected) as error:
         raise LookupError("it is no texture that was written here") from error
     return texture
-
-
-def _exr_texels(data: bytes) -> NDArray[np.float32]:
-    name = "Y" if channel_names(data) == ["Y"] else "RGB"
-    pixels = decode_channels(data, name, lambda header: None)[name]
-    texels: NDArray[np.float32] = pixels.reshape(*pixels.shape[:2], -1)[::-1]
-    return texels
-
-
-def _png_texels(data: bytes) -> NDArray[np.uint8]:
-    from PIL import Image
-
-    with Image.open(io.BytesIO(data), formats=("PNG",)) as image:
-        if max(image.size) > MAX_RESOLUTION or image.mode not in ("L", "RGB"):
-            raise ValueError(f"{image.size} in mode {image.mode}")
-        pixels: NDArray[np.uint8] = np.asarray(image, np.uint8)
-    return pixels.reshape(*pixels.shape[:2], -1)[::-1]
 
 
 def openpbr_inputs(
