@@ -64,9 +64,9 @@ from storage.records.material import (
     REFLECTING,
     ROUGHNESS,
     SPECULAR,
+    column_places,
     default_rows,
     distinct_rows,
-    laid_out,
 )
 from storage.records.retextured import with_textures, without_constant_textures
 from storage.records.scene import (
@@ -476,9 +476,9 @@ def compute_cells(scene: Scene, triangle: int) -> list[tuple[slice, NDArray[np.f
     assert scene.material_textures is not None and scene.uv is not None
     index = scene.material_textures[scene.material_index[triangle]]
     uv = scene.uv.reshape(-1, 3, 2)[triangle].astype(np.float64)
-    column_slices = {column.name: part for column, part in laid_out()}
+    places = column_places()
     return [
-        (column_slices[name], _compute_means(scene.textures[row], uv))
+        (places[name], _compute_means(scene.textures[row], uv))
         for name, row in zip(TEXTURED, index, strict=True)
         if row != CONSTANT
     ]

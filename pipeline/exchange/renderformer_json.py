@@ -60,7 +60,7 @@ _MAX_SHOWN = 120
 class _CameraFile:
     """What a list of cameras states, and a scene file too."""
 
-    cameras: tuple[Any, ...]
+    cameras: tuple[Mapping[str, Any], ...]
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -69,7 +69,7 @@ class _SceneFile(_CameraFile):
 
     scene_name: PrintableText
     version: Literal["1.0"]
-    objects: Mapping[str, Any]
+    objects: Mapping[str, Mapping[str, Any]]
 
 
 def read_renderformer_json(data: bytes, name: str) -> SceneDescription:

@@ -24,9 +24,8 @@ from storage.records.material import (
     ROUGHNESS,
     default_rows,
     distinct_rows,
-    laid_out,
 )
-from storage.records.retextured import with_textures
+from storage.records.retextured import with_textures, without_constant_textures
 from storage.records.scene import ObjectKind, Scene, SceneObject
 from storage.records.texture import CONSTANT, TEXTURED, Texture
 
@@ -135,27 +134,6 @@ def build_lamp(
     )
 
 
-def _with_means(triangles: TexturedTriangles) -> NDArray[np.float32]:
-    """Return the rows with the means of textures, so that equal materials have equal rows."""
-    rows = triangles.rows.copy()
-    column_slices = {column.name: part for column, part in laid_out()}
-    for number, texture_set in enumerate(triangles.texture_sets):
-        chosen = np.flatnonzero(triangles.texture_set_index == number)
-        for name, texture in zip(TEXTURED, texture_set, strict=True):
-            if texture is not None and len(chosen):
-                same = texture.constant
-                rows[chosen, column_slices[name]] = texture.mean if same is None else same
-    return rows
-
-
-def _drop_constant_textures(textures: TextureSet) -> TextureSet:
-    """Replace textures of one color by None; the material columns hold their values."""
-    one, two, three = (
-        None if texture is None or texture.constant is not None else texture for texture in textures
-    )
-    return one, two, three
-
-
 def _fit_camera(points: NDArray[np.float32]) -> tuple[NDArray[np.float64], float]:
     """Return the pose and angle of a camera that sees all points [N, 3], obliquely from above."""
     low = points.min(axis=0).astype(np.float64)
@@ -232,7 +210,7 @@ class SceneParts:
 
     def _add_piece(self, entry: SceneObject, triangles: TexturedTriangles) -> None:
         positions, normals, faces = index_corners(triangles.positions, triangles.normals)
-        rows = _with_means(triangles)
+        rows = triangles.rows
         appearance = np.column_stack([rows, triangles.texture_set_index.astype(np.float32)])
         palette, index = distinct_rows(appearance)
         groups = np.zeros(len(faces), np.int64)
@@ -241,10 +219,8 @@ class SceneParts:
             ScenePiece(entry=entry, mesh=mesh, materials=rows[palette], material_index=index)
         )
         self._uv.append(triangles.uv)
-        self._texture_sets += [
-            _drop_constant_textures(triangles.texture_sets[row])
-            for row in triangles.texture_set_index[palette]
-        ]
+        set_index = triangles.texture_set_index[palette]
+        self._texture_sets += [triangles.texture_sets[row] for row in set_index]
         self._num_triangles += len(faces)
 
     @property
@@ -302,7 +278,7 @@ class SceneParts:
         index = [[order[each.sha256] if each else CONSTANT for each in row] for row in sets]
         uv = np.concatenate(self._uv).reshape(-1, 2).astype(np.float32)
         rows = np.array(index, np.int32).reshape(-1, len(TEXTURED))
-        return with_textures(scene, uv, tuple(textures.values()), rows)
+        return without_constant_textures(with_textures(scene, uv, tuple(textures.values()), rows))
 
 
 def unique_name(base: str, counts: dict[str, int], key: Callable[[str], str] = str) -> str:

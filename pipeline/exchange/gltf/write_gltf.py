@@ -27,7 +27,7 @@ from pipeline.exchange.linear_maps import (
 from pipeline.exchange.textured_triangles import group_triangles
 from storage.atomic import write_atomically
 from storage.conventions import srgb8
-from storage.records.material import DIFFUSE, EMISSION, PUBLISHED_COLUMNS, ROUGHNESS, SPECULAR
+from storage.records.material import EMISSION, PUBLISHED_COLUMNS, column_places
 from storage.records.scene import ARRAY_FIELDS, Scene
 from storage.records.texture import CONSTANT, NORMAL, TEXTURED, Texture
 
@@ -204,8 +204,8 @@ def _material(
 
 def _maps(scene: Scene, row: int) -> Mapping[str, Map]:
     """Return the map of each column of a material that may be textured, and its normal map."""
-    column_slices = {"diffuse": DIFFUSE, "specular": SPECULAR, "roughness": ROUGHNESS}
-    maps = {name: constant_map(scene.materials[row, part]) for name, part in column_slices.items()}
+    places = column_places()
+    maps = {name: constant_map(scene.materials[row, places[name]]) for name in TEXTURED}
     if scene.material_textures is not None:
         for name, texture in zip(TEXTURED, scene.material_textures[row], strict=True):
             if texture >= 0:

@@ -8,7 +8,7 @@ disks of USD emit to one, so a note is added.
 
 import dataclasses
 import math
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from typing import Any
 
 import numpy as np
@@ -47,17 +47,9 @@ def light_triangles(placed: PlacedPrim, time: Any, lost: list[str]) -> NDArray[n
     """Return the world-space triangles [T, 3, 3] of a light; None where it has no area."""
     prim = placed.prim
     kind = str(prim.GetTypeName())
-
-    def size(name: str) -> float:
-        return _read(prim.GetAttribute(f"inputs:{name}"), time)
-
-    shapes: Mapping[str, Callable[[], NDArray[np.float64]]] = {
-        "RectLight": lambda: _square() * np.array([size("width"), size("height"), 1.0]),
-        "DiskLight": lambda: _disk() * size("radius"),
-        "SphereLight": lambda: _sphere() * size("radius"),
-        "CylinderLight": lambda: _build_tube() * [size("length"), size("radius"), size("radius")],
-    }
-    world = np.einsum("ij,tcj->tci", placed.to_world[:3, :3], shapes[kind]())
+    shape, sizes = _SHAPES[kind]
+    scale = [_read(prim.GetAttribute(f"inputs:{name}"), time) for name in sizes]
+    world = np.einsum("ij,tcj->tci", placed.to_world[:3, :3], shape() * np.array([*scale, 1.0][:3]))
     world = world + placed.to_world[:3, 3]
     area = sum_area(world)
     if not area > 0 or not np.isfinite(area):
@@ -189,6 +181,14 @@ def _sphere() -> NDArray[np.float64]:
         faces = np.concatenate([*corner, middle])
     return faces * math.sqrt(4 * math.pi / sum_area(faces))
 
+
+_SHAPES: Mapping[str, tuple[Callable[[], NDArray[np.float64]], Sequence[str]]] = {
+    "RectLight": (_square, ("width", "height")),
+    "DiskLight": (_disk, ("radius", "radius")),
+    "SphereLight": (_sphere, ("radius", "radius", "radius")),
+    "CylinderLight": (_build_tube, ("length", "radius", "radius")),
+}
+"""Shape of each light, and its sizes along the axes of the light."""
 
 _SAME_ROTATION = 1e-5
 """Tolerance for a rotation that Trilight wrote: other programs keep angles in float32."""

@@ -49,6 +49,7 @@ from pipeline.foreign.usd.texture_nodes import (
 from storage.records.material import (
     DIFFUSE,
     SPECULAR,
+    column_places,
     laid_out,
 )
 from storage.records.texture import TEXTURED, MapSource, Texture
@@ -117,7 +118,9 @@ class HeldMaterial:
         self._where = str(prim.GetPath())
         self._shader = surface_shader(material)
         self._columns = columns
-        self._written = {} if row is None else {each.name: row[part] for each, part in laid_out()}
+        self._written = (
+            {} if row is None else {name: row[part] for name, part in column_places().items()}
+        )
         self._time = time
         self._opened = opened
         self._lost = opened.lost
@@ -297,9 +300,9 @@ def keep_exact(
 ) -> TexturedTriangles:
     """Return triangles whose unchanged columns are exact, and diffuse + specular at most 1."""
     rows = triangles.rows.copy()
-    for column, part in laid_out():
-        if column.name in exact:
-            rows[:, part] = exact[column.name].mean
+    places = column_places()
+    for name, texture in exact.items():
+        rows[:, places[name]] = texture.mean
     note = f"{where}: diffuse lowered where diffuse + specular is over 1"
     if triangles.texture_sets[0] == NO_TEXTURES:
         excess = (rows[:, DIFFUSE] + rows[:, SPECULAR]).max(axis=1, initial=0) > 1 + EXCESS

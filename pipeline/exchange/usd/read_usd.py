@@ -94,7 +94,7 @@ def _read(path: Path, key: str | None, folder: Path | None, licence: str) -> Loa
             return LoadedScene(scene=scene, notes=())
     stage = opened.compose()
     frames = list(_frames(stage))
-    if _is_marked(opened.root):
+    if _find_root(opened.root, None) is not None:
         opened.lost.append("changed since Trilight wrote it: read as any other file")
     if key is not None and key not in frames:
         expected = f"{frames[0]} to {frames[-1]}" if frames else "none: it does not move"
@@ -176,11 +176,6 @@ def _scene_keys(layer: Any) -> list[str] | None:
     return keys if all_marked and keys else None
 
 
-def _is_marked(layer: Any) -> bool:
-    """Return whether a layer has the marks of a scene that Trilight wrote."""
-    return _find_root(layer, None) is not None
-
-
 def _read_exact(opened: OpenedStage, key: str | None = None) -> Scene | None:
     """Read the scene of a file, or of a key of a shard; return None where it was changed.
 
@@ -242,6 +237,7 @@ def _read_written_rows(opened: OpenedStage) -> dict[str, NDArray[np.float32]]:
 
 
 def _find_root(layer: Any, key: str | None) -> Any:
+    """Return the prim of a scene, or of a key of a shard, with Trilight's marks; else None."""
     path = names.ROOT
     if key is not None:
         path = f"{names.SHARD_ROOT}{{{names.VARIANT_SET}={key}}}{path.removeprefix('/')}"
