@@ -44,8 +44,7 @@ MOST_SPECULAR = 25.0
 """Specular factor of a mirror: 25 times the F0 = 0.04 of an ordinary dielectric."""
 _JSON = 0x4E4F534A
 _BIN = 0x004E4942
-FLOAT = 5126
-UNSIGNED = 5125
+_COMPONENTS = {"f": 5126, "u": 5125}
 """Component types of glTF accessors: float32, and unsigned 32-bit integers."""
 
 _USED = ["KHR_materials_specular", "KHR_materials_emissive_strength"]
@@ -154,13 +153,13 @@ def _primitive(
     """Return the JSON of positions and normals [V, 3], and coordinates [V, 2] with v up."""
     points = points.astype("<f4")
     bounds = {"min": points.min(axis=0).tolist(), "max": points.max(axis=0).tolist()}
-    attributes = {"POSITION": file.accessor(points, "VEC3", FLOAT, bounds)}
+    attributes = {"POSITION": file.accessor(points, bounds)}
     if normals is not None:
-        attributes["NORMAL"] = file.accessor(normals.astype("<f4"), "VEC3", FLOAT)
+        attributes["NORMAL"] = file.accessor(normals.astype("<f4"))
     if uv is not None:
         from_top = np.stack([uv[:, 0], 1 - uv[:, 1]], axis=1).astype("<f4")
-        attributes["TEXCOORD_0"] = file.accessor(from_top, "VEC2", FLOAT)
-    index = file.accessor(indices.astype("<u4"), "SCALAR", UNSIGNED)
+        attributes["TEXCOORD_0"] = file.accessor(from_top)
+    index = file.accessor(indices.astype("<u4"))
     return {"attributes": attributes, "indices": index, "material": material}
 
 
@@ -229,12 +228,15 @@ class GlbFile:
         }
         self._data = bytearray()
 
-    def accessor(
-        self, values: NDArray, kind: str, component: int, more: Mapping[str, Any] | None = None
-    ) -> int:
-        """Add an array of numbers; return the index of its accessor."""
-        entry = {"bufferView": self._view(values.tobytes()), "componentType": component}
-        self.tree["accessors"].append({**entry, "count": len(values), "type": kind, **(more or {})})
+    def accessor(self, values: NDArray, more: Mapping[str, Any] | None = None) -> int:
+        """Add an array of numbers or vectors; return the index of its accessor."""
+        entry = {
+            "bufferView": self._view(values.tobytes()),
+            "componentType": _COMPONENTS[values.dtype.kind],
+            "count": len(values),
+            "type": "SCALAR" if values.ndim == 1 else f"VEC{values.shape[1]}",
+        }
+        self.tree["accessors"].append({**entry, **(more or {})})
         return len(self.tree["accessors"]) - 1
 
     def picture(self, values: NDArray[np.uint8]) -> int:

@@ -39,6 +39,8 @@ _NEUTRAL: Mapping[str, Any] = {
 }
 """Unsupported inputs, each with the value at which it has no effect."""
 
+_OLD_NAMES = ("intensity", "exposure", "color", "normalize", "radius", "width", "height")
+"""Names of inputs in stages of old programs."""
 
 _EXPOSURES = Within(-1000, 1000, unit="stops")
 
@@ -102,30 +104,23 @@ def _read(attribute: Any, time: Any, within: Within = FINITE) -> float:
 
 def _note_losses(prim: Any, time: Any, lost: list[str]) -> None:
     where = prim.GetPath()
-    for name, neutral in _NEUTRAL.items():
-        attribute = prim.GetAttribute(name)
-        value = attribute.Get(time) if attribute and attribute.HasAuthoredValue() else None
-        if value is not None and value != neutral:
+    files = {"inputs:texture:file", "inputs:shaping:ies:file"}
+    if "Dome" in str(prim.GetTypeName()):
+        files.remove(names.MAP_PATH)
+    for attribute in prim.GetAuthoredAttributes():
+        name = attribute.GetName()
+        value = attribute.Get(time)
+        is_lost = value is not None and value != _NEUTRAL.get(name, value)
+        if is_lost or (name in files and value and value.path):
             lost.append(f"{where}.{name}: has no place here")
-    for name in ("inputs:texture:file", "inputs:shaping:ies:file"):
-        attribute = prim.GetAttribute(name)
-        is_map = "Dome" in str(prim.GetTypeName()) and name == "inputs:texture:file"
-        if not is_map and attribute and attribute.Get(time) and attribute.Get(time).path:
-            lost.append(f"{where}.{name}: has no place here")
-    lost += [
-        f"{where}.{name}: USD has read inputs:{name} alone since 21.02"
-        for name in ("intensity", "exposure", "color", "normalize", "radius", "width", "height")
-        if prim.HasAttribute(name) and prim.GetAttribute(name).HasAuthoredValue()
-    ]
+        if name in _OLD_NAMES:
+            lost.append(f"{where}.{name}: USD has read inputs:{name} alone since 21.02")
+        if attribute.HasAuthoredConnections():
+            lost.append(f"{where}.{name}: a network that is not read")
     for relation in prim.GetRelationships():
         is_link = relation.GetName().startswith(("light:filters", "portals", "collection:"))
         if is_link and relation.HasAuthoredTargets():
             lost.append(f"{where}.{relation.GetName()}: has no place here")
-    lost += [
-        f"{where}.{attribute.GetName()}: a network that is not read"
-        for attribute in prim.GetAttributes()
-        if attribute.HasAuthoredConnections()
-    ]
 
 
 def sum_area(triangles: NDArray[np.floating]) -> float:
