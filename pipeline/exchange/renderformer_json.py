@@ -167,7 +167,7 @@ def _to_text(value: Any) -> str:
 
 def _parse_json(data: bytes, name: str) -> Any:
     if len(data) > MAX_BYTES:
-        raise TrilightError(f"{name}: {len(data)} bytes; expected at most {MAX_BYTES}.")
+        raise TrilightError(f"{name}: too large; expected at most {MAX_BYTES} bytes.")
     try:
         return json.loads(
             data.decode("utf-8-sig"),

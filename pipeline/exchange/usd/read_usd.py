@@ -13,7 +13,7 @@ import dataclasses
 import json
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -53,6 +53,8 @@ from storage.records.scene import OBJECT_KINDS, Scene, SceneObject
 from storage.records.scene_file import scene_digest, scene_provenance
 from storage.records.texture import CONSTANT, TEXTURED, MapSource, Texture
 
+Read = TypeVar("Read")
+
 MAX_FRAMES = 10_000
 """Maximum number of scenes in a stage with time samples."""
 
@@ -63,7 +65,7 @@ def usd_keys(path: Path, folder: Path | None = None) -> list[str]:
     Raises:
         TrilightError: the file is unusable (pipeline.foreign.usd.stage).
     """
-    return read_quietly(path, lambda: _keys(OpenedStage(path, folder)))
+    return _read_file(path, lambda: _keys(OpenedStage(path, folder)))
 
 
 def read_usd(path: Path, key: str | None, folder: Path | None, licence: str) -> LoadedScene:
@@ -78,13 +80,23 @@ def read_usd(path: Path, key: str | None, folder: Path | None, licence: str) -> 
     Raises:
         TrilightError: the file is unusable, lacks the scene, or a `Scene` cannot hold it.
     """
-    return read_quietly(path, lambda: _read(path, key, folder, licence))
+    return _read_file(path, lambda: _read(OpenedStage(path, folder), key, licence))
 
 
-def _read(path: Path, key: str | None, folder: Path | None, licence: str) -> LoadedScene:
+def _read_file(path: Path, read: Callable[[], Read]) -> Read:
+    """Return the result of `read` for a file, whose name begins every message."""
+    try:
+        return read_quietly(path, read)
+    except (TrilightError, Rejected) as error:
+        message = error.message if isinstance(error, Rejected) else str(error)
+        if message.startswith(path.name):
+            raise
+        raise TrilightError(f"{path.name}: {message}") from error
+
+
+def _read(opened: OpenedStage, key: str | None, licence: str) -> LoadedScene:
     from pxr import Usd
 
-    opened = OpenedStage(path, folder)
     shard = _scene_keys(opened.root)
     if shard is not None:
         return _read_shard_scene(opened, shard, key or shard[0])
@@ -98,29 +110,23 @@ def _read(path: Path, key: str | None, folder: Path | None, licence: str) -> Loa
         opened.lost.append("changed since Trilight wrote it: read as any other file")
     if key is not None and key not in frames:
         expected = f"{frames[0]} to {frames[-1]}" if frames else "none: it does not move"
-        raise TrilightError(f"{path.name}: no time code {key}; expected one of {expected}.")
+        raise TrilightError(f"no time code {key}; expected one of {expected}.")
     chosen = key or (frames[0] if frames else "")
     if frames and key is None:
         opened.lost.append(f"time codes other than {chosen} of {len(frames)}")
     time = Usd.TimeCode(float(chosen)) if chosen else Usd.TimeCode.EarliestTime()
-    try:
-        scene = build_stage_scene(stage, time, opened, licence, _read_written_rows(opened))
-    except (TrilightError, Rejected) as error:
-        message = error.message if isinstance(error, Rejected) else str(error)
-        text = message.removeprefix(f"{path.name}: ")
-        raise TrilightError(f"{path.name}: {text}") from error
+    scene = build_stage_scene(stage, time, opened, licence, _read_written_rows(opened))
     return LoadedScene(scene=scene, notes=opened.notes)
 
 
 def _read_shard_scene(opened: OpenedStage, keys: list[str], key: str) -> LoadedScene:
-    name = opened.path.name
     if key not in keys:
-        raise TrilightError(f"{name}: no scene {key}; expected one of {keys[0]} to {keys[-1]}.")
+        raise TrilightError(f"no scene {key}; expected one of {keys[0]} to {keys[-1]}.")
     scene = _read_exact(opened, key)
     if scene is None:
         raise TrilightError(
-            f"{name}: scene {key} has been changed since Trilight wrote it; save it as a file of "
-            "its own and read that."
+            f"scene {key} has been changed since Trilight wrote it; save it as a file of its own "
+            "and read that."
         )
     return LoadedScene(scene=scene, notes=())
 
@@ -136,10 +142,15 @@ def _keys(opened: OpenedStage) -> list[str]:
 
 def _frames(stage: Any) -> Iterator[str]:
     """Yield the time codes of an animated stage: its frames, or else its samples."""
+    from pxr import Usd
+
     if len({t for layer in stage.GetUsedLayers() for t in layer.ListAllTimeSamples()}) < 2:
         return
     if not stage.HasAuthoredTimeCodeRange():
-        times = np.unique(list(_list_samples(stage)))
+        roots = (stage.GetPseudoRoot(), *stage.GetPrototypes())
+        prims = (prim for root in roots for prim in Usd.PrimRange.AllPrims(root))
+        attributes = [each for prim in prims for each in prim.GetAuthoredAttributes()]
+        times = np.array(Usd.Attribute.GetUnionedTimeSamples(attributes))  # in those of the stage
     else:
         first = stage.GetStartTimeCode()
         last = stage.GetEndTimeCode()
@@ -152,16 +163,6 @@ def _frames(stage: Any) -> Iterator[str]:
         raise TrilightError(f"{len(times)} time codes; expected at most {MAX_FRAMES}.")
     for time in times:
         yield f"{time:g}"
-
-
-def _list_samples(stage: Any) -> Iterator[float]:
-    """Yield the time codes of all samples, in the time of the stage."""
-    from pxr import Usd
-
-    for root in (stage.GetPseudoRoot(), *stage.GetPrototypes()):
-        for prim in Usd.PrimRange.AllPrims(root):
-            for attribute in prim.GetAuthoredAttributes():
-                yield from attribute.GetTimeSamples()
 
 
 def _scene_keys(layer: Any) -> list[str] | None:
@@ -187,20 +188,16 @@ def _read_exact(opened: OpenedStage, key: str | None = None) -> Scene | None:
     root = _find_root(layer, key)
     if root is None or len(layer.subLayerPaths) or len(layer.rootPrims) != 1:
         return None
-    name = layer.GetDisplayName()
-    require_readable(root.attributes[names.VERSION].default, name)
+    require_readable(root.attributes[names.VERSION].default, opened.path.name)
     try:
         scene = _read_scene(root, opened)
-    except UndeclaredColumn as error:
-        raise TrilightError(f"{name}: {error}") from error
+    except UndeclaredColumn:
+        raise
     except _NOT_AS_WRITTEN:
         return None
     if scene_digest(scene) != root.attributes[names.DIGEST].default:
         return None
-    try:
-        scene.check()
-    except TrilightError as error:
-        raise TrilightError(f"{name}: {error}") from error
+    scene.check()
     expected = new_layer(".usdc", names.ROOT)
     try:
         written = author_scene(expected, str(root.path), scene)

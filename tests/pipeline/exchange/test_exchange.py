@@ -312,7 +312,7 @@ def test_textures_and_a_sky_are_said_to_be_lost_where_they_are(tmp_path: Path) -
     assert np.allclose(row[[0, 1, 2, 6]], np.concatenate(means), atol=1e-3)  # H5 holds halves
 
 
-@pytest.mark.parametrize("form", ["json", "h5"])
+@pytest.mark.parametrize("form", ["json", "h5", "glb"])
 def test_a_scene_that_only_its_sky_lights_is_not_written_dark(tmp_path: Path, form: str) -> None:
     plain = tiny_scene()
     materials = plain.materials.copy()
