@@ -15,7 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pipeline.exchange.pictures import MAX_BYTES, decode_pixels, linear_rgb
-from pipeline.exchange.usd import prim_names as names
+from pipeline.exchange.usd import layout
 from pipeline.foreign.numbers import FINITE, read_number, read_numbers
 from pipeline.foreign.usd.placed import PlacedPrim
 from pipeline.foreign.usd.stage import OpenedStage
@@ -106,7 +106,7 @@ def _note_losses(prim: Any, time: Any, lost: list[str]) -> None:
     where = prim.GetPath()
     files = {"inputs:texture:file", "inputs:shaping:ies:file"}
     if "Dome" in str(prim.GetTypeName()):
-        files.remove(names.MAP_PATH)
+        files.remove(layout.MAP_PATH)
     for attribute in prim.GetAuthoredAttributes():
         name = attribute.GetName()
         value = attribute.Get(time)
@@ -209,10 +209,10 @@ def read_foreign_dome(
     if np.linalg.det(rotation) < 0:
         opened.lost.append(f"{prim_path}: a mirrored dome; its light was left out")
         return None
-    visibility = prim.GetAttribute(names.VISIBLE_TO_CAMERA)
+    visibility = prim.GetAttribute(layout.VISIBLE_TO_CAMERA)
     sky = Environment(
         radiance_rgb=tinted.astype(np.float32),
-        rotation=(rotation @ names.TO_OUR_AXES.T).astype(np.float32),
+        rotation=(rotation @ layout.TO_OUR_AXES.T).astype(np.float32),
         is_seen=bool(visibility and visibility.Get(time)),
         source=MapSource(name=prim.GetName(), licence=licence),
     )
@@ -227,20 +227,20 @@ def read_foreign_dome(
 def _take_held(sky: Environment, dome: Any, time: Any) -> Environment:
     """Return an environment with the values that Trilight wrote on the prim of the scene."""
     stage = dome.GetStage()
-    holder = next((prim for prim in stage.Traverse() if prim.HasAttribute(names.SKY_SOURCE)), None)
+    holder = next((prim for prim in stage.Traverse() if prim.HasAttribute(layout.SKY_SOURCE)), None)
     if holder is None:
         return sky
 
     def read_value(name: str) -> Any:
         return holder.GetAttribute(name).Get(time)
 
-    held = names.parse_map_text(read_value(names.SKY_SOURCE))
+    held = layout.parse_map_text(read_value(layout.SKY_SOURCE))
     if held is None or held[0] != sky.sha256:
         return sky
     sky = dataclasses.replace(sky, source=held[1])
-    if not dome.HasAttribute(names.VISIBLE_TO_CAMERA):
-        sky = dataclasses.replace(sky, is_seen=bool(read_value(names.SKY_VISIBLE)))
-    rows = list(map(read_value, names.SKY_ROWS))
+    if not dome.HasAttribute(layout.VISIBLE_TO_CAMERA):
+        sky = dataclasses.replace(sky, is_seen=bool(read_value(layout.SKY_VISIBLE)))
+    rows = list(map(read_value, layout.SKY_ROWS))
     if None in rows or not np.allclose(rows, sky.rotation, atol=_SAME_ROTATION):
         return sky
     return dataclasses.replace(sky, rotation=np.array(rows, np.float32))
@@ -261,13 +261,13 @@ def _pole_rotation(prim: Any) -> NDArray[np.float64]:
 def _read_map(prim: Any, time: Any, opened: OpenedStage) -> NDArray[np.float64] | None:
     """Return the map [H, 2 H, 3] of a dome; uniform radiance 1 where it names no file."""
     prim_path = str(prim.GetPath())
-    attribute = prim.GetAttribute(names.MAP_PATH)
+    attribute = prim.GetAttribute(layout.MAP_PATH)
     asset = attribute.Get(time) if attribute else None
     if asset is None or not asset.path:
         return np.ones((1, 2, 3))
-    layout = prim.GetAttribute("inputs:texture:format").Get(time)
-    if layout not in (None, "automatic", "latlong"):
-        opened.lost.append(f"{prim_path}: a picture of format {layout}; expected latlong")
+    projection = prim.GetAttribute("inputs:texture:format").Get(time)
+    if projection not in (None, "automatic", "latlong"):
+        opened.lost.append(f"{prim_path}: a picture of format {projection}; expected latlong")
         return None
     specs = attribute.GetPropertyStack(time)
     resolved = opened.resolve(specs[0].layer if specs else opened.root, asset.path)

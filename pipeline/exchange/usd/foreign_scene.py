@@ -27,7 +27,7 @@ from pipeline.exchange.usd.foreign_lights import (
     read_foreign_dome,
 )
 from pipeline.exchange.usd.held_materials import HeldMaterial, keep_exact, read_columns
-from pipeline.exchange.usd.prim_names import (
+from pipeline.exchange.usd.layout import (
     FOV_DEG,
     INDEX,
     MATERIAL_ATTRIBUTES,

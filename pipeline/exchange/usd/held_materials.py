@@ -22,7 +22,7 @@ from pipeline.exchange.linear_maps import (
 )
 from pipeline.exchange.pictures import MAX_BYTES
 from pipeline.exchange.textured_triangles import NO_TEXTURES, TexturedTriangles
-from pipeline.exchange.usd import prim_names as names
+from pipeline.exchange.usd import layout
 from pipeline.exchange.usd.write_materials import (
     COAT_ROUGHNESS,
     OPENPBR,
@@ -68,9 +68,9 @@ def read_columns(prim: Any, time: Any, lost: list[str]) -> dict[str, NDArray[np.
     """
     declared = {column.name: column for column, _ in laid_out()}
     columns = dict[str, NDArray[np.float32]]()
-    missing = str(prim.GetAttribute(names.ADDED_COLUMNS).Get() or "").split()
+    missing = str(prim.GetAttribute(layout.ADDED_COLUMNS).Get() or "").split()
     for attribute in prim.GetAuthoredAttributes():
-        name = names.column_of(attribute.GetName())
+        name = layout.column_of(attribute.GetName())
         if name is None:
             continue
         missing = [each for each in missing if each != name]
@@ -126,10 +126,10 @@ class HeldMaterial:
         self._lost = opened.lost
         self._maps: dict[str, tuple[str, MapSource]] = {}
         for name in TEXTURED:
-            text = prim.GetAttribute(names.texture_attribute(name)).Get(time)
-            if (held := names.parse_map_text(text)) is not None:
+            text = prim.GetAttribute(layout.texture_attribute(name)).Get(time)
+            if (held := layout.parse_map_text(text)) is not None:
                 self._maps[name] = held
-        self._is_marked = bool(root) and root.HasAttribute(names.DIGEST)
+        self._is_marked = bool(root) and root.HasAttribute(layout.DIGEST)
         self._openpbr = read_openpbr(material, time, opened) if self._is_marked else {}
 
     def restore(
@@ -248,7 +248,7 @@ class HeldMaterial:
         """
         of_preview = {each: stated.constants[name] for each, name in PREVIEW_INPUTS.items()}
         places: dict[str, NDArray[Any]] = {
-            names.column_attribute(column): self._columns[column],
+            layout.column_attribute(column): self._columns[column],
             _name_shader(stated): of_preview[column],
         }
         if column in self._openpbr:

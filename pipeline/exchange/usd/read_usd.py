@@ -20,7 +20,7 @@ from numpy.typing import NDArray
 
 from pipeline.exchange.pictures import MAX_BYTES
 from pipeline.exchange.textured_triangles import MAX_ROWS, LoadedScene
-from pipeline.exchange.usd import prim_names as names
+from pipeline.exchange.usd import layout
 from pipeline.exchange.usd.foreign_scene import build_stage_scene
 from pipeline.exchange.usd.write_materials import (
     PREVIEW,
@@ -167,12 +167,12 @@ def _frames(stage: Any) -> Iterator[str]:
 
 def _scene_keys(layer: Any) -> list[str] | None:
     """Return the keys of the scenes of a shard that Trilight wrote; None for any other layer."""
-    root = layer.GetPrimAtPath(names.SHARD_ROOT)
-    if layer.defaultPrim != names.SHARD_ROOT.removeprefix("/") or root is None:
+    root = layer.GetPrimAtPath(layout.SHARD_ROOT)
+    if layer.defaultPrim != layout.SHARD_ROOT.removeprefix("/") or root is None:
         return None
-    if names.VARIANT_SET not in root.variantSets or len(root.nameChildren):
+    if layout.VARIANT_SET not in root.variantSets or len(root.nameChildren):
         return None
-    keys: list[str] = list(root.variantSets[names.VARIANT_SET].variants.keys())
+    keys: list[str] = list(root.variantSets[layout.VARIANT_SET].variants.keys())
     all_marked = all(_find_root(layer, key) is not None for key in keys)
     return keys if all_marked and keys else None
 
@@ -188,17 +188,17 @@ def _read_exact(opened: OpenedStage, key: str | None = None) -> Scene | None:
     root = _find_root(layer, key)
     if root is None or len(layer.subLayerPaths) or len(layer.rootPrims) != 1:
         return None
-    require_readable(root.attributes[names.VERSION].default, opened.path.name)
+    require_readable(root.attributes[layout.VERSION].default, opened.path.name)
     try:
         scene = _read_scene(root, opened)
     except UndeclaredColumn:
         raise
     except _NOT_AS_WRITTEN:
         return None
-    if scene_digest(scene) != root.attributes[names.DIGEST].default:
+    if scene_digest(scene) != root.attributes[layout.DIGEST].default:
         return None
     scene.check()
-    expected = new_layer(".usdc", names.ROOT)
+    expected = new_layer(".usdc", layout.ROOT)
     try:
         written = author_scene(expected, str(root.path), scene)
         return scene if _list_specs(root) == _list_specs(written) else None
@@ -217,7 +217,7 @@ def _read_written_rows(opened: OpenedStage) -> dict[str, NDArray[np.float32]]:
         return {}
     try:
         scene = _read_scene(root, opened)
-        prims = _list_by_row(root.nameChildren["Materials"], names.material_name)
+        prims = _list_by_row(root.nameChildren["Materials"], layout.material_name)
         of_preview = scene.materials.copy()
         for row, prim in enumerate(prims):
             inputs = prim.nameChildren[PREVIEW].attributes
@@ -226,7 +226,7 @@ def _read_written_rows(opened: OpenedStage) -> dict[str, NDArray[np.float32]]:
                     of_preview[row, part] = inputs[f"inputs:{PREVIEW_INPUTS[column.name]}"].default
         for rows in (scene.materials, of_preview):
             digest = scene_digest(dataclasses.replace(scene, materials=rows))
-            if digest == root.attributes[names.DIGEST].default:
+            if digest == root.attributes[layout.DIGEST].default:
                 return {str(prim.path): rows[row] for row, prim in enumerate(prims)}
     except (UndeclaredColumn, *_NOT_AS_WRITTEN):
         pass
@@ -235,11 +235,11 @@ def _read_written_rows(opened: OpenedStage) -> dict[str, NDArray[np.float32]]:
 
 def _find_root(layer: Any, key: str | None) -> Any:
     """Return the prim of a scene, or of a key of a shard, with Trilight's marks; else None."""
-    path = names.ROOT
+    path = layout.ROOT
     if key is not None:
-        path = f"{names.SHARD_ROOT}{{{names.VARIANT_SET}={key}}}{path.removeprefix('/')}"
+        path = f"{layout.SHARD_ROOT}{{{layout.VARIANT_SET}={key}}}{path.removeprefix('/')}"
     root = layer.GetPrimAtPath(path)
-    marks = (names.VERSION, names.DIGEST)
+    marks = (layout.VERSION, layout.DIGEST)
     return root if root and all(mark in root.attributes for mark in marks) else None
 
 
@@ -249,19 +249,21 @@ def _read_scene(root: Any, opened: OpenedStage) -> Scene:
     if ENVIRONMENT in folders:
         sky = _read_dome(folders[ENVIRONMENT], opened)
     materials = _read_materials(folders["Materials"], opened)
-    prims = sorted(folders["Objects"].nameChildren, key=lambda p: p.attributes[names.INDEX].default)
-    objects = tuple(SceneObject(**_read_texts(prim, names.OBJECT_TEXTS)) for prim in prims)
+    prims = sorted(
+        folders["Objects"].nameChildren, key=lambda p: p.attributes[layout.INDEX].default
+    )
+    objects = tuple(SceneObject(**_read_texts(prim, layout.OBJECT_TEXTS)) for prim in prims)
     _require(all(entry.kind in OBJECT_KINDS for entry in objects))
     meshes = [prim for prim in prims if prim.typeName == "Mesh"]
-    cameras = [prim.attributes for prim in _list_by_row(folders["Cameras"], names.camera_name)]
+    cameras = [prim.attributes for prim in _list_by_row(folders["Cameras"], layout.camera_name)]
     poses = [np.array(camera["xformOp:transform"].default).T for camera in cameras]
     return Scene(
         **_read_vertices(root, meshes),
         **_read_triangles(meshes, is_textured=bool(materials["textures"])),
         c2w=np.array(poses, np.float32),
-        fov_deg=np.array([camera[names.FOV_DEG].default for camera in cameras], np.float32),
+        fov_deg=np.array([camera[layout.FOV_DEG].default for camera in cameras], np.float32),
         objects=objects,
-        provenance=scene_provenance(json.loads(root.attributes[names.PROVENANCE].default)),
+        provenance=scene_provenance(json.loads(root.attributes[layout.PROVENANCE].default)),
         **materials,
         environment=sky,
     )
@@ -271,10 +273,10 @@ def _read_dome(prim: Any, opened: OpenedStage) -> Environment:
     """Read the environment that was written; raises LookupError without its file."""
     matrix = np.array(prim.attributes["xformOp:transform"].default).T
     return Environment(
-        radiance_rgb=decode_exr(_read_asset(prim, names.MAP_PATH, opened)),
-        rotation=(matrix[:3, :3] @ names.TO_OUR_AXES.T).astype(np.float32),
-        is_seen=bool(prim.attributes[names.VISIBLE_TO_CAMERA].default),
-        source=MapSource(**_read_texts(prim, names.MAP_TEXTS)),
+        radiance_rgb=decode_exr(_read_asset(prim, layout.MAP_PATH, opened)),
+        rotation=(matrix[:3, :3] @ layout.TO_OUR_AXES.T).astype(np.float32),
+        is_seen=bool(prim.attributes[layout.VISIBLE_TO_CAMERA].default),
+        source=MapSource(**_read_texts(prim, layout.MAP_TEXTS)),
     )
 
 
@@ -285,10 +287,10 @@ def _read_texts(prim: Any, attributes: Mapping[str, str]) -> dict[str, Any]:
 
 def _read_vertices(root: Any, meshes: list[Any]) -> dict[str, Any]:
     """Return positions and normals [V, 3], placed by the vertex rows of root and meshes."""
-    rows = [_read_integers(root, names.UNUSED_ROWS)]
-    rows += [_read_integers(mesh, names.VERTEX_ROWS) for mesh in meshes]
-    positions = [_read_vectors(root, names.UNUSED_POSITIONS), *map(_read_positions, meshes)]
-    normals = [_read_vectors(root, names.UNUSED_NORMALS)]
+    rows = [_read_integers(root, layout.UNUSED_ROWS)]
+    rows += [_read_integers(mesh, layout.VERTEX_ROWS) for mesh in meshes]
+    positions = [_read_vectors(root, layout.UNUSED_POSITIONS), *map(_read_positions, meshes)]
+    normals = [_read_vectors(root, layout.UNUSED_NORMALS)]
     normals += [_read_vectors(mesh, "normals") for mesh in meshes]
     return {
         "vertex_positions": _place_by_row(rows, positions),
@@ -301,18 +303,18 @@ def _read_positions(mesh: Any) -> NDArray[np.float32]:
     name = _OLD_CENTER if _OLD_CENTER in mesh.attributes else CENTER
     center = np.array(mesh.attributes[name].default, np.float64)
     positions = sum_positions(center, _read_vectors(mesh, "points"))
-    positions[_read_integers(mesh, names.EXACT_ROWS)] = _read_vectors(mesh, names.EXACT_POSITIONS)
+    positions[_read_integers(mesh, layout.EXACT_ROWS)] = _read_vectors(mesh, layout.EXACT_POSITIONS)
     return positions
 
 
 def _read_triangles(meshes: list[Any], *, is_textured: bool) -> dict[str, Any]:
     """Return the fields of a scene by triangle, placed by the face rows of meshes."""
-    rows = [_read_integers(mesh, names.FACE_ROWS) for mesh in meshes]
+    rows = [_read_integers(mesh, layout.FACE_ROWS) for mesh in meshes]
     faces, materials, objects, uv = [], [], [], []
     for mesh, face_rows in zip(meshes, rows, strict=True):
-        vertex_rows = _read_integers(mesh, names.VERTEX_ROWS)
+        vertex_rows = _read_integers(mesh, layout.VERTEX_ROWS)
         faces.append(vertex_rows[_read_integers(mesh, "faceVertexIndices").reshape(-1, 3)])
-        objects.append(np.full(len(face_rows), mesh.attributes[names.INDEX].default))
+        objects.append(np.full(len(face_rows), mesh.attributes[layout.INDEX].default))
         index = np.full(len(face_rows), -1)
         for subset in mesh.nameChildren:
             index[_read_integers(subset, "indices")] = int(subset.name.rpartition("_")[2])
@@ -338,20 +340,20 @@ def _place_by_row(rows: Sequence[NDArray[np.int64]], values: Sequence[NDArray]) 
 
 def _read_materials(folder: Any, opened: OpenedStage) -> dict[str, Any]:
     """Return the fields of a scene on materials and textures; raises UndeclaredColumn."""
-    prims = _list_by_row(folder, names.material_name)
+    prims = _list_by_row(folder, layout.material_name)
     rows = default_rows(len(prims))
-    stored = (names.column_of(attribute.name) for attribute in prims[0].attributes)
+    stored = (layout.column_of(attribute.name) for attribute in prims[0].attributes)
     columns = {*PUBLISHED_COLUMNS, *(declared_column(name).name for name in stored if name)}
     index = np.full((len(prims), len(SHADERS)), CONSTANT, np.int32)
     textures: dict[int, Texture] = {}
     for row, prim in enumerate(prims):
         for column, part in laid_out():
             if column.name in columns:
-                rows[row, part] = prim.attributes[names.column_attribute(column.name)].default
+                rows[row, part] = prim.attributes[layout.column_attribute(column.name)].default
         for place, (name, shader) in enumerate(SHADERS.items()):
             if shader in prim.nameChildren:
                 node = prim.nameChildren[shader]
-                texture = node.attributes[names.TEXTURE_ROW].default
+                texture = node.attributes[layout.TEXTURE_ROW].default
                 index[row, place] = texture
                 if texture not in textures:
                     textures[texture] = _read_texture(node, name, opened)
@@ -370,7 +372,7 @@ def _read_texture(node: Any, column: str, opened: OpenedStage) -> Texture:
         node.attributes["inputs:file"].default.path,
         column,
         is_srgb=node.attributes["inputs:sourceColorSpace"].default == "sRGB",
-        source=MapSource(**_read_texts(node, names.MAP_TEXTS)),
+        source=MapSource(**_read_texts(node, layout.MAP_TEXTS)),
     )
 
 

@@ -28,14 +28,7 @@ from numpy.typing import NDArray
 
 from pipeline.documents.png import encode_png
 from pipeline.exchange.pictures import MAX_PIXELS
-from pipeline.exchange.usd import prim_names as names
-from pipeline.exchange.usd.authoring import (
-    Attributes,
-    add_attributes,
-    add_prim,
-    text_attributes,
-    usd_value,
-)
+from pipeline.exchange.usd import layout
 from pipeline.foreign.picture import decode_image
 from pipeline.foreign.usd.shaders import (
     IOR_OF_CONSTANT_ALBEDOS,
@@ -92,7 +85,7 @@ _LINKS = {
 }
 """Type and name of the input, and name and type of its output, by column."""
 
-_TO_VECTORS: Attributes = {
+_TO_VECTORS: layout.Attributes = {
     "inputs:scale": ("float4", (2.0, 2.0, 2.0, 1.0)),
     "inputs:bias": ("float4", (-1.0, -1.0, -1.0, 0.0)),
     "inputs:fallback": ("float4", (0.0, 0.0, 1.0, 1.0)),
@@ -129,24 +122,24 @@ def add_materials(layer: Any, folder: str, scene: Scene) -> None:
     """
     from pxr import Sdf
 
-    add_prim(layer, folder, "Scope")
+    layout.add_prim(layer, folder, "Scope")
     first = None
     columns = stored_columns(scene.materials)
     for row, values in enumerate(scene.materials):
-        path = f"{folder}/{names.material_name(row)}"
+        path = f"{folder}/{layout.material_name(row)}"
         used = _used_textures(scene, row)
         copied = first is not None and not used
         if copied:
             Sdf.CopySpec(layer, first, layer, path)
         for below, attributes in material_tables(values, columns, used).items():
             if not copied:
-                prim = add_prim(layer, path + below, "Shader" if below else "Material")
-                add_attributes(prim, attributes, path)
+                prim = layout.add_prim(layer, path + below, "Shader" if below else "Material")
+                layout.add_attributes(prim, attributes, path)
                 continue
             prim = layer.GetPrimAtPath(path + below)
             for name, (kind, value, *_) in attributes.items():
                 if kind in ("color3f", "float", "float[]"):
-                    prim.attributes[name].default = usd_value(kind, value)
+                    prim.attributes[name].default = layout.usd_value(kind, value)
         first = first if used else first or path
 
 
@@ -165,7 +158,7 @@ def _used_textures(scene: Scene, row: int) -> Used:
 
 def material_tables(
     values: NDArray[np.float32], columns: Sequence[str], used: Used
-) -> dict[str, Attributes]:
+) -> dict[str, layout.Attributes]:
     """Return the attributes of a material row's prims, by their path below the material.
 
     The row has all declared columns; `columns` names the stored ones, and `used` its textures.
@@ -174,8 +167,8 @@ def material_tables(
     roughness = float(values[ROUGHNESS])
     material = _exact_attributes(values, columns)
     for name, (_, texture) in used.items():
-        source = names.format_map(texture.sha256, texture.source)
-        material[names.texture_attribute(name)] = ("string", source)
+        source = layout.format_map(texture.sha256, texture.source)
+        material[layout.texture_attribute(name)] = ("string", source)
     material["outputs:surface"] = ("token", None, f"{PREVIEW}.outputs:surface")
     preview: _Table = {
         "info:id": ("uniform token", "UsdPreviewSurface"),
@@ -187,7 +180,7 @@ def material_tables(
         "inputs:ior": ("float", IOR_OF_CONSTANT_ALBEDOS),
         "outputs:surface": ("token", None),
     }
-    tables: dict[str, Attributes] = {"": material, f"/{PREVIEW}": preview}
+    tables: dict[str, layout.Attributes] = {"": material, f"/{PREVIEW}": preview}
     if not used:
         material["outputs:mtlx:surface"] = ("token", None, f"{OPENPBR}.outputs:out")
         inputs = openpbr_inputs(diffuse, specular, roughness, emission)
@@ -221,12 +214,12 @@ def _exact_attributes(values: NDArray[np.float32], columns: Sequence[str]) -> _T
         if column.name in columns:
             kind = "color3f" if column.is_colour else "float" if column.width == 1 else "float[]"
             value = values[part].tolist() if column.is_colour else values[part]
-            attributes[names.column_attribute(column.name)] = (
+            attributes[layout.column_attribute(column.name)] = (
                 kind,
                 float(value[0]) if kind == "float" else value,
             )
-    if added := [name for name in columns if name not in names.MATERIAL_ATTRIBUTES]:
-        attributes[names.ADDED_COLUMNS] = ("string", " ".join(added))
+    if added := [name for name in columns if name not in layout.MATERIAL_ATTRIBUTES]:
+        attributes[layout.ADDED_COLUMNS] = ("string", " ".join(added))
     return attributes
 
 
@@ -239,8 +232,8 @@ def _texture_table(row: int, texture: Texture) -> _Table:
         "inputs:wrapS": ("token", "repeat"),
         "inputs:wrapT": ("token", "repeat"),
         "inputs:fallback": ("float4", (*mean, 1.0)),
-        names.TEXTURE_ROW: ("int", row),
-        **text_attributes(names.MAP_TEXTS, texture.source),
+        layout.TEXTURE_ROW: ("int", row),
+        **layout.text_attributes(layout.MAP_TEXTS, texture.source),
     }
 
 
@@ -315,7 +308,7 @@ def openpbr_inputs(
     specular: Sequence[float],
     roughness: float,
     emission: Sequence[float],
-) -> Attributes:
+) -> layout.Attributes:
     """Return the attributes of the shader of a material's columns."""
     root = math.sqrt(min(max(specular), _MOST_REFLECTING))
     return {
