@@ -38,7 +38,7 @@ from storage.records import scene_file
 from storage.records.material import columns_in_use
 from storage.records.profiles import PACKED, PLAIN
 from storage.records.retextured import without_maps, without_normal_maps
-from storage.records.sample import decode_sample, decode_scene
+from storage.records.sample import decode_sample, decode_scene, require_lawful
 from storage.records.scene import MAP_ARRAYS, Scene, SceneObject
 from storage.records.scene_file import encode_scene, read_scene_file
 from storage.registry import Registry
@@ -164,10 +164,7 @@ def _read_sample(source: SceneSource, pictures: bool) -> LoadedScene:
     key = str(source.key)
     with open_shard(source.path) as opened:
         record = decode_scene(key, opened.members(key, _MEMBERS.__contains__))
-        try:
-            record.scene.check()
-        except TrilightError as error:
-            raise TrilightError(f"sample {key}: {error}") from error
+        require_lawful(record)
         if not pictures:
             return LoadedScene(scene=record.scene, notes=())
         names = (*_MEMBERS, *(f"{view}.exr" for view in range(len(record.views))))

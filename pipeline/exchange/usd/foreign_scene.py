@@ -5,6 +5,7 @@ wrote keeps its exact values where nothing was changed. Coats, transparency and 
 notes.
 """
 
+import itertools
 import math
 from collections.abc import Mapping, Sequence
 from typing import Any
@@ -49,55 +50,16 @@ from storage.records.material import EMISSION, column_places
 from storage.records.scene import Scene, SceneObject
 from storage.records.texture import MapSource, Texture
 
+_MESHES = ("Mesh", *SOLIDS)
+
 _MOST_NOTED = 2
 """Maximum number of notes in the message on a stage without light."""
 
+_SAME_LENS = 1e-5
+"""Relative tolerance for a lens that Trilight wrote."""
 
-def build_stage_scene(
-    stage: Any,
-    time: Any,
-    opened: OpenedStage,
-    licence: str,
-    written: Mapping[str, NDArray[np.float32]],
-) -> Scene:
-    """Read meshes, materials, lights and cameras of a Usd.Stage at a time, as a scene.
-
-    `opened.lost` receives notes on losses. `written` has material rows as Trilight wrote them, by
-    the paths of their prims, where known.
-
-    Raises:
-        TrilightError: a count exceeds its maximum, arrays contradict each other, or the stage lacks
-            triangles or light.
-    """
-    placed = sorted(placed_prims(stage, time, opened.lost), key=_read_row)
-    meshes = tuple(each for each in placed if each.prim.GetTypeName() in ("Mesh", *SOLIDS))
-    usd_stage = UsdStage(opened=opened, composed=stage, meshes=meshes, time=time)
-    surfaces = StageSurfaces(usd_stage, licence, written)
-    numbers = iter(range(len(meshes)))
-    parts = SceneParts(opened.path.name)
-    cameras = []
-    for each in placed:
-        kind = each.prim.GetTypeName()
-        if kind in ("Mesh", *SOLIDS):
-            mesh = surfaces.convert(each, next(numbers))
-            if mesh is not None:
-                parts.add(_entry(each.prim, licence), mesh)
-        elif kind == "Camera":
-            cameras.append(_read_camera(each, time, opened.lost))
-        elif kind not in DOMES and (lamp := light_triangles(each, time, opened.lost)) is not None:
-            radiance = compute_radiance(each, lamp, time, opened.lost)
-            parts.add(_entry(each.prim, licence), build_lamp(lamp, radiance), is_lamp=True)
-    sky = _read_environment(placed, time, opened, licence)
-    is_lit = sky is not None and sky.radiance_rgb.any()
-    if not is_lit and not parts.has_emitters:
-        raise TrilightError(
-            f"no light that can be carried over ({_name_lights(opened.notes)}); expected an "
-            "emissive material, or a rectangle, disk, sphere, cylinder, mesh or dome light."
-        )
-    code = time.GetValue() if time.IsNumeric() and not time.IsEarliestTime() else None
-    provenance = {"template": "usd", "file": opened.path.name, "time_code": code}
-    usable = [camera for camera in cameras if camera is not None]
-    return parts.build(usable, sky, provenance, opened.lost)
+SMOOTH_ANGLE_DEG = 30.0
+"""Maximum angle of a smooth edge where a subdivision surface states no normals."""
 
 
 def _name_lights(notes: Sequence[str]) -> str:
@@ -115,100 +77,6 @@ def _read_row(each: PlacedPrim) -> float:
     if prim.HasAttribute(FOV_DEG):
         row = parse_camera_row(prim.GetName())
     return row if isinstance(row, int) else math.inf
-
-
-def _read_environment(
-    placed: Sequence[PlacedPrim], time: Any, opened: OpenedStage, licence: str
-) -> Environment | None:
-    """Return the environment of the first readable dome; note the others."""
-    domes = [each for each in placed if each.prim.GetTypeName() in DOMES]
-    sky = None
-    for each in domes:
-        if sky is not None:
-            opened.lost.append(f"{each.prim.GetPath()}: a second dome; a scene has one environment")
-            continue
-        sky = read_foreign_dome(each.prim, each.to_world, time, opened, licence)
-    return sky
-
-
-def _entry(prim: Any, licence: str) -> SceneObject:
-    """Return the object entry of a prim: values that Trilight wrote on it, or its name."""
-    texts = {field: prim.GetAttribute(name).Get() for field, name in OBJECT_TEXTS.items()}
-    known = {field: text for field, text in texts.items() if isinstance(text, str)}
-    return SceneObject(
-        name=known.get("name") or prim.GetName(),
-        kind="shell" if known.get("kind") == "shell" else "object",
-        uid=known.get("uid", ""),
-        licence=known.get("licence") or licence,
-        attribution=known.get("attribution", ""),
-        source_url=known.get("source_url", ""),
-    )
-
-
-_SAME_LENS = 1e-5
-"""Relative tolerance for a lens that Trilight wrote."""
-
-
-def _read_camera(
-    placed: PlacedPrim, time: Any, lost: list[str]
-) -> tuple[NDArray[np.float64], float] | None:
-    """Return pose [4, 4] and full angle in degrees of a camera; None for an unusable one."""
-    from pxr import UsdGeom
-
-    camera = UsdGeom.Camera(placed.prim)
-    where = placed.prim.GetPath()
-    lens = (
-        camera.GetFocalLengthAttr(),
-        camera.GetHorizontalApertureAttr(),
-        camera.GetVerticalApertureAttr(),
-    )
-    focal, wide, high = (read_number(each.Get(time), str(each.GetPath())) for each in lens)
-    pose = rigid_pose(placed.to_world)
-    if camera.GetProjectionAttr().Get(time) != "perspective" or pose is None or not focal > 0:
-        lost.append(f"{where}: no perspective camera with a focal length")
-        return None
-    angle = math.degrees(2 * math.atan(wide / (2 * focal)))
-    held = placed.prim.GetAttribute(FOV_DEG).Get(time)
-    is_held = isinstance(held, float) and math.isclose(held, angle, rel_tol=_SAME_LENS)
-    if not is_held and not math.isclose(wide, high, rel_tol=1e-4):
-        lost.append(f"{where}: pictures are square; its horizontal angle was used")
-    if any(a.Get(time) for a in (camera.GetHorizontalApertureOffsetAttr(),
-                                 camera.GetVerticalApertureOffsetAttr())):  # fmt: skip
-        lost.append(f"{where}: its shift has no place here")
-    if camera.GetFStopAttr().Get(time):
-        lost.append(f"{where}: depth of field has no place here")
-    angle = held if is_held else angle
-    return (pose, angle) if 0 < angle < 180 else None
-
-
-SMOOTH_ANGLE_DEG = 30.0
-"""Maximum angle of a smooth edge where a subdivision surface states no normals."""
-
-
-def _normals(
-    cut: CutMesh,
-    time: Any,
-    positions: NDArray[np.float32],
-    flat: NDArray[np.float64],
-    lost: list[str],
-) -> NDArray[np.float32]:
-    placed = cut.placed
-    where = cut.prim.GetPath()
-    stated = None if placed.skin is not None else _stated_normals(cut.prim, time)
-    if stated is None:
-        if not (cut.is_smooth or placed.skin is not None):
-            return unit_normals(None, flat)
-        if placed.skin is not None:
-            lost.append(f"{where}: posed by bones; its normals are those of its faces")
-        elif cut.prim.GetTypeName() == "Mesh":
-            lost.append(f"{where}: subdivision; its cage was read, with smooth normals")
-        return _smooth(positions, cut)
-    normals = cut.per_corner(*stated)
-    if normals is None:
-        lost.append(f"{where}: the number of normals does not match")
-        return unit_normals(None, flat)
-    normal_matrix = np.linalg.inv(placed.to_world[:3, :3]).T
-    return unit_normals(np.einsum("ij,tcj->tci", normal_matrix, normals), flat)
 
 
 def _smooth(positions: NDArray[np.float32], cut: CutMesh) -> NDArray[np.float32]:
@@ -245,39 +113,149 @@ _MAX_PICTURE_BYTES = 4 << 30
 """Maximum bytes of all pictures of a stage together."""
 
 
-class StageSurfaces:
-    """Converts the meshes of a stage to triangles with materials and textures."""
+class StageReader:
+    """Reads the meshes, materials, lights and cameras of a stage at a time."""
 
     def __init__(
-        self, stage: UsdStage, licence: str, written: Mapping[str, NDArray[np.float32]]
+        self,
+        stage: Any,
+        time: Any,
+        opened: OpenedStage,
+        licence: str,
+        written: Mapping[str, NDArray[np.float32]],
     ) -> None:
-        """Read all materials; the stage's notes receive their losses.
+        """Read all materials of a Usd.Stage; `opened.lost` receives notes on losses.
 
-        Textures get the licence; `written` has material rows as Trilight wrote them, by the paths
-        of their prims.
+        Objects and textures get the licence; `written` has material rows as Trilight wrote them, by
+        the paths of their prims, where known.
 
         Raises:
             Rejected: a picture is outside of the folder, or too large.
             TrilightError: a picture has too many pixels.
         """
-        self._time = stage.time
-        self._lost = stage.opened.lost
-        self._opened = stage.opened
+        self._time = time
+        self._lost = opened.lost
+        self._opened = opened
         self._licence = licence
         self._written = written
         self._converter = PartConverter(self._lost)
+        self._placed = sorted(placed_prims(stage, time, self._lost), key=_read_row)
+        meshes = tuple(each for each in self._placed if each.prim.GetTypeName() in _MESHES)
+        usd_stage = UsdStage(opened=opened, composed=stage, meshes=meshes, time=time)
         # of each material: name of its prim, added columns, and exact columns if Trilight wrote it
         self._extras: list[tuple[str, dict[str, Any], dict[str, Texture] | None]] = []
         self._looks = MeshMaterials(
-            read_stage_materials(stage, _MAX_PICTURE_BYTES, self._read),
+            read_stage_materials(usd_stage, _MAX_PICTURE_BYTES, self._read),
             lambda data, name: decode_values(data, name, self._lost),
-            stage.time,
+            time,
             emission=True,
             notes=self._lost,
         )
         self._extras.append(("", {}, None))
 
-    def convert(self, placed: PlacedPrim, number: int) -> TexturedTriangles | None:
+    def scene(self) -> Scene:
+        """Build the scene.
+
+        Raises:
+            TrilightError: a count exceeds its maximum, arrays contradict each other, or the stage
+                lacks triangles or light.
+        """
+        time = self._time
+        numbers = itertools.count()
+        parts = SceneParts(self._opened.path.name)
+        cameras = []
+        sky: Environment | None = None
+        for each in self._placed:
+            kind = each.prim.GetTypeName()
+            if kind in _MESHES:
+                mesh = self._convert(each, next(numbers))
+                if mesh is not None:
+                    parts.add(self._entry(each.prim), mesh)
+            elif kind == "Camera":
+                cameras.append(self._read_camera(each))
+            elif kind not in DOMES:
+                lamp = light_triangles(each, time, self._lost)
+                if lamp is not None:
+                    radiance = compute_radiance(each, lamp, time, self._lost)
+                    parts.add(self._entry(each.prim), build_lamp(lamp, radiance), is_lamp=True)
+        for each in self._placed:
+            if each.prim.GetTypeName() in DOMES and sky is not None:
+                where = each.prim.GetPath()
+                self._lost.append(f"{where}: a second dome; a scene has one environment")
+            elif each.prim.GetTypeName() in DOMES:
+                sky = read_foreign_dome(each.prim, each.to_world, time, self._opened, self._licence)
+        is_lit = sky is not None and sky.radiance_rgb.any()
+        if not is_lit and not parts.has_emitters:
+            raise TrilightError(
+                f"no light that can be carried over ({_name_lights(self._opened.notes)}); expected "
+                "an emissive material, or a rectangle, disk, sphere, cylinder, mesh or dome light."
+            )
+        code = time.GetValue() if time.IsNumeric() and not time.IsEarliestTime() else None
+        provenance = {"template": "usd", "file": self._opened.path.name, "time_code": code}
+        usable = [camera for camera in cameras if camera is not None]
+        return parts.build(usable, sky, provenance, self._lost)
+
+    def _entry(self, prim: Any) -> SceneObject:
+        """Return the object entry of a prim: values that Trilight wrote on it, or its name."""
+        texts = {field: prim.GetAttribute(name).Get() for field, name in OBJECT_TEXTS.items()}
+        known = {field: text for field, text in texts.items() if text and isinstance(text, str)}
+        known["kind"] = "shell" if known.get("kind") == "shell" else "object"
+        fields: dict[str, Any] = {"name": prim.GetName(), "licence": self._licence, **known}
+        return SceneObject(**fields)
+
+    def _read_camera(self, placed: PlacedPrim) -> tuple[NDArray[np.float64], float] | None:
+        """Return pose [4, 4] and full angle in degrees of a camera; None for an unusable one."""
+        from pxr import UsdGeom
+
+        time = self._time
+        camera = UsdGeom.Camera(placed.prim)
+        where = placed.prim.GetPath()
+        lens = (
+            camera.GetFocalLengthAttr(),
+            camera.GetHorizontalApertureAttr(),
+            camera.GetVerticalApertureAttr(),
+        )
+        focal, wide, high = (read_number(each.Get(time), str(each.GetPath())) for each in lens)
+        pose = rigid_pose(placed.to_world)
+        if camera.GetProjectionAttr().Get(time) != "perspective" or pose is None or not focal > 0:
+            self._lost.append(f"{where}: no perspective camera with a focal length")
+            return None
+        angle = math.degrees(2 * math.atan(wide / (2 * focal)))
+        held = placed.prim.GetAttribute(FOV_DEG).Get(time)
+        is_held = isinstance(held, float) and math.isclose(held, angle, rel_tol=_SAME_LENS)
+        if not is_held and not math.isclose(wide, high, rel_tol=1e-4):
+            self._lost.append(f"{where}: pictures are square; its horizontal angle was used")
+        if any(a.Get(time) for a in (camera.GetHorizontalApertureOffsetAttr(),
+                                     camera.GetVerticalApertureOffsetAttr())):  # fmt: skip
+            self._lost.append(f"{where}: its shift has no place here")
+        if camera.GetFStopAttr().Get(time):
+            self._lost.append(f"{where}: depth of field has no place here")
+        angle = held if is_held else angle
+        return (pose, angle) if 0 < angle < 180 else None
+
+    def _normals(
+        self, cut: CutMesh, positions: NDArray[np.float32], flat: NDArray[np.float64]
+    ) -> NDArray[np.float32]:
+        """Return normals [T, 3, 3] at the corners [T, 3, 3] of triangles with normals [T, 3]."""
+        placed = cut.placed
+        where = cut.prim.GetPath()
+        stated = None if placed.skin is not None else _stated_normals(cut.prim, self._time)
+        if stated is None:
+            if not (cut.is_smooth or placed.skin is not None):
+                return unit_normals(None, flat)
+            if placed.skin is not None:
+                self._lost.append(f"{where}: posed by bones; its normals are those of its faces")
+            elif cut.prim.GetTypeName() == "Mesh":
+                self._lost.append(f"{where}: subdivision; its cage was read, with smooth normals")
+            return _smooth(positions, cut)
+        normals = cut.per_corner(*stated)
+        if normals is None:
+            self._lost.append(f"{where}: the number of normals does not match")
+            return unit_normals(None, flat)
+        normal_matrix = np.linalg.inv(placed.to_world[:3, :3]).T
+        return unit_normals(np.einsum("ij,tcj->tci", normal_matrix, normals), flat)
+
+    def _convert(self, placed: PlacedPrim, number: int) -> TexturedTriangles | None:
         """Return the triangles of a mesh that have an area, by its index within the stage.
 
         None, with a note, without any.
@@ -294,7 +272,7 @@ class StageSurfaces:
             self._lost.append(f"{where}: no triangle with an area")
             return None
         cut = cut.select(has_area)
-        normals = _normals(cut, self._time, positions, flat, self._lost)
+        normals = self._normals(cut, positions, flat)
         rows, tints = self._looks.assign(number, cut)
         masks = {int(row): rows == row for row in np.unique(rows)}
         triangles = join_triangles(

@@ -21,7 +21,7 @@ from numpy.typing import NDArray
 from pipeline.exchange.pictures import MAX_BYTES
 from pipeline.exchange.textured_triangles import MAX_ROWS, LoadedScene
 from pipeline.exchange.usd import layout
-from pipeline.exchange.usd.foreign_scene import build_stage_scene
+from pipeline.exchange.usd.foreign_scene import StageReader
 from pipeline.exchange.usd.write_materials import (
     PREVIEW,
     PREVIEW_INPUTS,
@@ -115,7 +115,7 @@ def _read(opened: OpenedStage, key: str | None, licence: str) -> LoadedScene:
     if frames and key is None:
         opened.lost.append(f"time codes other than {chosen} of {len(frames)}")
     time = Usd.TimeCode(float(chosen)) if chosen else Usd.TimeCode.EarliestTime()
-    scene = build_stage_scene(stage, time, opened, licence, _read_written_rows(opened))
+    scene = StageReader(stage, time, opened, licence, _read_written_rows(opened)).scene()
     return LoadedScene(scene=scene, notes=opened.notes)
 
 

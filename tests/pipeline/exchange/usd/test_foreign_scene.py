@@ -108,17 +108,6 @@ def test_a_stated_temperature_tints_a_light(
     assert (red == blue == 20) == (kelvin is None)
 
 
-def test_light_is_that_of_the_stages_units_and_temperature(shared: Path) -> None:
-    folder = shared / "cases" / "36-usd-normalised-light" / "in"
-    for name in ("metres", "centimetres"):
-        rows = read(folder / f"{name}.usda").scene.materials
-        assert rows[:, EMISSION].max() == pytest.approx(10, rel=1e-5)
-    sky = read(shared / "cases" / "37-usd-dome-temperature" / "in" / "dome.usda").scene.environment
-    assert sky is not None
-    expected = UsdLux.BlackbodyTemperatureAsRgb(3000)
-    assert sky.radiance_rgb[0, 0] == pytest.approx(np.array(expected), rel=1e-5)
-
-
 def test_our_own_file_whose_light_is_gone_says_nothing_else(tmp_path: Path) -> None:
     write_usd(tmp_path / "a.usda", tiny_scene())
     stage = Usd.Stage.Open(str(tmp_path / "a.usda"))
