@@ -43,10 +43,7 @@ from storage.errors import Rejected, TrilightError
 from storage.records.environment import Environment
 from storage.records.exr import MAGIC, MAX_RESOLUTION, decode_channels, encode_channels
 from storage.records.material import (
-    DIFFUSE,
-    EMISSION,
-    ROUGHNESS,
-    SPECULAR,
+    column_places,
     laid_out,
     stored_columns,
 )
@@ -163,8 +160,7 @@ def material_tables(
 
     The row has all declared columns; `columns` names the stored ones, and `used` its textures.
     """
-    diffuse, specular, emission = (values[part].tolist() for part in (DIFFUSE, SPECULAR, EMISSION))
-    roughness = float(values[ROUGHNESS])
+    shown = {name: values[part].tolist() for name, part in column_places().items()}
     material = _exact_attributes(values, columns)
     for name, (_, texture) in used.items():
         source = layout.format_map(texture.sha256, texture.source)
@@ -173,18 +169,18 @@ def material_tables(
     preview: _Table = {
         "info:id": ("uniform token", "UsdPreviewSurface"),
         "inputs:useSpecularWorkflow": ("int", 1),
-        "inputs:diffuseColor": ("color3f", diffuse),
-        "inputs:specularColor": ("color3f", specular),
-        "inputs:roughness": ("float", roughness),
-        "inputs:emissiveColor": ("color3f", emission),
+        "inputs:diffuseColor": ("color3f", shown["diffuse"]),
+        "inputs:specularColor": ("color3f", shown["specular"]),
+        "inputs:roughness": ("float", shown["roughness"][0]),
+        "inputs:emissiveColor": ("color3f", shown["emission"]),
         "inputs:ior": ("float", IOR_OF_CONSTANT_ALBEDOS),
         "outputs:surface": ("token", None),
     }
     tables: dict[str, layout.Attributes] = {"": material, f"/{PREVIEW}": preview}
     if not used:
         material["outputs:mtlx:surface"] = ("token", None, f"{OPENPBR}.outputs:out")
-        inputs = openpbr_inputs(diffuse, specular, roughness, emission)
-        return {**tables, f"/{OPENPBR}": {**inputs, "outputs:out": ("token", None)}}
+        tables[f"/{OPENPBR}"] = {**_openpbr_inputs(shown), "outputs:out": ("token", None)}
+        return tables
     for name, (row, texture) in used.items():
         kind, socket, output, output_kind = _LINKS[name]
         value = preview[socket][1] if socket in preview else None
@@ -303,22 +299,19 @@ def decode_texture(
     return texture
 
 
-def openpbr_inputs(
-    diffuse: Sequence[float],
-    specular: Sequence[float],
-    roughness: float,
-    emission: Sequence[float],
-) -> layout.Attributes:
+def _openpbr_inputs(columns: Mapping[str, Sequence[float]]) -> layout.Attributes:
     """Return the attributes of the shader of a material's columns."""
+    specular = columns["specular"]
+    emission = columns["emission"]
     root = math.sqrt(min(max(specular), _MOST_REFLECTING))
     return {
         "info:id": ("uniform token", _OPENPBR_SHADER),
-        "inputs:base_color": ("color3f", diffuse),
+        "inputs:base_color": ("color3f", columns["diffuse"]),
         "inputs:base_weight": ("float", 1.0),
         "inputs:base_diffuse_roughness": ("float", 0.0),
         "inputs:specular_weight": ("float", 1.0 if max(specular) > 0 else 0.0),
         "inputs:specular_color": ("color3f", _divide_by_largest(specular)),
-        "inputs:specular_roughness": ("float", roughness),
+        "inputs:specular_roughness": ("float", columns["roughness"][0]),
         "inputs:specular_ior": ("float", float(np.float32((1 + root) / (1 - root)))),
         "inputs:emission_luminance": ("float", max(emission)),
         "inputs:emission_color": ("color3f", _divide_by_largest(emission)),
@@ -327,12 +320,8 @@ def openpbr_inputs(
 
 def written_columns(columns: Mapping[str, NDArray]) -> dict[str, NDArray[np.float64]]:
     """Return the columns [3] that the shader written for a material's columns states."""
-    diffuse, specular, roughness, emission = (
-        np.maximum(columns[name], 0).tolist() for name in _INPUTS
-    )
-    table = openpbr_inputs(diffuse, specular, roughness[0], emission)
-    constants = {name.removeprefix("inputs:"): value for name, (_, value, *_) in table.items()}
-    return _multiply(constants)
+    table = _openpbr_inputs({name: np.maximum(columns[name], 0).tolist() for name in _INPUTS})
+    return _multiply({name.removeprefix("inputs:"): each[1] for name, each in table.items()})
 
 
 def read_openpbr(material: Any, time: Any, opened: OpenedStage) -> dict[str, NDArray[np.float64]]:
