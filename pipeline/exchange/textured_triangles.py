@@ -89,18 +89,14 @@ def join_triangles(
 ) -> TexturedTriangles:
     """Return the triangles of several parts, in the order of `places` [T], which they cover."""
     order = np.argsort(np.concatenate(places), kind="stable")
-    starts = np.cumsum([0, *(len(part.texture_sets) for part in parts)])
-    shifted = [
-        dataclasses.replace(part, texture_set_index=part.texture_set_index + start)
-        for part, start in zip(parts, starts, strict=False)
-    ]
     arrays: dict[str, Any] = {
-        name: np.concatenate([getattr(part, name) for part in shifted])[order]
+        name: np.concatenate([getattr(part, name) for part in parts])[order]
         for name in _PER_TRIANGLE
     }
-    return TexturedTriangles(
-        **arrays, texture_sets=[each for part in parts for each in part.texture_sets]
-    )
+    starts = np.cumsum([0, *(len(part.texture_sets) for part in parts)])[:-1]
+    arrays["texture_set_index"] += np.repeat(starts, list(map(len, places)))[order]
+    texture_sets = [each for part in parts for each in part.texture_sets]
+    return TexturedTriangles(**arrays, texture_sets=texture_sets)
 
 
 def index_corners(

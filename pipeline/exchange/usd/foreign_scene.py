@@ -180,8 +180,7 @@ class StageReader:
                     parts.add(self._entry(each.prim), build_lamp(lamp, radiance), is_lamp=True)
         for each in self._placed:
             if each.prim.GetTypeName() in DOMES and sky is not None:
-                where = each.prim.GetPath()
-                self._lost.append(f"{where}: a second dome; a scene has one environment")
+                self._note(each.prim, "a second dome; a scene has one environment")
             elif each.prim.GetTypeName() in DOMES:
                 sky = read_foreign_dome(each.prim, each.to_world, time, self._opened, self._licence)
         is_lit = sky is not None and sky.radiance_rgb.any()
@@ -194,6 +193,9 @@ class StageReader:
         provenance = {"template": "usd", "file": self._opened.path.name, "time_code": code}
         usable = [camera for camera in cameras if camera is not None]
         return parts.build(usable, sky, provenance, self._lost)
+
+    def _note(self, prim: Any, text: str) -> None:
+        self._lost.append(f"{prim.GetPath()}: {text}")
 
     def _entry(self, prim: Any) -> SceneObject:
         """Return the object entry of a prim: values that Trilight wrote on it, or its name."""
@@ -209,7 +211,6 @@ class StageReader:
 
         time = self._time
         camera = UsdGeom.Camera(placed.prim)
-        where = placed.prim.GetPath()
         lens = (
             camera.GetFocalLengthAttr(),
             camera.GetHorizontalApertureAttr(),
@@ -218,18 +219,18 @@ class StageReader:
         focal, wide, high = (read_number(each.Get(time), str(each.GetPath())) for each in lens)
         pose = rigid_pose(placed.to_world)
         if camera.GetProjectionAttr().Get(time) != "perspective" or pose is None or not focal > 0:
-            self._lost.append(f"{where}: no perspective camera with a focal length")
+            self._note(placed.prim, "no perspective camera with a focal length")
             return None
         angle = math.degrees(2 * math.atan(wide / (2 * focal)))
         held = placed.prim.GetAttribute(FOV_DEG).Get(time)
         is_held = isinstance(held, float) and math.isclose(held, angle, rel_tol=_SAME_LENS)
         if not is_held and not math.isclose(wide, high, rel_tol=1e-4):
-            self._lost.append(f"{where}: pictures are square; its horizontal angle was used")
+            self._note(placed.prim, "pictures are square; its horizontal angle was used")
         if any(a.Get(time) for a in (camera.GetHorizontalApertureOffsetAttr(),
                                      camera.GetVerticalApertureOffsetAttr())):  # fmt: skip
-            self._lost.append(f"{where}: its shift has no place here")
+            self._note(placed.prim, "its shift has no place here")
         if camera.GetFStopAttr().Get(time):
-            self._lost.append(f"{where}: depth of field has no place here")
+            self._note(placed.prim, "depth of field has no place here")
         angle = held if is_held else angle
         return (pose, angle) if 0 < angle < 180 else None
 
@@ -238,19 +239,18 @@ class StageReader:
     ) -> NDArray[np.float32]:
         """Return normals [T, 3, 3] at the corners [T, 3, 3] of triangles with normals [T, 3]."""
         placed = cut.placed
-        where = cut.prim.GetPath()
         stated = None if placed.skin is not None else _stated_normals(cut.prim, self._time)
         if stated is None:
             if not (cut.is_smooth or placed.skin is not None):
                 return unit_normals(None, flat)
             if placed.skin is not None:
-                self._lost.append(f"{where}: posed by bones; its normals are those of its faces")
+                self._note(cut.prim, "posed by bones; its normals are those of its faces")
             elif cut.prim.GetTypeName() == "Mesh":
-                self._lost.append(f"{where}: subdivision; its cage was read, with smooth normals")
+                self._note(cut.prim, "subdivision; its cage was read, with smooth normals")
             return _smooth(positions, cut)
         normals = cut.per_corner(*stated)
         if normals is None:
-            self._lost.append(f"{where}: the number of normals does not match")
+            self._note(cut.prim, "the number of normals does not match")
             return unit_normals(None, flat)
         normal_matrix = np.linalg.inv(placed.to_world[:3, :3]).T
         return unit_normals(np.einsum("ij,tcj->tci", normal_matrix, normals), flat)
@@ -265,11 +265,10 @@ class StageReader:
         """
         cut = cut_mesh(placed, self._time)
         positions, flat, has_area = drop_empty(cut.world_points[cut.indices[cut.corners]])
-        where = cut.prim.GetPath()
         if not has_area.all():
-            self._lost.append(f"{where}: {int((~has_area).sum())} triangles without an area")
+            self._note(cut.prim, f"{int((~has_area).sum())} triangles without an area")
         if not len(positions):
-            self._lost.append(f"{where}: no triangle with an area")
+            self._note(cut.prim, "no triangle with an area")
             return None
         cut = cut.select(has_area)
         normals = self._normals(cut, positions, flat)
@@ -295,10 +294,8 @@ class StageReader:
         tints = mode == "materialGlowTintsLight" and glows
         rows[:, EMISSION] = rows[:, EMISSION] * light if tints else light
         if mode == "materialGlowTintsLight" and not glows:
-            self._lost.append(
-                f"{placed.prim.GetPath()}: its material emits nothing; the radiance of the light "
-                "is used"
-            )
+            text = "its material emits nothing; the radiance of the light is used"
+            self._note(placed.prim, text)
 
     def _convert_row(
         self,
@@ -349,9 +346,7 @@ class StageReader:
             self._lost.append(_HELD)
             stated, exact = held.restore(stated)
         if stated is None:
-            self._lost.append(
-                f"{material.GetPath()}: no supported shader; its display color is used"
-            )
+            self._note(material, "no supported shader; its display color is used")
             return None
         added = {name: columns[name] for name in columns.keys() - MATERIAL_ATTRIBUTES.keys()}
         self._extras.append((stated.name, added, exact))

@@ -123,7 +123,6 @@ class HeldMaterial:
         )
         self._time = time
         self._opened = opened
-        self._lost = opened.lost
         self._maps: dict[str, tuple[str, MapSource]] = {}
         for name in TEXTURED:
             text = prim.GetAttribute(layout.texture_attribute(name)).Get(time)
@@ -141,16 +140,17 @@ class HeldMaterial:
         no exact columns, and a note.
         """
         if stated is None:
-            self._lost.append(f"{self._where}: no shader; the values that Trilight wrote are used")
+            self._note("no shader; the values that Trilight wrote are used")
             return self._find_exact(self._as_stated())
         if not stated.is_specular and (
             "metallic" in stated.textures or stated.constants["metallic"].any()
         ):
-            self._lost.append(
-                f"{self._where}: became a metal since Trilight wrote it; read as any other material"
-            )
+            self._note("became a metal since Trilight wrote it; read as any other material")
             return stated, None
         return self._find_exact(self._restore_workflow(stated))
+
+    def _note(self, text: str) -> None:
+        self._opened.lost.append(f"{self._where}: {text}")
 
     def _restore_workflow(self, stated: StatedMaterial) -> StatedMaterial:
         """Return the inputs of a shader in the workflow that Trilight writes.
@@ -175,9 +175,7 @@ class HeldMaterial:
         if not stated.is_specular:
             constants["specularColor"] = self._columns["specular"]
             if "specular" in self._maps and "specularColor" not in textures:
-                self._lost.append(
-                    f"{self._where}: the texture of specular is not in the file; its mean is used"
-                )
+                self._note("the texture of specular is not in the file; its mean is used")
         return dataclasses.replace(stated, constants=constants, textures=textures)
 
     def _note_unused(self, stated: StatedMaterial) -> None:
@@ -188,13 +186,13 @@ class HeldMaterial:
             constant = parse_color(self._shader.GetInput(name).Get(self._time))
             written = self._columns[column]
             if constant is not None and not np.allclose(constant, written, _SAME_VALUE, 0):
-                self._lost.append(
-                    f"{self._where}: {column} has a texture, which is used, not its changed "
-                    "constant; disconnect the texture to use that"
+                self._note(
+                    f"{column} has a texture, which is used, not its changed constant; disconnect "
+                    "the texture to use that"
                 )
         for name, value in _WORKFLOW.items():
             if self._shader.GetInput(name) and (stated.constants[name] != value).any():
-                self._lost.append(f"{stated.where}.{name}: has no place here")
+                self._opened.lost.append(f"{stated.where}.{name}: has no place here")
 
     def _as_stated(self) -> StatedMaterial:
         """Return a material of the values that Trilight wrote, for one that has lost its shader."""
@@ -238,7 +236,7 @@ class HeldMaterial:
             text = f"{column} was changed since Trilight wrote it; the value of {place} is used"
             if unused:
                 text += f", not of {' or '.join(unused)}; make them equal to choose"
-            self._lost.append(f"{self._where}: {text}")
+            self._note(text)
         return dataclasses.replace(stated, constants=constants), exact
 
     def _find_changed(self, stated: StatedMaterial, column: str) -> dict[str, NDArray[Any]]:

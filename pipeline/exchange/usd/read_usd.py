@@ -89,9 +89,10 @@ def _read_file(path: Path, read: Callable[[], Read]) -> Read:
         return read_quietly(path, read)
     except (TrilightError, Rejected) as error:
         message = error.message if isinstance(error, Rejected) else str(error)
-        if message.startswith(path.name):
+        if isinstance(error, TrilightError) and message.startswith(path.name):
             raise
-        raise TrilightError(f"{path.name}: {message}") from error
+        text = message.removeprefix(f"{path.name}: ")
+        raise TrilightError(f"{path.name}: {text}") from error
 
 
 def _read(opened: OpenedStage, key: str | None, licence: str) -> LoadedScene:

@@ -445,7 +445,7 @@ def test_a_crash_in_native_code_is_one_line(
     use_processes(monkeypatch)
     monkeypatch.setattr(reader, "source_keys", crash)
     told = refused("convert", stage, tmp_path / "a.json")
-    assert told.startswith("stage.usda: could not be read (crashed_signal_11")
+    assert "stage.usda: could not be read (crashed_signal_11" in told
 
 
 @pytest.fixture

@@ -166,9 +166,9 @@ def test_a_stage_without_light_or_camera(tmp_path: Path) -> None:
         TrilightError, match="/None: a light without an area; /Below: negative radiance"
     ):
         read(tmp_path / "a.usda")
-    UsdLux.SphereLight.Define(stage, "/Dark").CreateIntensityAttr(-1.0)
+    UsdLux.DistantLight.Define(stage, "/Sun")
     stage.GetRootLayer().Export(str(tmp_path / "a.usda"))
-    with pytest.raises(TrilightError, match=r"emits nothing; 1 more of lights\)"):
+    with pytest.raises(TrilightError, match=r"; 1 more of lights\)"):
         read(tmp_path / "a.usda")
     lamps[0].CreateRadiusAttr(1.0)
     stage.GetRootLayer().Export(str(tmp_path / "a.usda"))
