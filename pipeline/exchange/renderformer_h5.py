@@ -61,7 +61,6 @@ from storage.records.lookup import texture_values
 from storage.records.material import (
     DIFFUSE,
     EMISSION,
-    PUBLISHED_COLUMNS,
     REFLECTING,
     ROUGHNESS,
     SPECULAR,
@@ -78,12 +77,6 @@ from storage.records.scene import (
     SceneObject,
 )
 from storage.records.texture import CONSTANT, TEXTURED, MapSource, Texture
-
-CARRIED = frozenset(
-    {"vertex_positions", "vertex_normals", "faces", "material_index", "c2w", "fov_deg", "textures"}
-    | {f"materials.{name}" for name in PUBLISHED_COLUMNS}
-)
-"""Members of a scene that the file holds (pipeline.exchange.formats)."""
 
 CHANNELS = 13
 """A texture has CHANNELS channels of CELLS x CELLS cells."""
@@ -110,7 +103,7 @@ def write_renderformer_h5(
     The file appears whole or not at all; memory is its compressed size and one block of textures.
 
     Returns:
-        Sentences about members in CARRIED that lose something.
+        Sentences about members in the file that lose something.
 
     Raises:
         TrilightError: a picture exceeds half floats, or the file cannot be written.

@@ -5,10 +5,10 @@ ignores unknown fields. It knows the fields of the published example scenes only
 (whose values would have to be halved), no textures, no environment.
 
 A written file names one OBJ file per mesh, in world space and not normalized. An object of the file
-has one material, so an object of a scene becomes one object for each of its materials. `CARRIED`
-lists the members that the format holds. `DescribedFiles.lost` lists what of these a reader cannot
-restore: objects of several materials; shading normals other than flat ones and those that readers
-compute (smooth across edges of up to 30 degrees).
+has one material, so an object of a scene becomes one object for each of its materials. Of what the
+format holds (pipeline.exchange.formats), `DescribedFiles.lost` lists what a reader cannot restore:
+objects of several materials; shading normals other than flat ones and those that readers compute
+(smooth across edges of up to 30 degrees).
 """
 
 import dataclasses
@@ -36,8 +36,8 @@ from pipeline.foreign.numbers import Malformed
 from pipeline.scenes.shading_normals import face_normals, smooth_shaded, without_slivers
 from storage.conventions import HALF_FLOAT_MAX
 from storage.errors import TrilightError
-from storage.records.material import DIFFUSE, EMISSION, PUBLISHED_COLUMNS, ROUGHNESS, SPECULAR
-from storage.records.scene import ARRAY_FIELDS, Scene
+from storage.records.material import DIFFUSE, EMISSION, ROUGHNESS, SPECULAR
+from storage.records.scene import Scene
 from storage.settings.fields import describe_fields
 from storage.typed_json import read_json
 
@@ -197,12 +197,6 @@ def _refuse_constant(text: str) -> float:
     raise Malformed(f"{text} is no JSON number")
 
 
-CARRIED = frozenset(
-    {*ARRAY_FIELDS, "objects.name", "objects.kind"} - {"materials"}
-    | {f"materials.{name}" for name in PUBLISHED_COLUMNS}
-)
-"""Members of a scene that the file holds (pipeline.exchange.formats)."""
-
 _FLAT = 1e-5
 """Largest difference between a flat face's float32 normal and its geometric normal."""
 _CLOSE = 1e-2
@@ -219,7 +213,7 @@ class DescribedFiles:
 
     json: bytes  # the scene file
     meshes: dict[str, bytes]  # OBJ files by path relative to the scene file
-    lost: tuple[str, ...]  # sentences about members in CARRIED that readers cannot restore
+    lost: tuple[str, ...]  # sentences about members in the file that readers cannot restore
 
 
 def describe_scene(scene: Scene, stem: str) -> DescribedFiles:

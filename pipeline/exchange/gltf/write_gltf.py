@@ -27,15 +27,9 @@ from pipeline.exchange.linear_maps import (
 from pipeline.exchange.textured_triangles import group_triangles
 from storage.atomic import write_atomically
 from storage.conventions import srgb8
-from storage.records.material import EMISSION, PUBLISHED_COLUMNS, column_places
-from storage.records.scene import ARRAY_FIELDS, Scene
+from storage.records.material import EMISSION, column_places
+from storage.records.scene import Scene
 from storage.records.texture import CONSTANT, NORMAL, TEXTURED, Texture
-
-CARRIED = frozenset(
-    {*ARRAY_FIELDS, "objects.name", "objects.kind", "textures", "normal_textures"} - {"materials"}
-    | {f"materials.{name}" for name in PUBLISHED_COLUMNS}
-)
-"""Members of a scene that the file holds (pipeline.exchange.formats)."""
 
 _TO_Y_UP = (-(0.5**0.5), 0.0, 0.0, 0.5**0.5)
 """Quaternion of the root node, which rotates +Z up to the +Y up of glTF."""
@@ -51,7 +45,7 @@ _USED = ["KHR_materials_specular", "KHR_materials_emissive_strength"]
 
 
 def write_gltf(path: Path, scene: Scene) -> tuple[str, ...]:
-    """Write a scene, and return sentences about members in CARRIED that lose something.
+    """Write a scene, and return sentences about members in it that lose something.
 
     Args:
         path: ends in `.glb`.

@@ -34,7 +34,7 @@ from storage.digests import canonical_json
 from storage.errors import TrilightError
 from storage.records.environment import Environment
 from storage.records.retextured import without_constant_textures
-from storage.records.scene import ARRAY_FIELDS, Scene
+from storage.records.scene import Scene
 from storage.records.scene_file import scene_digest
 
 SUFFIXES = (".usda", ".usdc", ".usdz")
@@ -42,15 +42,9 @@ SUFFIXES = (".usda", ".usdc", ".usdz")
 ENVIRONMENT = "Environment"
 """Name of the prim of an environment."""
 
-CARRIED = frozenset(
-    {*ARRAY_FIELDS, "provenance", "textures", "normal_textures", "environment"}
-    | {f"objects.{field}" for field in layout.OBJECT_TEXTS}
-)
-"""Members of a scene that the file holds (pipeline.exchange.formats)."""
-
 
 def write_usd(path: Path, scene: Scene) -> tuple[()]:
-    """Write one scene; the file appears whole or not at all. Nothing in CARRIED loses anything.
+    """Write one scene; the file appears whole or not at all. No member loses anything.
 
     Raises:
         TrilightError: the suffix is not USD's, the scene breaks a law or holds text that USD cannot
