@@ -131,9 +131,6 @@ def _read_json(source: SceneSource, pictures: bool) -> LoadedScene:
         name,
         AssetSettings(),
         licence=USER_PROVIDED,
-        num_views=None,
-        scene_index=0,
-        seed=0,
         albedo_over_one=source.albedo_over_one,
         notes=notes,
     )

@@ -100,9 +100,9 @@ def build_scene(
     settings: AssetSettings,
     *,
     licence: str,
-    num_views: int | None,
-    scene_index: int,
-    seed: int,
+    num_views: int | None = None,
+    scene_index: int = 0,
+    seed: int = 0,
     albedo_over_one: AlbedoOverOne = "scale",
     notes: list[str] | None = None,
 ) -> tuple[Scene, Mapping[str, str]]:

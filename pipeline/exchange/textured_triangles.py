@@ -237,25 +237,26 @@ class SceneParts:
 
     def build(
         self,
-        cameras: Sequence[tuple[NDArray[np.float64], float]],
+        cameras: Sequence[tuple[NDArray[np.float64], float] | None],
         sky: Environment | None,
         provenance: Mapping[str, Any],
         lost: list[str],
     ) -> Scene:
         """Build and check the scene; a camera that sees everything is added where there is none.
 
-        `cameras` has the pose [4, 4] and full angle in degrees of each, `sky` the environment, if
-        any; `lost` receives a sentence for each loss.
+        `cameras` has the pose [4, 4] and full angle in degrees of each, or None for one that is
+        left out, `sky` the environment, if any; `lost` receives a sentence for each loss.
         """
         points = self.surface_points()
-        if not cameras:
+        usable = [camera for camera in cameras if camera is not None]
+        if not usable:
             lost.append("no camera: one was added that sees everything")
-            cameras = [_fit_camera(points)]
+            usable = [_fit_camera(points)]
         scene = Scene(
             **concatenate_pieces(self._pieces),
             objects=tuple(piece.entry for piece in self._pieces),
-            c2w=np.stack([pose for pose, _ in cameras]).astype(np.float32),
-            fov_deg=np.array([angle for _, angle in cameras], np.float32),
+            c2w=np.stack([pose for pose, _ in usable]).astype(np.float32),
+            fov_deg=np.array([angle for _, angle in usable], np.float32),
             provenance=provenance,
             environment=sky,
         )

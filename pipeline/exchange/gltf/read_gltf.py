@@ -115,8 +115,7 @@ class _GltfReader:
             self.lost.append("no light: an even sky of radiance 1 lights it")
             radiance_rgb = np.ones((1, 2, 3), np.float32)
             sky = Environment(radiance_rgb=radiance_rgb, source=MapSource(name="even light"))
-        usable = [camera for camera in cameras if camera is not None]
-        scene = parts.build(usable, sky, {"template": "gltf", "file": self.name}, self.lost)
+        scene = parts.build(cameras, sky, {"template": "gltf", "file": self.name}, self.lost)
         notes = dict.fromkeys([*self.document.unread, *self.lost])
         return LoadedScene(scene=scene, notes=tuple(notes))
 

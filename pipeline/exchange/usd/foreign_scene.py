@@ -191,8 +191,7 @@ class StageReader:
             )
         code = time.GetValue() if time.IsNumeric() and not time.IsEarliestTime() else None
         provenance = {"template": "usd", "file": self._opened.path.name, "time_code": code}
-        usable = [camera for camera in cameras if camera is not None]
-        return parts.build(usable, sky, provenance, self._lost)
+        return parts.build(cameras, sky, provenance, self._lost)
 
     def _note(self, prim: Any, text: str) -> None:
         self._lost.append(f"{prim.GetPath()}: {text}")
