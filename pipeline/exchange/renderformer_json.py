@@ -11,11 +11,10 @@ objects of several materials; shading normals other than flat ones and those tha
 (smooth across edges of up to 30 degrees).
 """
 
-import dataclasses
 import json
 import re
 from collections import Counter
-from collections.abc import Collection, Mapping
+from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any, Literal, TypeVar
 
@@ -38,7 +37,7 @@ from storage.conventions import HALF_FLOAT_MAX
 from storage.errors import TrilightError
 from storage.records.material import DIFFUSE, EMISSION, ROUGHNESS, SPECULAR
 from storage.records.scene import Scene
-from storage.settings.fields import describe_fields
+from storage.settings.fields import describe_fields, group_of
 from storage.typed_json import read_json
 
 Record = TypeVar("Record")
@@ -60,16 +59,16 @@ _MAX_SHOWN = 120
 class _CameraFile:
     """What a list of cameras states, and a scene file too."""
 
-    cameras: tuple[Mapping[str, Any], ...]
+    cameras: tuple[DescribedCamera, ...]
 
 
 @dataclass(frozen=True, kw_only=True)
 class _SceneFile(_CameraFile):
-    """A scene file whose objects and cameras are not read yet."""
+    """What a scene file states; each object also has its key as its name."""
 
     scene_name: PrintableText
     version: Literal["1.0"]
-    objects: Mapping[str, Mapping[str, Any]]
+    objects: Mapping[str, DescribedObject]
 
 
 def read_renderformer_json(data: bytes, name: str) -> SceneDescription:
@@ -80,19 +79,14 @@ def read_renderformer_json(data: bytes, name: str) -> SceneDescription:
             field is missing, of the wrong type, not finite or out of range. The message names file,
             field (with the object's name), value and expected value.
     """
-    reader = _Reader(name)
-    file = reader.record(_SceneFile, _parse_json(data, name))
-    unknown = reader.take_unknown()
-    _require_count(name, "objects", file.objects, MAX_OBJECTS)
+    unknown: list[str] = []
+    file = _read(_SceneFile, data, name, unknown)
     return SceneDescription(
         file=name,
         scene_name=file.scene_name,
-        objects=tuple(
-            reader.record(DescribedObject, entry, f"objects.{key}", name=key)
-            for key, entry in file.objects.items()
-        ),
-        cameras=reader.cameras(file),
-        unknown_fields=(*reader.take_unknown(), *unknown),
+        objects=tuple(file.objects.values()),
+        cameras=file.cameras,
+        unknown_fields=tuple(unknown),
     )
 
 
@@ -102,61 +96,48 @@ def read_cameras(data: bytes, name: str) -> tuple[DescribedCamera, ...]:
     Raises:
         TrilightError: as `read_renderformer_json`, for the cameras alone.
     """
-    reader = _Reader(name)
-    return reader.cameras(reader.record(_CameraFile, _parse_json(data, name)))
+    return _read(_CameraFile, data, name, []).cameras
 
 
-class _Reader:
-    """Reads the records of one file, and collects the names of fields that none of them has.
+def _read(kind: type[Record], data: bytes, name: str, unknown: list[str]) -> Record:
+    """Return a file as a record; `unknown` receives the names of fields that no record has.
 
     So a misspelt option is reported instead of ignored.
     """
-
-    def __init__(self, file: str) -> None:
-        self._file = file
-        self._unknown: list[str] = []
-
-    def take_unknown(self) -> list[str]:
-        """Return the unknown fields since the last call."""
-        unknown, self._unknown = self._unknown, []
-        return unknown
-
-    def cameras(self, file: _CameraFile) -> tuple[DescribedCamera, ...]:
-        """Return the cameras of a file."""
-        _require_count(self._file, "cameras", file.cameras, MAX_CAMERAS)
-        return tuple(
-            self.record(DescribedCamera, row, f"cameras[{at}]")
-            for at, row in enumerate(file.cameras)
-        )
-
-    def record(self, kind: type[Record], value: Any, where: str = "", **more: str) -> Record:
-        """Return a JSON object as a record; `more` are fields that the file states elsewhere."""
-        source = f"{self._file}: {_to_text(where)}" if where else self._file
-        known = self._take_known(kind, value, where, more)
-        try:
-            return read_json(json.dumps(known), kind, source)
-        except RecursionError as error:
-            raise TrilightError(f"{source}: nested too deeply; expected a scene.") from error
-
-    def _take_known(self, kind: Any, value: Any, where: str, more: Mapping[str, str]) -> Any:
-        """Return the fields of a record, and those of records in it; note the others."""
-        is_record = dataclasses.is_dataclass(kind) and isinstance(value, dict)
-        if not is_record:
-            return value
-        hints = {each.name: each.hint for each in describe_fields(kind) if each.name not in more}
-        known: dict[str, Any] = dict(more)
-        for key, inner in value.items():
-            path = f"{where}.{key}" if where else key
-            if key in hints:
-                known[key] = self._take_known(hints[key], inner, path, {})
-            else:
-                self._unknown.append(_to_text(path))
-        return known
+    known = _take_known(kind, _parse_json(data, name), "", unknown)
+    for what, most in (("objects", MAX_OBJECTS), ("cameras", MAX_CAMERAS)):
+        entries = known.get(what) if isinstance(known, dict) else None
+        if isinstance(entries, list | dict) and not 1 <= len(entries) <= most:
+            raise TrilightError(f"{name}: {len(entries)} {what}; expected 1 to {most}.")
+    try:
+        return read_json(json.dumps(known), kind, name)
+    except RecursionError as error:
+        raise TrilightError(f"{name}: nested too deeply; expected a scene.") from error
 
 
-def _require_count(file: str, what: str, entries: Collection[Any], most: int) -> None:
-    if not 1 <= len(entries) <= most:
-        raise TrilightError(f"{file}: {len(entries)} {what}; expected 1 to {most}.")
+def _take_known(kind: Any, value: Any, where: str, unknown: list[str]) -> Any:
+    """Return the known fields of a record and of those in it; the name of an object is its key."""
+    if isinstance(value, list) and kind == tuple[DescribedCamera, ...]:
+        return [
+            _take_known(DescribedCamera, entry, f"{where}[{at}]", unknown)
+            for at, entry in enumerate(value)
+        ]
+    if isinstance(value, dict) and kind == Mapping[str, DescribedObject]:
+        entries = {
+            key: _take_known(DescribedObject, entry, f"{where}.{key}", unknown)
+            for key, entry in value.items()
+        }
+        return {k: {**v, "name": k} if isinstance(v, dict) else v for k, v in entries.items()}
+    if not group_of(kind) or not isinstance(value, dict):
+        return value
+    hints = {each.name: each.hint for each in describe_fields(kind) if each.name != "name"}
+    paths = {key: f"{where}.{key}" if where else key for key in value}
+    unknown += [_to_text(paths[key]) for key in value if key not in hints]
+    return {
+        key: _take_known(hints[key], inner, paths[key], unknown)
+        for key, inner in value.items()
+        if key in hints
+    }
 
 
 def _to_text(value: Any) -> str:
