@@ -11,6 +11,7 @@ Only child processes with limits import this (pipeline.isolation): native code p
 
 import dataclasses
 import json
+from collections import defaultdict
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any, TypeVar
@@ -311,23 +312,25 @@ def _read_positions(mesh: Any) -> NDArray[np.float32]:
 def _read_triangles(meshes: list[Any], *, is_textured: bool) -> dict[str, Any]:
     """Return the fields of a scene by triangle, placed by the face rows of meshes."""
     rows = [_read_integers(mesh, layout.FACE_ROWS) for mesh in meshes]
-    faces, materials, objects, uv = [], [], [], []
+    values = defaultdict[str, list[NDArray]](list)
     for mesh, face_rows in zip(meshes, rows, strict=True):
         vertex_rows = _read_integers(mesh, layout.VERTEX_ROWS)
-        faces.append(vertex_rows[_read_integers(mesh, "faceVertexIndices").reshape(-1, 3)])
-        objects.append(np.full(len(face_rows), mesh.attributes[layout.INDEX].default))
+        values["faces"].append(
+            vertex_rows[_read_integers(mesh, "faceVertexIndices").reshape(-1, 3)]
+        )
+        values["objects"].append(np.full(len(face_rows), mesh.attributes[layout.INDEX].default))
         index = np.full(len(face_rows), -1)
         for subset in mesh.nameChildren:
             index[_read_integers(subset, "indices")] = int(subset.name.rpartition("_")[2])
         _require(index.min() >= 0 and index.max() < MAX_ROWS)
-        materials.append(index)
+        values["materials"].append(index)
         if is_textured:
-            uv.append(np.array(mesh.attributes[ST].default, np.float32).reshape(-1, 3, 2))
+            values["uv"].append(np.array(mesh.attributes[ST].default, np.float32).reshape(-1, 3, 2))
     return {
-        "faces": _place_by_row(rows, faces).astype(np.uint32),
-        "material_index": _place_by_row(rows, materials).astype(np.uint16),
-        "object_index": _place_by_row(rows, objects).astype(np.uint16),
-        "uv": _place_by_row(rows, uv).reshape(-1, 2) if is_textured else None,
+        "faces": _place_by_row(rows, values["faces"]).astype(np.uint32),
+        "material_index": _place_by_row(rows, values["materials"]).astype(np.uint16),
+        "object_index": _place_by_row(rows, values["objects"]).astype(np.uint16),
+        "uv": _place_by_row(rows, values["uv"]).reshape(-1, 2) if is_textured else None,
     }
 
 
