@@ -175,6 +175,7 @@ def scene_from_description(
                 scales[described.name] = round(scale, 6)
         except TrilightError as error:
             raise TrilightError(f"{description.file}: objects.{described.name}: {error}") from error
+    c2w, fov_deg = build_cameras(description.cameras[:num_views], description.file)
     try:
         emitters = sum(piece.entry.kind == "emitter" for piece in pieces)
         require_at_most(
@@ -184,7 +185,6 @@ def scene_from_description(
                 "materials": (sum(len(piece.materials) for piece in pieces), MAX_MATERIALS),
             }
         )
-        c2w, fov_deg = build_cameras(description.cameras[:num_views])
         scene = Scene(
             **concatenate_pieces(pieces),
             c2w=c2w,
@@ -266,16 +266,16 @@ def _pieces(
 
 
 def build_cameras(
-    cameras: Sequence[DescribedCamera],
+    cameras: Sequence[DescribedCamera], file: str
 ) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
-    """Return poses [C, 4, 4] and full angles [C] in degrees; raises TrilightError."""
+    """Return poses [C, 4, 4] and full angles [C] in degrees; raises TrilightError about a file."""
     poses = []
     for row, camera in enumerate(cameras):
         with np.errstate(divide="ignore", invalid="ignore"):
             c2w = look_at_c2w(eye=camera.position, target=camera.look_at, up=camera.up)
         if not np.isfinite(c2w).all():
             raise TrilightError(
-                f"cameras[{row}] looks from {camera.position} at {camera.look_at} with up "
+                f"{file}: cameras[{row}] looks from {camera.position} at {camera.look_at} with up "
                 f"{camera.up}; expected a distance, and an up that is not along the view."
             )
         poses.append(c2w)

@@ -87,11 +87,7 @@ def read_scene_cameras(root: Path, name: str) -> tuple[NDArray[np.float32], NDAr
     Raises:
         TrilightError: the file or a camera in it is unusable; the message names it.
     """
-    cameras = read_cameras(_read_scene_file(root, name), name)
-    try:
-        return build_cameras(cameras)
-    except TrilightError as error:
-        raise TrilightError(f"{name}: {error}") from error
+    return build_cameras(read_cameras(_read_scene_file(root, name), name), name)
 
 
 def build_scene(
