@@ -123,11 +123,12 @@ def _take_known(kind: Any, value: Any, where: str, unknown: list[str]) -> Any:
             for at, entry in enumerate(value)
         ]
     if isinstance(value, dict) and kind == Mapping[str, DescribedObject]:
-        entries = {
-            key: _take_known(DescribedObject, entry, f"{where}.{key}", unknown)
-            for key, entry in value.items()
-        }
-        return {k: {**v, "name": k} if isinstance(v, dict) else v for k, v in entries.items()}
+        entries = {}
+        for key, entry in value.items():
+            shown = key if key.isprintable() and len(key) <= 200 else _to_text(key)
+            known = _take_known(DescribedObject, entry, f"{where}.{shown}", unknown)
+            entries[shown] = {**known, "name": key} if isinstance(known, dict) else known
+        return entries
     if not group_of(kind) or not isinstance(value, dict):
         return value
     hints = {each.name: each.hint for each in describe_fields(kind) if each.name != "name"}
