@@ -294,9 +294,10 @@ def _read_vertices(root: Any, meshes: list[Any]) -> dict[str, Any]:
     positions = [_read_vectors(root, layout.UNUSED_POSITIONS), *map(_read_positions, meshes)]
     normals = [_read_vectors(root, layout.UNUSED_NORMALS)]
     normals += [_read_vectors(mesh, "normals") for mesh in meshes]
+    order = _order_rows(rows)
     return {
-        "vertex_positions": _place_by_row(rows, positions),
-        "vertex_normals": _place_by_row(rows, normals),
+        "vertex_positions": np.concatenate(positions)[order],
+        "vertex_normals": np.concatenate(normals)[order],
     }
 
 
@@ -326,20 +327,21 @@ def _read_triangles(meshes: list[Any], *, is_textured: bool) -> dict[str, Any]:
         values["materials"].append(index)
         if is_textured:
             values["uv"].append(np.array(mesh.attributes[ST].default, np.float32).reshape(-1, 3, 2))
+    order = _order_rows(rows)
+    placed = {name: np.concatenate(arrays)[order] for name, arrays in values.items()}
     return {
-        "faces": _place_by_row(rows, values["faces"]).astype(np.uint32),
-        "material_index": _place_by_row(rows, values["materials"]).astype(np.uint16),
-        "object_index": _place_by_row(rows, values["objects"]).astype(np.uint16),
-        "uv": _place_by_row(rows, values["uv"]).reshape(-1, 2) if is_textured else None,
+        "faces": placed["faces"].astype(np.uint32),
+        "material_index": placed["materials"].astype(np.uint16),
+        "object_index": placed["objects"].astype(np.uint16),
+        "uv": placed["uv"].reshape(-1, 2) if is_textured else None,
     }
 
 
-def _place_by_row(rows: Sequence[NDArray[np.int64]], values: Sequence[NDArray]) -> NDArray:
-    """Return values in the order of their rows, which cover 0 to N - 1 and may repeat."""
+def _order_rows(rows: Sequence[NDArray[np.int64]]) -> NDArray[np.intp]:
+    """Return where each of the rows 0 to N - 1 stands first; some may repeat."""
     distinct, first = np.unique(np.concatenate(rows), return_index=True)
     _require(len(distinct) > 0 and distinct[0] == 0 and distinct[-1] == len(distinct) - 1)
-    placed: NDArray = np.concatenate(values)[first]
-    return placed
+    return first
 
 
 def _read_materials(folder: Any, opened: OpenedStage) -> dict[str, Any]:
@@ -394,7 +396,7 @@ _NOT_AS_WRITTEN = (LookupError, TypeError, ValueError, AttributeError)
 """Errors of a layer that is not as export writes it."""
 _PLAIN_INFO = {"specifier", "typeName", "apiSchemas", "documentation", "comment", "displayName"}
 """Metadata that does not change how a prim looks."""
-_LOOKS = ("default", "typeName", "interpolation", "targetPaths", "connectionPaths")
+_LOOKS = {"default", "typeName", "interpolation", "targetPaths", "connectionPaths"}
 """Metadata of prims and properties that does."""
 _OLD_CENTER = "xformOp:translate:center"
 """Name of the transform to the center in older files, such as `examples/room.usdz`."""
@@ -411,11 +413,12 @@ def _list_specs(root: Any) -> dict[str, Any]:
         if path.IsTargetPath():
             return
         spec = root.layer.GetObjectAtPath(path)
-        _require(path.IsPropertyPath() or set(spec.ListInfoKeys()) <= _PLAIN_INFO)
-        _require(not spec.HasInfo("timeSamples"))
-        look = [spec.GetInfo(key) for key in _LOOKS]
+        keys = set(spec.ListInfoKeys())
+        _require(path.IsPropertyPath() or keys <= _PLAIN_INFO)
+        _require("timeSamples" not in keys)
+        look = {key: spec.GetInfo(key) for key in keys & _LOOKS}
         if spec.name == "xformOpOrder":
-            look.append([name.replace(_OLD_CENTER, CENTER) for name in look.pop(0)])
+            look["default"] = [name.replace(_OLD_CENTER, CENTER) for name in spec.default]
         specs[str(path).replace(_OLD_CENTER, CENTER)] = look
 
     root.layer.Traverse(root.path, add_spec)
