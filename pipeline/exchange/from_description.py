@@ -83,7 +83,7 @@ class DescribedObject:
     """One entry of `objects`."""
 
     name: Annotated[str, Spelled(_PRINTABLE + "{1,200}", "a printable name of 1 to 200 letters")]
-    """Key of the entry."""
+    """Name of the object, which is the key of its entry."""
     mesh_path: PrintableText  # relative to the scene file
     transform: DescribedTransform  # from mesh to world space
     material: DescribedMaterial  # reflectance and emission
