@@ -125,9 +125,9 @@ def _take_known(kind: Any, value: Any, where: str, unknown: list[str]) -> Any:
     if isinstance(value, dict) and kind == Mapping[str, DescribedObject]:
         entries = {}
         for key, entry in value.items():
-            shown = key if key.isprintable() and len(key) <= 200 else _to_text(key)
-            known = _take_known(DescribedObject, entry, f"{where}.{shown}", unknown)
-            entries[shown] = {**known, "name": key} if isinstance(known, dict) else known
+            label = key if key.isprintable() and len(key) <= 200 else _to_text(key)
+            known = _take_known(DescribedObject, entry, f"{where}.{label}", unknown)
+            entries[label] = {**known, "name": key} if isinstance(known, dict) else known
         return entries
     if not group_of(kind) or not isinstance(value, dict):
         return value

@@ -160,7 +160,7 @@ def material_tables(
 
     The row has all declared columns; `columns` names the stored ones, and `used` its textures.
     """
-    shown = {name: values[part].tolist() for name, part in column_places().items()}
+    stated = {name: values[part].tolist() for name, part in column_places().items()}
     material = _exact_attributes(values, columns)
     for name, (_, texture) in used.items():
         source = layout.format_map(texture.sha256, texture.source)
@@ -169,17 +169,17 @@ def material_tables(
     preview: _Table = {
         "info:id": ("uniform token", "UsdPreviewSurface"),
         "inputs:useSpecularWorkflow": ("int", 1),
-        "inputs:diffuseColor": ("color3f", shown["diffuse"]),
-        "inputs:specularColor": ("color3f", shown["specular"]),
-        "inputs:roughness": ("float", shown["roughness"][0]),
-        "inputs:emissiveColor": ("color3f", shown["emission"]),
+        "inputs:diffuseColor": ("color3f", stated["diffuse"]),
+        "inputs:specularColor": ("color3f", stated["specular"]),
+        "inputs:roughness": ("float", stated["roughness"][0]),
+        "inputs:emissiveColor": ("color3f", stated["emission"]),
         "inputs:ior": ("float", IOR_OF_CONSTANT_ALBEDOS),
         "outputs:surface": ("token", None),
     }
     tables: dict[str, layout.Attributes] = {"": material, f"/{PREVIEW}": preview}
     if not used:
         material["outputs:mtlx:surface"] = ("token", None, f"{OPENPBR}.outputs:out")
-        tables[f"/{OPENPBR}"] = {**_openpbr_inputs(shown), "outputs:out": ("token", None)}
+        tables[f"/{OPENPBR}"] = {**_openpbr_inputs(stated), "outputs:out": ("token", None)}
         return tables
     for name, (row, texture) in used.items():
         kind, socket, output, output_kind = _LINKS[name]
