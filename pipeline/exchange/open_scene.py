@@ -53,16 +53,16 @@ def scene_source(
     path = Path(name if separator else text)
     form = FORMATS.get(path.suffix.lower())
     is_keyed = form is not None and form.keys is not None and bool(_KEY.fullmatch(key))
-    is_shard = form is not None and form.always_many and not (separator or many)
     for is_wrong, why in (
         (separator and not is_keyed, "no shard and key"),
         (path.is_dir(), "a folder"),
         (not path.exists(), "no such file"),
         (form is None or form.read is None, "cannot be read as a scene"),
-        (is_shard, "a shard holds many scenes"),
     ):
         if is_wrong:
             raise TrilightError(f"{text}: {why}; {expected}.")
+    if form is not None and form.always_many and not (separator or many):
+        raise TrilightError(f"{text}: a shard holds many scenes; expected {text}{SEPARATOR}KEY.")
     return SceneSource(
         path=path,
         key=key if separator else None,
