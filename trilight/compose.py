@@ -121,7 +121,7 @@ _TRIANGLE = np.array([[0.0, 1.0, 0.0], [-(0.75**0.5), -0.5, 0.0], [0.75**0.5, -0
 
 _STAYS = DescribedTransform(
     translation=(0.0, 0.0, 0.0),
-    rotation_deg=(0.0, 0.0, 0.0),
+    rotation=(0.0, 0.0, 0.0),
     scale=(1.0, 1.0, 1.0),
     normalize=False,
 )
@@ -187,7 +187,7 @@ class SceneBuilder:
         scale = 1.0 if size is None else float(size)
         transform = DescribedTransform(
             translation=vector(f"{name}: at", at),
-            rotation_deg=vector(f"{name}: rotation_deg", rotation_deg),
+            rotation=vector(f"{name}: rotation_deg", rotation_deg),
             scale=(scale, scale, scale),
             normalize=size is not None,
         )
@@ -303,7 +303,7 @@ class SceneBuilder:
             position=vector(f"camera {row}: at", at),
             look_at=vector(f"camera {row}: look_at", look_at),
             up=vector(f"camera {row}: up", up),
-            fov_deg=float(fov_deg),
+            fov=float(fov_deg),
         )
         self._cameras.append(camera)
         return self

@@ -3,7 +3,6 @@
 A USD file holds many scenes. In formats that hold one, each scene becomes `NAME.KEY.SUFFIX`.
 """
 
-import dataclasses
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -14,16 +13,16 @@ from numpy.typing import NDArray
 from pipeline.exchange.formats import (
     FORMATS,
     LoadedScene,
+    Pictures,
     SceneFormat,
     SceneSource,
     drop_uncarried_maps,
     list_lost_members,
     writable_suffixes,
 )
-from pipeline.exchange.open_scene import load_source, source_keys
-from pipeline.exchange.reader import file_child, reach_of
+from pipeline.exchange.open_scene import load_source
+from pipeline.exchange.reader import SceneReader
 from pipeline.exchange.scene_budget import within_budget
-from pipeline.isolation import ChildFailed, call_with_retries
 from storage.atomic import write_error
 from storage.errors import TrilightError
 from storage.records.scene import Scene
@@ -51,23 +50,15 @@ def convert_scene(
             written.
     """
     form = _form_of(target)
-    child = file_child(reach_of(source, writes=[_make_folder(target)]))
-    try:
-        keys = call_with_retries(child, source_keys, source)
-        if not keys:
-            raise TrilightError(f"{source.name}: holds no scene.")
-        sources = [source if key is None else dataclasses.replace(source, key=key) for key in keys]
+    with SceneReader(writes=[_make_folder(target)]) as reader:
+        sources = reader.scenes_of(source)
         outputs = [(target, sources)]
         if len(sources) > 1 and not form.write_many:
             outputs = [(target.with_suffix(f".{one.key}{target.suffix}"), [one]) for one in sources]
         results = []
         for out, group in outputs:
-            results.append(call_with_retries(child, convert_sources, group, out, budget))
+            results.append(reader.call(convert_sources, group, out, budget, name=source.name))
             done(len(results), len(outputs))
-    except ChildFailed as failure:
-        raise TrilightError(f"{source.name}: could not be converted ({failure}).") from failure
-    finally:
-        child.close()
     return ConvertResult(
         files=tuple(path for each in results for path in each.files),
         triangles=sum(each.triangles for each in results),
@@ -118,27 +109,24 @@ def convert_sources(
     triangles = 0
     notes = list[str]()
 
-    def load_all() -> Iterator[tuple[str, LoadedScene]]:
+    def carried_scenes() -> Iterator[tuple[str, Scene, Pictures]]:
         nonlocal triangles
         for source in sources:
             loaded = _load_within_budget(source, budget, pictures=form.holds_pictures)
             triangles += loaded.scene.num_triangles
             notes.extend(loaded.notes)
-            yield str(source.key), loaded
-
-    def carried_scenes() -> Iterator[tuple[str, Scene]]:
-        for key, loaded in load_all():
             note_losses(list_lost_members(loaded.scene, form.carried))
-            yield key, drop_uncarried_maps(loaded.scene, form.carried)
+            carried = drop_uncarried_maps(loaded.scene, form.carried)
+            yield str(source.key), carried, loaded.radiance_rgb
 
     def note_losses(lost: Iterable[str]) -> None:
         notes.extend(f"{target.name}: cannot hold {text}" for text in lost)
 
     if form.write_many and len(sources) > 1:
-        form.write_many(target, carried_scenes())
-    else:
-        for _, loaded in load_all():
-            note_losses(write_scene(target, loaded.scene, loaded.radiance_rgb))
+        form.write_many(target, ((key, scene) for key, scene, _ in carried_scenes()))
+    elif form.write:
+        for _, scene, radiance_rgb in carried_scenes():
+            note_losses(form.write(target, scene, radiance_rgb))
     files = (target, *(form.named_files(target) if form.named_files else ()))
     return ConvertResult(files=files, triangles=triangles, notes=tuple(notes))
 

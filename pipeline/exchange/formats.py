@@ -18,28 +18,26 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pipeline.assets.settings import AssetSettings
-from pipeline.exchange import renderformer_h5, renderformer_json
 from pipeline.exchange.from_description import AlbedoOverOne, scaled_albedo_notes
-from pipeline.exchange.gltf import write_gltf as gltf
 from pipeline.exchange.gltf.read_gltf import read_gltf
+from pipeline.exchange.gltf.write_gltf import write_gltf
 from pipeline.exchange.renderformer_h5 import read_renderformer_h5, write_renderformer_h5
 from pipeline.exchange.renderformer_json import describe_scene
 from pipeline.exchange.scene_files import build_scene, read_scene_cameras, read_scene_description
 from pipeline.exchange.textured_triangles import LoadedScene as LoadedScene
 from pipeline.exchange.textured_triangles import Pictures as Pictures
-from pipeline.exchange.usd import write_usd as usd
 from pipeline.exchange.usd.read_usd import read_usd, usd_keys
-from pipeline.exchange.usd.write_usd import write_usd, write_usd_shard
+from pipeline.exchange.usd.write_usd import SUFFIXES, write_usd, write_usd_shard
 from pipeline.objects.licences import USER_PROVIDED
 from storage.atomic import write_atomically
 from storage.dataset.shard import open_shard
 from storage.errors import TrilightError
 from storage.records import scene_file
-from storage.records.material import columns_in_use
+from storage.records.material import PUBLISHED_COLUMNS, columns_in_use
 from storage.records.profiles import PACKED, PLAIN
 from storage.records.retextured import without_maps, without_normal_maps
-from storage.records.sample import decode_sample, decode_scene
-from storage.records.scene import MAP_ARRAYS, Scene, SceneObject
+from storage.records.sample import decode_sample, decode_scene, require_lawful
+from storage.records.scene import ARRAY_FIELDS, MAP_ARRAYS, Scene, SceneObject
 from storage.records.scene_file import encode_scene, read_scene_file
 from storage.registry import Registry
 
@@ -133,9 +131,6 @@ def _read_json(source: SceneSource, pictures: bool) -> LoadedScene:
         name,
         AssetSettings(),
         licence=USER_PROVIDED,
-        num_views=None,
-        scene_index=0,
-        seed=0,
         albedo_over_one=source.albedo_over_one,
         notes=notes,
     )
@@ -164,16 +159,18 @@ def _read_sample(source: SceneSource, pictures: bool) -> LoadedScene:
     key = str(source.key)
     with open_shard(source.path) as opened:
         record = decode_scene(key, opened.members(key, _MEMBERS.__contains__))
-        try:
-            record.scene.check()
-        except TrilightError as error:
-            raise TrilightError(f"sample {key}: {error}") from error
+        require_lawful(record)
         if not pictures:
             return LoadedScene(scene=record.scene, notes=())
         names = (*_MEMBERS, *(f"{view}.exr" for view in range(len(record.views))))
         sample = decode_sample(key, opened.members(key, names.__contains__))
     return LoadedScene(scene=sample.scene, notes=(), radiance_rgb=sample.radiance_rgb)
 
+
+_OBJECTS = {"object_index", "objects.name", "objects.kind"}
+_GEOMETRY = {*ARRAY_FIELDS, *_OBJECTS} - {"materials"}
+_GEOMETRY |= {f"materials.{name}" for name in PUBLISHED_COLUMNS}
+"""Members that the formats of other programs hold: triangles, cameras and published columns."""
 
 _READ_USD = SceneFormat(
     read=lambda source, _: read_usd(source.path, source.key, source.usd_folder, USER_PROVIDED),
@@ -184,7 +181,7 @@ _USD = dataclasses.replace(
     write=lambda target, scene, _: write_usd(target, scene),
     write_many=_write_many_usd,
     named_files=_list_usd_pictures,
-    carried=usd.CARRIED,
+    carried=scene_file.CARRIED,
 )
 _READ_GLTF = SceneFormat(read=lambda source, _: read_gltf(source.path, USER_PROVIDED))
 
@@ -192,7 +189,7 @@ FORMATS: Registry[SceneFormat] = Registry(
     "scene format",
     SceneFormat,
     {
-        **dict.fromkeys(usd.SUFFIXES, _USD),
+        **dict.fromkeys(SUFFIXES, _USD),
         ".usd": _READ_USD,
         ".json": SceneFormat(
             read=_read_json,
@@ -200,18 +197,18 @@ FORMATS: Registry[SceneFormat] = Registry(
                 source.path.parent.resolve(), source.path.name
             ),
             write=_write_json,
-            carried=renderformer_json.CARRIED,
+            carried=_GEOMETRY,
         ),
         ".glb": dataclasses.replace(
             _READ_GLTF,
-            write=lambda target, scene, _: gltf.write_gltf(target, scene),
-            carried=gltf.CARRIED,
+            write=lambda target, scene, _: write_gltf(target, scene),
+            carried=_GEOMETRY | {"textures", "normal_textures"},
         ),
         ".gltf": _READ_GLTF,
         ".h5": SceneFormat(
             read=lambda source, pictures: read_renderformer_h5(source.path, pictures=pictures),
             write=write_renderformer_h5,
-            carried=renderformer_h5.CARRIED,
+            carried=_GEOMETRY - _OBJECTS | {"textures"},
             holds_pictures=True,
         ),
         ".safetensors": SceneFormat(

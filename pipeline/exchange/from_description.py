@@ -31,6 +31,7 @@ from storage.errors import TrilightError
 from storage.records.material import DIFFUSE, EMISSION, ROUGHNESS, SPECULAR, default_rows
 from storage.records.scene import ALBEDO_SUM_TOLERANCE, ObjectKind, Scene, SceneObject
 from storage.settings.ranges import Within
+from storage.typed_json import Spelled
 
 Vector = tuple[float, float, float]
 
@@ -41,6 +42,11 @@ Fraction = Annotated[float, Within(0, 1)]
 Albedo = Annotated[Vector, Within(0, 1)]
 Radiance = Annotated[Vector, Within(0, 1e9)]
 
+_PRINTABLE = r"(?:[^\p{C}\p{Z}]| )"
+PrintableText = Annotated[
+    str, Spelled(_PRINTABLE + "{0,200}", "printable text of up to 200 letters")
+]
+
 ColorGroups = Literal["per-triangle", "per-shading-group"]
 
 
@@ -49,7 +55,7 @@ class DescribedTransform:
     """Transform of a mesh into world space."""
 
     translation: Lengths  # world units, the last step
-    rotation_deg: Angles  # angles about the world's X, then Y, then Z
+    rotation: Angles  # angles about the world's X, then Y, then Z
     scale: Lengths  # factors along the world's axes, after the rotation; a negative one mirrors
     normalize: bool = True
     """True brings the mesh into a sphere of diameter 1 around the origin first."""
@@ -76,8 +82,9 @@ class DescribedMaterial:
 class DescribedObject:
     """One entry of `objects`."""
 
-    name: str  # key of the entry
-    mesh_path: str  # relative to the scene file
+    name: Annotated[str, Spelled(_PRINTABLE + "{1,200}", "a printable name of 1 to 200 letters")]
+    """Name of the object, which is the key of its entry."""
+    mesh_path: PrintableText  # relative to the scene file
     transform: DescribedTransform  # from mesh to world space
     material: DescribedMaterial  # reflectance and emission
     remesh: bool = False  # True replaces the mesh by one of even triangles
@@ -97,7 +104,7 @@ class DescribedCamera:
     position: Lengths  # world units
     look_at: Lengths  # the point in the middle of the picture
     up: Lengths  # roughly upwards in the picture; neither unit nor orthogonal
-    fov_deg: Annotated[float, Within(0.001, 179, unit="degrees")]
+    fov: Annotated[float, Within(0.001, 179, unit="degrees")]
     """Full field of view, horizontal and vertical."""
 
 
@@ -168,6 +175,7 @@ def scene_from_description(
                 scales[described.name] = round(scale, 6)
         except TrilightError as error:
             raise TrilightError(f"{description.file}: objects.{described.name}: {error}") from error
+    c2w, fov_deg = build_cameras(description.cameras[:num_views], description.file)
     try:
         emitters = sum(piece.entry.kind == "emitter" for piece in pieces)
         require_at_most(
@@ -177,7 +185,6 @@ def scene_from_description(
                 "materials": (sum(len(piece.materials) for piece in pieces), MAX_MATERIALS),
             }
         )
-        c2w, fov_deg = build_cameras(description.cameras[:num_views])
         scene = Scene(
             **concatenate_pieces(pieces),
             c2w=c2w,
@@ -209,7 +216,7 @@ def _pieces(
     points = mesh.positions
     if transform.normalize:
         points = (points - mesh.centre) / (2 * mesh.reach)
-    rotated = rotate_points(points, rotation_xyz(transform.rotation_deg))
+    rotated = rotate_points(points, rotation_xyz(transform.rotation))
     world = rotated * np.array(transform.scale) + np.array(transform.translation)
     positions = world.astype(np.float32)
     mirrored = np.prod(transform.scale) < 0
@@ -259,20 +266,20 @@ def _pieces(
 
 
 def build_cameras(
-    cameras: Sequence[DescribedCamera],
+    cameras: Sequence[DescribedCamera], file: str
 ) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
-    """Return poses [C, 4, 4] and full angles [C] in degrees; raises TrilightError."""
+    """Return poses [C, 4, 4] and full angles [C] in degrees; raises TrilightError about a file."""
     poses = []
     for row, camera in enumerate(cameras):
         with np.errstate(divide="ignore", invalid="ignore"):
             c2w = look_at_c2w(eye=camera.position, target=camera.look_at, up=camera.up)
         if not np.isfinite(c2w).all():
             raise TrilightError(
-                f"cameras[{row}] looks from {camera.position} at {camera.look_at} with up "
+                f"{file}: cameras[{row}] looks from {camera.position} at {camera.look_at} with up "
                 f"{camera.up}; expected a distance, and an up that is not along the view."
             )
         poses.append(c2w)
-    angles = np.array([camera.fov_deg for camera in cameras], np.float32)
+    angles = np.array([camera.fov for camera in cameras], np.float32)
     return np.array(poses, np.float32).reshape(-1, 4, 4), angles
 
 

@@ -52,15 +52,16 @@ def scene_source(
     name, separator, key = text.rpartition(SEPARATOR)
     path = Path(name if separator else text)
     form = FORMATS.get(path.suffix.lower())
-    if separator and (form is None or form.keys is None or not _KEY.fullmatch(key)):
-        raise TrilightError(f"{text}: no shard and key; {expected}.")
-    if path.is_dir():
-        raise TrilightError(f"{text}: a folder; {expected}.")
-    if not path.exists():
-        raise TrilightError(f"{text}: no such file; {expected}.")
-    if form is None or form.read is None:
-        raise TrilightError(f"{text}: cannot be read as a scene; {expected}.")
-    if not separator and form.always_many and not many:
+    is_keyed = form is not None and form.keys is not None and bool(_KEY.fullmatch(key))
+    for is_wrong, why in (
+        (separator and not is_keyed, "no shard and key"),
+        (path.is_dir(), "a folder"),
+        (not path.exists(), "no such file"),
+        (form is None or form.read is None, "cannot be read as a scene"),
+    ):
+        if is_wrong:
+            raise TrilightError(f"{text}: {why}; {expected}.")
+    if form is not None and form.always_many and not (separator or many):
         raise TrilightError(f"{text}: a shard holds many scenes; expected {text}{SEPARATOR}KEY.")
     return SceneSource(
         path=path,

@@ -120,7 +120,7 @@ class PartConverter:
         `source`.
         """
         count = len(part.positions)
-        placed = _place_slots(part, self._lost)
+        placed = _PlacedSlots(part, self._lost)
         uv = placed.uv
         most = _MOST_TINTED
         if uv is not None:
@@ -281,74 +281,68 @@ def _emission(part: Part, lost: list[str]) -> NDArray[np.float64]:
     return radiance
 
 
-@dataclass(frozen=True, kw_only=True, eq=False)
 class _PlacedSlots:
-    """Pictures of a material, and the coordinates of a mesh in their maps."""
+    """Pictures of a part's material by slot, and the coordinates of the part in their maps.
 
-    slots: Mapping[str, Slot]
-    """Slots by the field of `MaterialSamples`."""
-    same_chart: Sequence[str]
-    """Names of the slots whose maps vary over the mesh; others are their means."""
-    tiles: tuple[range, range] | None
-    """Tiles of these maps along u and v, tile 0 is [0, 1]; None where all maps are constants."""
-    uv: NDArray[np.float32] | None
-    """[T, 3, 2] coordinates in the maps; None where all maps are constants."""
+    The first picture decides on the coordinates; those with others become their means. `tiles` are
+    those of the maps along u and v, tile 0 is [0, 1]. They and the coordinates `uv` [T, 3, 2] are
+    None where all maps are constants.
+    """
+
+    tiles: tuple[range, range] | None = None
+    uv: NDArray[np.float32] | None = None
+
+    def __init__(self, part: Part, lost: list[str]) -> None:
+        """Place the pictures; `lost` receives a sentence for each loss."""
+        self._slots = part.material.column_slots
+        self._same_chart: list[str] = []
+        first = next(iter(self._slots.values()), None)
+        plain = None if first is None else part.coordinates(first.uv_set)
+        if first is None or plain is None:
+            if self._slots:
+                lost.append(
+                    f"{part.where}textures of a mesh without texture coordinates: replaced by "
+                    "their means"
+                )
+            return
+        uv = plain @ first.uv_matrix.T + first.uv_offset
+        self._same_chart += [name for name, s in self._slots.items() if _chart(s) == _chart(first)]
+        if len(self._same_chart) < len(self._slots):
+            lost.append(
+                f"{part.where}textures with other coordinates than the first of a material: "
+                "replaced by means"
+            )
+        pictures = [self._slots[name].picture for name in self._same_chart]
+        (across, all_across), (up, all_up) = (
+            _choose_tiles(pictures, uv[..., axis], axis) for axis in range(2)
+        )
+        moved = (uv - [across.start, up.start]) / [len(across), len(up)]
+        near, all_near = _shift_near_zero(moved)
+        if not (all_across and all_up and all_near):
+            lost.append(
+                f"{part.where}coordinates far outside [0, 1]: some textures look different there"
+            )
+        self.tiles = (across, up)
+        self.uv = near.astype(np.float32)
 
     @property
     def texels(self) -> int:
         """Return the number of texels of the largest map."""
-        shapes = [self.slots[name].picture.values.shape for name in self.same_chart]
+        shapes = [self._slots[name].picture.values.shape for name in self._same_chart]
         tiles = 1 if self.tiles is None else len(self.tiles[0]) * len(self.tiles[1])
         return max((shape[0] * shape[1] * tiles for shape in shapes), default=1)
 
     def build_maps(self) -> dict[str, Map]:
         """Return linear maps [H, W, 4] by the names of slots, the bottom row first."""
         maps = {}
-        for name, slot in self.slots.items():
+        for name, slot in self._slots.items():
             values = slot.picture.linear(slot.picture.values)
-            if self.tiles is None or name not in self.same_chart:
+            if self.tiles is None or name not in self._same_chart:
                 maps[name] = constant_map(values.mean(axis=(0, 1)))
                 continue
             across = _expand_tiles(values, slot.picture.wrap[0], self.tiles[0], 1)
             maps[name] = _expand_tiles(across, slot.picture.wrap[1], self.tiles[1], 0)
         return maps
-
-
-def _place_slots(part: Part, lost: list[str]) -> _PlacedSlots:
-    """Return the pictures of a part's material; the first one decides on the coordinates.
-
-    `lost` receives a sentence for each loss.
-    """
-    slots = part.material.column_slots
-    first = next(iter(slots.values()), None)
-    plain = None if first is None else part.coordinates(first.uv_set)
-    if first is None or plain is None:
-        if slots:
-            lost.append(
-                f"{part.where}textures of a mesh without texture coordinates: replaced by their "
-                "means"
-            )
-        return _PlacedSlots(slots=slots, same_chart=(), tiles=None, uv=None)
-    uv = plain @ first.uv_matrix.T + first.uv_offset
-    same_chart = [name for name, slot in slots.items() if _chart(slot) == _chart(first)]
-    if len(same_chart) < len(slots):
-        lost.append(
-            f"{part.where}textures with other coordinates than the first of a material: replaced "
-            "by means"
-        )
-    pictures = [slots[name].picture for name in same_chart]
-    (across, all_across), (up, all_up) = (
-        _choose_tiles(pictures, uv[..., axis], axis) for axis in range(2)
-    )
-    moved = (uv - [across.start, up.start]) / [len(across), len(up)]
-    near, all_near = _shift_near_zero(moved)
-    if not (all_across and all_up and all_near):
-        lost.append(
-            f"{part.where}coordinates far outside [0, 1]: some textures look different there"
-        )
-    return _PlacedSlots(
-        slots=slots, same_chart=same_chart, tiles=(across, up), uv=near.astype(np.float32)
-    )
 
 
 def _chart(slot: Slot) -> tuple[int, bytes, bytes]:
@@ -380,8 +374,18 @@ def _choose_tiles(
 
 def _expand_tiles(values: NDArray, wrap: Wrap, tiles: range, axis: int) -> NDArray:
     """Return the tiles of a picture [H, W, C] side by side along axis 0 (v) or 1 (u)."""
-    tile_values = [_tile(values, wrap, number, axis) for number in tiles]
-    return np.concatenate(tile_values, axis=axis) if len(tile_values) > 1 else tile_values[0]
+    size = values.shape[axis]
+    if wrap == "repeat" or tiles == range(1):
+        return np.concatenate([values] * len(tiles), axis=axis)
+    texels = np.arange(tiles.start * size, tiles.stop * size)
+    rows = np.clip(texels, 0, size - 1)
+    if wrap == "mirror":
+        rows = np.where(texels // size % 2, -1 - texels, texels) % size
+    expanded: NDArray = np.take(values, rows, axis)
+    if wrap == "black":
+        outside = np.expand_dims(rows != texels, (1 - axis, 2))
+        expanded = np.where(outside, expanded.dtype.type(0), expanded)
+    return expanded
 
 
 def _shift_near_zero(uv: NDArray[np.float64]) -> tuple[NDArray[np.float64], bool]:
@@ -393,14 +397,3 @@ def _shift_near_zero(uv: NDArray[np.float64]) -> tuple[NDArray[np.float64], bool
         return uv, True
     near = uv - np.floor(uv.min(axis=1, keepdims=True))
     return np.clip(near, -MAX_UV, MAX_UV), bool(near.max() <= MAX_UV)
-
-
-def _tile(values: NDArray, wrap: Wrap, number: int, axis: int) -> NDArray:
-    if wrap == "repeat" or number == 0:
-        return values
-    if wrap == "mirror":
-        return np.flip(values, axis) if number % 2 else values
-    if wrap == "black":
-        return np.zeros_like(values)
-    border = np.take(values, [0 if number < 0 else values.shape[axis] - 1], axis)
-    return np.repeat(border, values.shape[axis], axis)

@@ -1,5 +1,8 @@
 """Decodes untrusted pictures of scenes; sizes are checked before any allocation."""
 
+import contextlib
+from collections.abc import Iterator
+
 import numpy as np
 from numpy.typing import NDArray
 
@@ -18,12 +21,8 @@ def decode_values(data: bytes, name: str, lost: list[str]) -> NDArray:
         Rejected: the bytes are no picture.
         TrilightError: the picture has more pixels than MAX_PIXELS.
     """
-    try:
+    with _refuse_large(""):
         return decode_image(data, name, MAX_PIXELS, lost, replaces_nan=True)
-    except Rejected as error:
-        if error.reason != "texture_too_large":
-            raise
-        raise _too_large(error) from error
 
 
 def decode_pixels(data: bytes, name: str, lost: list[str] | None = None) -> NDArray | None:
@@ -37,12 +36,11 @@ def decode_pixels(data: bytes, name: str, lost: list[str] | None = None) -> NDAr
     """
     lost = [] if lost is None else lost
     try:
-        picture = read_linear_picture(data, MAX_PIXELS)
-        if picture is None:
-            return decode_image(data, name, MAX_PIXELS, lost, replaces_nan=True)[::-1]
+        with _refuse_large(name):
+            picture = read_linear_picture(data, MAX_PIXELS)
+            if picture is None:
+                return decode_image(data, name, MAX_PIXELS, lost, replaces_nan=True)[::-1]
     except Rejected as error:
-        if error.reason in ("too_many_pixels", "texture_too_large"):
-            raise _too_large(error, name) from error
         lost.append(f"{name!r:.100}: {error.message}")
         return None
     lost += [f"{name!r:.100}: {sentence}" for sentence in picture.unread]
@@ -58,7 +56,15 @@ def linear_rgb(pixels: NDArray) -> NDArray[np.float32]:
     return np.asarray(rgb, np.float32)
 
 
-def _too_large(error: Rejected, name: str = "") -> TrilightError:
-    stated, is_left, _ = error.message.partition("; at most ")
-    text = f"{stated} pixels; expected at most {MAX_PIXELS}" if is_left else error.message
-    return TrilightError(f"{text}." if not name or name in text else f"{name}: {text}.")
+@contextlib.contextmanager
+def _refuse_large(name: str) -> Iterator[None]:
+    """Raise TrilightError for a picture of too many pixels."""
+    try:
+        yield
+    except Rejected as error:
+        if error.reason not in ("too_many_pixels", "texture_too_large"):
+            raise
+        stated, is_left, _ = error.message.partition("; at most ")
+        text = f"{stated} pixels; expected at most {MAX_PIXELS}" if is_left else error.message
+        text = f"{text}." if not name or name in text else f"{name}: {text}."
+        raise TrilightError(text) from error

@@ -32,13 +32,16 @@ log = logging.getLogger("trilight.exchange")
 class SceneReader(contextlib.AbstractContextManager["SceneReader"]):
     """A child process that reads any number of sources; close it, or use a `with` block."""
 
-    def __init__(self, albedo_over_one: AlbedoOverOne = "scale") -> None:
+    def __init__(
+        self, albedo_over_one: AlbedoOverOne = "scale", *, writes: Iterable[Path] = ()
+    ) -> None:
         """Create the reader; the child starts with the first call.
 
         Args:
             albedo_over_one: treatment of albedos over 1 in RenderFormer's JSON.
+            writes: folders that the child may write into.
         """
-        self._child = file_child()
+        self._child = file_child(reach(writes=writes))
         self._over_one = albedo_over_one
 
     def scenes_of(self, source: SceneSource) -> list[SceneSource]:
@@ -69,14 +72,14 @@ class SceneReader(contextlib.AbstractContextManager["SceneReader"]):
         """
         self._child.allow_files(reach(files=[path]))
         arguments = (path, path.name, path.name, AssetSettings(), licence)
-        mesh = self._call(path.name, load_mesh_file, *arguments)
+        mesh = self.call(load_mesh_file, *arguments, name=path.name)
         if mesh.unread:
             log.warning("%s: not read: %s", path.name, "; ".join(mesh.unread))
         return mesh
 
     def within_budget(self, scene: Scene, max_triangles: int) -> LoadedScene:
         """Reduce a scene in the child; see `pipeline.exchange.scene_budget.within_budget`."""
-        reduced, notes = self._call("scene", within_budget, scene, max_triangles)
+        reduced, notes = self.call(within_budget, scene, max_triangles, name="scene")
         return LoadedScene(scene=reduced, notes=notes)
 
     def close(self) -> None:
@@ -91,16 +94,18 @@ class SceneReader(contextlib.AbstractContextManager["SceneReader"]):
 
         Readers say the name alone, since others write what they say into datasets.
         """
-        self._child.allow_files(reach_of(source))
+        folders = [] if source.usd_folder is None else [source.usd_folder]
+        self._child.allow_files(reach(files=[source.path, *folders]))
         try:
-            return self._call(source.name, function, source, *args)
+            return self.call(function, source, *args, name=source.name)
         except TrilightError as error:
             name = source.path.name
             if not str(error).startswith(name):
                 raise
             raise type(error)(f"{source.path}{str(error).removeprefix(name)}") from error
 
-    def _call(self, name: str, function: Callable[..., Result], *args: Any) -> Result:
+    def call(self, function: Callable[..., Result], *args: Any, name: str) -> Result:
+        """Call a function in the child; `name` begins the message if the child fails."""
         try:
             return call_with_retries(self._child, function, *args)
         except ChildFailed as failure:
@@ -126,9 +131,3 @@ def unconfined_child(address_space: Callable[[int], int]) -> IsolatedChild:
     """
     memory_bytes = address_space(_LIMITS.memory_bytes)
     return IsolatedChild(limits=dataclasses.replace(_LIMITS, memory_bytes=memory_bytes))
-
-
-def reach_of(source: SceneSource, *, writes: Iterable[Path] = ()) -> Reach:
-    """Return the files that a child needs to read a source and to write into folders."""
-    folders = [] if source.usd_folder is None else [source.usd_folder]
-    return reach(files=[source.path, *folders], writes=writes)

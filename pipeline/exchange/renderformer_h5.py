@@ -36,11 +36,12 @@ with a note.
 """
 
 import io
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 
 from pipeline.exchange.linear_maps import color_textures, number_texture
 from pipeline.exchange.safe_h5 import (
@@ -60,13 +61,12 @@ from storage.records.lookup import texture_values
 from storage.records.material import (
     DIFFUSE,
     EMISSION,
-    PUBLISHED_COLUMNS,
     REFLECTING,
     ROUGHNESS,
     SPECULAR,
+    column_places,
     default_rows,
     distinct_rows,
-    laid_out,
 )
 from storage.records.retextured import with_textures, without_constant_textures
 from storage.records.scene import (
@@ -77,12 +77,6 @@ from storage.records.scene import (
     SceneObject,
 )
 from storage.records.texture import CONSTANT, TEXTURED, MapSource, Texture
-
-CARRIED = frozenset(
-    {"vertex_positions", "vertex_normals", "faces", "material_index", "c2w", "fov_deg", "textures"}
-    | {f"materials.{name}" for name in PUBLISHED_COLUMNS}
-)
-"""Members of a scene that the file holds (pipeline.exchange.formats)."""
 
 CHANNELS = 13
 """A texture has CHANNELS channels of CELLS x CELLS cells."""
@@ -109,7 +103,7 @@ def write_renderformer_h5(
     The file appears whole or not at all; memory is its compressed size and one block of textures.
 
     Returns:
-        Sentences about members in CARRIED that lose something.
+        Sentences about members in the file that lose something.
 
     Raises:
         TrilightError: a picture exceeds half floats, or the file cannot be written.
@@ -121,7 +115,8 @@ def write_renderformer_h5(
     with h5py.File(stream, "w") as file:
         _write(file, "triangles", scene.vertex_positions[corners])
         _write(file, "vn", scene.vertex_normals[corners])
-        _write_texture(file, _texture_rows(scene), scene)
+        rows = _stated_rows(scene.materials[:, REFLECTING], scene.materials[:, EMISSION])
+        _write_texture(file, rows[scene.material_index], scene)
         _write(file, "c2w", scene.c2w)
         _write(file, "fov", scene.fov_deg)
         if radiance_rgb is not None:
@@ -139,15 +134,14 @@ def write_renderformer_h5(
     return tuple(lost)
 
 
-def _texture_rows(scene: Scene) -> NDArray[np.float32]:
-    """Return the value [T, 13] of each triangle's texture."""
-    emits = np.any(scene.materials[:, EMISSION] > 0, axis=1)
-    rows = np.zeros((len(scene.materials), CHANNELS), np.float32)
-    rows[:, REFLECTING] = scene.materials[:, REFLECTING]
-    rows[emits, REFLECTING] = _PUBLISHED_EMITTER
+def _stated_rows(reflecting: ArrayLike, emission: NDArray[np.float32]) -> NDArray[np.float32]:
+    """Return the values [N, 13] of textures, of emission [N, 3] and the channels that reflect."""
+    rows = np.zeros((len(emission), CHANNELS), np.float32)
+    rows[:, REFLECTING] = reflecting
+    rows[(emission > 0).any(axis=1), REFLECTING] = _PUBLISHED_EMITTER
     rows[:, _NORMAL] = _FLAT_NORMAL
-    rows[:, _EMISSION] = scene.materials[:, EMISSION]
-    return rows[scene.material_index]
+    rows[:, _EMISSION] = emission
+    return rows
 
 
 def _write(file: Any, name: str, values: NDArray) -> None:
@@ -193,7 +187,8 @@ MAX_PALETTE = 1 << 16
 UNKNOWN_LICENCE = "LicenseRef-unknown"
 """Licence of everything that is read, since the file states no rights."""
 
-_GREY = 0.5
+_GREY = (0.5, 0.5, 0.5, 0, 0, 0, 1)
+"""What the reflecting channels of a surface of the successor become."""
 _SECOND_VERSION = ("env_map", "env_map_rotation", "env_map_strength", "light_strength")
 """Arrays of the successor, in addition to those of the first version."""
 _KNOWN = ("c2w", "fov", "img", "mvp", "texture", "triangles", "vn")
@@ -213,15 +208,15 @@ def read_renderformer_h5(path: Path, *, pictures: bool = True) -> LoadedScene:
     """
     lost: list[str] = []
     with open_h5(path) as file:
-        lost += _list_unknown(file)
-        triangles = read_whole(plain_array(file, "triangles", (None, 3, 3), MAX_TRIANGLES))
+        second = "light_strength" in list_names(file)
+        lost += _list_unknown(file, (*_KNOWN, *(_SECOND_VERSION if second else ())))
+        triangles = read_whole(file, "triangles", (None, 3, 3), MAX_TRIANGLES)
         count = len(triangles)
-        normals = read_whole(plain_array(file, "vn", (count, 3, 3), MAX_TRIANGLES))
-        second = _is_second_version(file)
+        normals = read_whole(file, "vn", (count, 3, 3), MAX_TRIANGLES)
         rows, varies = (_read_grey_rows if second else _read_rows)(file, count, lost)
         sky = _read_sky(file, lost) if second else None
-        c2w = read_whole(plain_array(file, "c2w", (None, 4, 4), MAX_VIEWS))
-        fov_deg = read_whole(plain_array(file, "fov", (len(c2w),), MAX_VIEWS))
+        c2w = read_whole(file, "c2w", (None, 4, 4), MAX_VIEWS)
+        fov_deg = read_whole(file, "fov", (len(c2w),), MAX_VIEWS)
         radiance_rgb = _pictures(file, len(c2w), lost) if "img" in list_names(file) else None
         positions, normals, faces = index_corners(triangles, _normalize(triangles, normals, lost))
         scene = Scene(
@@ -242,16 +237,15 @@ def read_renderformer_h5(path: Path, *, pictures: bool = True) -> LoadedScene:
     )
 
 
-def _list_unknown(file: Any) -> list[str]:
-    known = (*_KNOWN, *_SECOND_VERSION) if _is_second_version(file) else _KNOWN
+def _list_unknown(file: Any, known: Sequence[str]) -> list[str]:
     names = [f"array or group {name!r:.60}" for name in list_names(file) if name not in known]
     names += [f"attribute {name!r:.60}" for name in sorted(file.attrs)]
     return names if len(names) <= 10 else [*names[:10], f"and {len(names) - 10} more"]
 
 
 def _pictures(file: Any, num_views: int, lost: list[str]) -> NDArray[np.float32]:
-    array = plain_array(file, "img", (num_views, None, None, 4), MAX_RESOLUTION)
-    rgba = read_whole(array, MAX_PICTURE_BYTES)
+    shape = (num_views, None, None, 4)
+    rgba = read_whole(file, "img", shape, MAX_RESOLUTION, MAX_PICTURE_BYTES)
     if (rgba[..., 3] != 1).any():
         lost.append("alpha of pictures: composited over black")
     return rgba[..., :3].copy()
@@ -382,27 +376,16 @@ def _with_cells(scene: Scene, cells: NDArray[np.float32], varies: NDArray[np.boo
     return without_constant_textures(scene)
 
 
-def _is_second_version(file: Any) -> bool:
-    """Return whether an open file has the separate lights of the successor."""
-    return "light_strength" in list_names(file)
-
-
 def _read_grey_rows(
     file: Any, count: int, lost: list[str]
 ) -> tuple[NDArray[np.float32], NDArray[np.bool_]]:
     """Return grey surfaces with the emission of a successor's file, as `_read_rows`."""
-    light = read_whole(plain_array(file, "light_strength", (count, 3), MAX_TRIANGLES))
-    rows = np.zeros((count, CHANNELS), np.float32)
-    rows[:, DIFFUSE] = _GREY
-    rows[:, ROUGHNESS] = 1
-    rows[light.any(axis=1), REFLECTING] = _PUBLISHED_EMITTER
-    rows[:, _NORMAL] = _FLAT_NORMAL
-    rows[:, _EMISSION] = light
+    light = read_whole(file, "light_strength", (count, 3), MAX_TRIANGLES)
     lost.append(
         f"materials: nine channels of a learned code for a BRDF, which no formula turns into "
-        f"albedos; all {count} triangles are a diffuse gray of {_GREY}"
+        f"albedos; all {count} triangles are a diffuse gray of {_GREY[0]}"
     )
-    return rows, np.zeros(count, np.bool_)
+    return _stated_rows(_GREY, light), np.zeros(count, np.bool_)
 
 
 def _read_sky(file: Any, lost: list[str]) -> Environment | None:
@@ -415,18 +398,18 @@ def _read_sky(file: Any, lost: list[str]) -> Environment | None:
     """
     if "env_map" not in list_names(file):
         return None
-    values = read_whole(plain_array(file, "env_map", (None, None, None), MAX_RESOLUTION))
-    if 3 not in (values.shape[0], values.shape[2]):
+    values = read_whole(file, "env_map", (None, None, None), MAX_RESOLUTION)
+    if values.shape[0] == 3:  # a processed map, which is already rotated and scaled
+        radiance = np.moveaxis(values, 0, -1)
+    elif values.shape[2] == 3:
+        strength = _read_small(file, "env_map_strength").ravel()
+        radiance = values * (strength[0] if strength.size == 1 else np.float32(1))
+        if np.any(_read_small(file, "env_map_rotation")):
+            lost.append("rotation of the environment: three angles whose order it does not state")
+    else:
         raise TrilightError(
             f"env_map has shape {values.shape}; expected (3, H, 2 H) or (H, 2 H, 3)."
         )
-    is_processed = values.shape[0] == 3  # a processed map is already rotated and scaled
-    radiance = np.moveaxis(values, 0, -1) if is_processed else values
-    if not is_processed:
-        strength = _read_small(file, "env_map_strength").ravel()
-        radiance = radiance * (strength[0] if strength.size == 1 else np.float32(1))
-        if np.any(_read_small(file, "env_map_rotation")):
-            lost.append("rotation of the environment: three angles whose order it does not state")
     if not radiance.any():
         return None  # a black map stands for no environment
     return Environment(
@@ -440,9 +423,9 @@ def _read_small(file: Any, name: str) -> NDArray[np.float32]:
     if name not in list_names(file):
         return np.zeros(0, np.float32)
     try:
-        return read_whole(plain_array(file, name, (), 1))
+        return read_whole(file, name, (), 1)
     except TrilightError:
-        return read_whole(plain_array(file, name, (None,), 16))
+        return read_whole(file, name, (None,), 16)
 
 
 CELLS = 32
@@ -476,9 +459,9 @@ def compute_cells(scene: Scene, triangle: int) -> list[tuple[slice, NDArray[np.f
     assert scene.material_textures is not None and scene.uv is not None
     index = scene.material_textures[scene.material_index[triangle]]
     uv = scene.uv.reshape(-1, 3, 2)[triangle].astype(np.float64)
-    column_slices = {column.name: part for column, part in laid_out()}
+    places = column_places()
     return [
-        (column_slices[name], _compute_means(scene.textures[row], uv))
+        (places[name], _compute_means(scene.textures[row], uv))
         for name, row in zip(TEXTURED, index, strict=True)
         if row != CONSTANT
     ]

@@ -5,18 +5,18 @@ ignores unknown fields. It knows the fields of the published example scenes only
 (whose values would have to be halved), no textures, no environment.
 
 A written file names one OBJ file per mesh, in world space and not normalized. An object of the file
-has one material, so an object of a scene becomes one object for each of its materials. `CARRIED`
-lists the members that the format holds. `DescribedFiles.lost` lists what of these a reader cannot
-restore: objects of several materials; shading normals other than flat ones and those that readers
-compute (smooth across edges of up to 30 degrees).
+has one material, so an object of a scene becomes one object for each of its materials. Of what the
+format holds (pipeline.exchange.formats), `DescribedFiles.lost` lists what a reader cannot restore:
+objects of several materials; shading normals other than flat ones and those that readers compute
+(smooth across edges of up to 30 degrees).
 """
 
-import dataclasses
 import json
 import re
 from collections import Counter
+from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import Any, NoReturn
+from typing import Any, Literal, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -26,6 +26,7 @@ from pipeline.exchange.from_description import (
     SMOOTH_ANGLE_DEG,
     DescribedCamera,
     DescribedObject,
+    PrintableText,
     SceneDescription,
     require_at_most,
 )
@@ -34,10 +35,12 @@ from pipeline.foreign.numbers import Malformed
 from pipeline.scenes.shading_normals import face_normals, smooth_shaded, without_slivers
 from storage.conventions import HALF_FLOAT_MAX
 from storage.errors import TrilightError
-from storage.records.material import DIFFUSE, EMISSION, PUBLISHED_COLUMNS, ROUGHNESS, SPECULAR
-from storage.records.scene import ARRAY_FIELDS, Scene
-from storage.settings.fields import describe_fields
+from storage.records.material import DIFFUSE, EMISSION, ROUGHNESS, SPECULAR
+from storage.records.scene import Scene
+from storage.settings.fields import describe_fields, group_of
 from storage.typed_json import read_json
+
+Record = TypeVar("Record")
 
 MAX_BYTES = 4 << 20
 """Maximum size of a file; an object takes about 1 KiB."""
@@ -48,13 +51,24 @@ MAX_OBJECTS = 8192
 MAX_CAMERAS = 1000
 """Maximum number of cameras in a file."""
 
-_VERSION = "1.0"
-_MAX_TEXT = 200
-"""Maximum number of characters of a text, such as the name of an object."""
 _MAX_SHOWN = 120
 """Maximum number of characters of a value in a message."""
-_OUR_NAMES = {"rotation": "rotation_deg", "fov": "fov_deg"}
-"""Our names of fields, by those of the file, where they differ."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class _CameraFile:
+    """What a list of cameras states, and a scene file too."""
+
+    cameras: tuple[DescribedCamera, ...]
+
+
+@dataclass(frozen=True, kw_only=True)
+class _SceneFile(_CameraFile):
+    """What a scene file states; each object also has its key as its name."""
+
+    scene_name: PrintableText
+    version: Literal["1.0"]
+    objects: Mapping[str, DescribedObject]
 
 
 def read_renderformer_json(data: bytes, name: str) -> SceneDescription:
@@ -65,27 +79,14 @@ def read_renderformer_json(data: bytes, name: str) -> SceneDescription:
             field is missing, of the wrong type, not finite or out of range. The message names file,
             field (with the object's name), value and expected value.
     """
-    reader = _Reader(name)
-    tree = reader.read_tree(data)
-    scene_name = reader.text(reader.field(tree, "scene_name"), "scene_name")
-    version = reader.text(reader.field(tree, "version"), "version")
-    if version != _VERSION:
-        raise TrilightError(f"{name}: version is {version!r}; expected {_VERSION!r}.")
-    objects = reader.field(tree, "objects")
-    if not isinstance(objects, dict):
-        reader.refuse("objects", objects, "a JSON object")
-    if not 1 <= len(objects) <= MAX_OBJECTS:
-        raise TrilightError(f"{name}: {len(objects)} objects; expected 1 to {MAX_OBJECTS}.")
-    described = tuple(reader.object(key, entry) for key, entry in objects.items())
-    cameras = reader.cameras(tree)
-    known = ("scene_name", "version", "objects", "cameras")
-    reader.unknown += [_to_text(key) for key in tree if key not in known]
+    unknown: list[str] = []
+    file = _read(_SceneFile, data, name, unknown)
     return SceneDescription(
         file=name,
-        scene_name=scene_name,
-        objects=described,
-        cameras=cameras,
-        unknown_fields=tuple(reader.unknown),
+        scene_name=file.scene_name,
+        objects=tuple(file.objects.values()),
+        cameras=file.cameras,
+        unknown_fields=tuple(unknown),
     )
 
 
@@ -95,91 +96,49 @@ def read_cameras(data: bytes, name: str) -> tuple[DescribedCamera, ...]:
     Raises:
         TrilightError: as `read_renderformer_json`, for the cameras alone.
     """
-    reader = _Reader(name)
-    return reader.cameras(reader.read_tree(data))
+    return _read(_CameraFile, data, name, []).cameras
 
 
-class _Reader:
-    """Reads the records of one file; `unknown` collects fields that none of them has.
+def _read(kind: type[Record], data: bytes, name: str, unknown: list[str]) -> Record:
+    """Return a file as a record; `unknown` receives the names of fields that no record has.
 
     So a misspelt option is reported instead of ignored.
     """
+    known = _take_known(kind, _parse_json(data, name), "", unknown)
+    for what, most in (("objects", MAX_OBJECTS), ("cameras", MAX_CAMERAS)):
+        entries = known.get(what) if isinstance(known, dict) else None
+        if isinstance(entries, list | dict) and not 1 <= len(entries) <= most:
+            raise TrilightError(f"{name}: {len(entries)} {what}; expected 1 to {most}.")
+    try:
+        return read_json(json.dumps(known), kind, name)
+    except RecursionError as error:
+        raise TrilightError(f"{name}: nested too deeply; expected a scene.") from error
 
-    def __init__(self, file: str) -> None:
-        self._file = file
-        self.unknown: list[str] = []
 
-    def read_tree(self, data: bytes) -> dict[str, Any]:
-        """Return the JSON object of the whole file."""
-        if len(data) > MAX_BYTES:
-            raise TrilightError(f"{self._file}: {len(data)} bytes; expected at most {MAX_BYTES}.")
-        tree = _parse_json(data, self._file)
-        if not isinstance(tree, dict):
-            self.refuse("the file", tree, "a JSON object")
-        return tree
-
-    def field(self, tree: dict[str, Any], name: str) -> Any:
-        """Return a field of the file, which must exist."""
-        if name not in tree:
-            raise TrilightError(f"{self._file}: {name} is missing; add it.")
-        return tree[name]
-
-    def cameras(self, tree: dict[str, Any]) -> tuple[DescribedCamera, ...]:
-        rows = self.field(tree, "cameras")
-        if not isinstance(rows, list) or not 1 <= len(rows) <= MAX_CAMERAS:
-            self.refuse("cameras", rows, f"a list of 1 to {MAX_CAMERAS} JSON objects")
-        return tuple(
-            self._record(DescribedCamera, row, f"cameras[{at}]") for at, row in enumerate(rows)
-        )
-
-    def object(self, key: str, entry: Any) -> DescribedObject:
-        where = f"objects.{key}"
-        if not key or len(key) > _MAX_TEXT or not key.isprintable():
-            self.refuse(where, key, f"a printable name of 1 to {_MAX_TEXT} letters")
-        described: DescribedObject = self._record(DescribedObject, entry, where, name=key)
-        self.text(described.mesh_path, f"{where}.mesh_path")
-        return described
-
-    def text(self, value: Any, where: str) -> str:
-        if not isinstance(value, str) or len(value) > _MAX_TEXT or not value.isprintable():
-            self.refuse(where, value, f"printable text of up to {_MAX_TEXT} letters")
+def _take_known(kind: Any, value: Any, where: str, unknown: list[str]) -> Any:
+    """Return the known fields of a record and of those in it; the name of an object is its key."""
+    if isinstance(value, list) and kind == tuple[DescribedCamera, ...]:
+        return [
+            _take_known(DescribedCamera, entry, f"{where}[{at}]", unknown)
+            for at, entry in enumerate(value)
+        ]
+    if isinstance(value, dict) and kind == Mapping[str, DescribedObject]:
+        entries = {}
+        for key, entry in value.items():
+            label = key if key.isprintable() and len(key) <= 200 else _to_text(key)
+            known = _take_known(DescribedObject, entry, f"{where}.{label}", unknown)
+            entries[label] = {**known, "name": key} if isinstance(known, dict) else known
+        return entries
+    if not group_of(kind) or not isinstance(value, dict):
         return value
-
-    def _record(self, kind: Any, value: Any, where: str, **more: str) -> Any:
-        """Return a JSON object as a record; `more` are fields that the file states elsewhere."""
-        if not isinstance(value, dict):
-            self.refuse(where, value, "a JSON object")
-        known = self._take_known(kind, value, where, more)
-        try:
-            return read_json(json.dumps(known), kind, f"{self._file}: {_to_text(where)}")
-        except RecursionError:
-            self.refuse(where, "nested too deeply", "the fields of a scene")
-        except TrilightError as error:
-            text = str(error)
-            for name, ours in _OUR_NAMES.items():
-                text = text.replace(ours, name)
-            raise TrilightError(text) from error
-
-    def _take_known(self, kind: Any, value: Any, where: str, more: dict[str, str]) -> Any:
-        """Return the fields of a record, renamed, and those of records in it; note the others."""
-        is_record = dataclasses.is_dataclass(kind) and isinstance(value, dict)
-        if not is_record:
-            return value
-        hints = {each.name: each.hint for each in describe_fields(kind) if each.name not in more}
-        known: dict[str, Any] = dict(more)
-        for key, inner in value.items():
-            name = _OUR_NAMES.get(key, key)
-            if name not in hints or key in _OUR_NAMES.values():
-                self.unknown.append(_to_text(f"{where}.{key}"))
-            else:
-                known[name] = self._take_known(hints[name], inner, f"{where}.{key}", {})
-        return known
-
-    def refuse(self, where: str, value: Any, expected: str) -> NoReturn:
-        """Raise TrilightError about a value."""
-        raise TrilightError(
-            f"{self._file}: {_to_text(where)} is {_to_text(value)}; expected {expected}."
-        )
+    hints = {each.name: each.hint for each in describe_fields(kind) if each.name != "name"}
+    paths = {key: f"{where}.{key}" if where else key for key in value}
+    unknown += [_to_text(paths[key]) for key in value if key not in hints]
+    return {
+        key: _take_known(hints[key], inner, paths[key], unknown)
+        for key, inner in value.items()
+        if key in hints
+    }
 
 
 def _to_text(value: Any) -> str:
@@ -189,6 +148,8 @@ def _to_text(value: Any) -> str:
 
 
 def _parse_json(data: bytes, name: str) -> Any:
+    if len(data) > MAX_BYTES:
+        raise TrilightError(f"{name}: too large; expected at most {MAX_BYTES} bytes.")
     try:
         return json.loads(
             data.decode("utf-8-sig"),
@@ -218,12 +179,6 @@ def _refuse_constant(text: str) -> float:
     raise Malformed(f"{text} is no JSON number")
 
 
-CARRIED = frozenset(
-    {*ARRAY_FIELDS, "objects.name", "objects.kind"} - {"materials"}
-    | {f"materials.{name}" for name in PUBLISHED_COLUMNS}
-)
-"""Members of a scene that the file holds (pipeline.exchange.formats)."""
-
 _FLAT = 1e-5
 """Largest difference between a flat face's float32 normal and its geometric normal."""
 _CLOSE = 1e-2
@@ -240,7 +195,7 @@ class DescribedFiles:
 
     json: bytes  # the scene file
     meshes: dict[str, bytes]  # OBJ files by path relative to the scene file
-    lost: tuple[str, ...]  # sentences about members in CARRIED that readers cannot restore
+    lost: tuple[str, ...]  # sentences about members in the file that readers cannot restore
 
 
 def describe_scene(scene: Scene, stem: str) -> DescribedFiles:

@@ -8,7 +8,6 @@ with limits (pipeline.isolation).
 """
 
 import contextlib
-import itertools
 import math
 import zlib
 from collections.abc import Iterator, Sequence
@@ -107,13 +106,13 @@ def iterate_blocks(array: Any) -> Iterator[tuple[tuple[slice, ...], NDArray]]:
 
     plan = array.id.get_create_plist()
     if plan.get_external_count() or plan.get_layout() == h5d.VIRTUAL:
-        raise TrilightError(f"{_name(array)}: its bytes are elsewhere; expected them in the file.")
+        raise _error(array, "its bytes are elsewhere; expected them in the file.")
     if plan.get_layout() == h5d.CHUNKED:
         yield from _iterate_chunks(array, plan)
         return
     num_bytes = math.prod(array.shape) * array.dtype.itemsize
     if array.id.get_storage_size() != num_bytes:
-        raise TrilightError(f"{_name(array)}: holds other bytes than its shape needs.")
+        raise _error(array, "holds other bytes than its shape needs.")
     if not array.shape:
         yield (), np.asarray(array[()])
         return
@@ -125,13 +124,20 @@ def iterate_blocks(array: Any) -> Iterator[tuple[tuple[slice, ...], NDArray]]:
         yield where, array[where]
 
 
-def read_whole(array: Any, most_bytes: int = MAX_BLOCK_BYTES) -> NDArray[np.float32]:
-    """Read a whole array as float32.
+def read_whole(
+    group: Any,
+    name: str,
+    shape: Sequence[int | None],
+    longest: int,
+    most_bytes: int = MAX_BLOCK_BYTES,
+) -> NDArray[np.float32]:
+    """Read a whole array of a group as float32.
 
     Raises:
-        TrilightError: a block is unusable (`iterate_blocks`), the array takes more than
-            `most_bytes`, or a value is not finite.
+        TrilightError: the array or a block is unusable (`plain_array`, `iterate_blocks`), it takes
+            more than `most_bytes`, or a value is not finite.
     """
+    array = plain_array(group, name, shape, longest)
     _require_memory(array, math.prod(array.shape) * 4, most_bytes)
     values = np.zeros(array.shape, np.float32)
     for where, block in iterate_blocks(array):
@@ -145,34 +151,26 @@ def require_finite(array: Any, values: NDArray) -> None:
     with np.errstate(over="ignore"):
         finite = np.isfinite(values.astype(np.float32))
     if not finite.all():
-        raise TrilightError(f"{_name(array)}: holds {values[~finite][0]}; expected finite values.")
+        raise _error(array, f"holds {values[~finite][0]}; expected finite values.")
 
 
 def _iterate_chunks(array: Any, plan: Any) -> Iterator[tuple[tuple[slice, ...], NDArray]]:
     size = array.chunks
     filters = [plan.get_filter(at)[0] for at in range(plan.get_nfilters())]
     if filters not in ([], [_DEFLATE], [_SHUFFLE], [_SHUFFLE, _DEFLATE]):
-        raise TrilightError(
-            f"{_name(array)}: is packed with filters {filters}; expected deflate, shuffle or none."
-        )
+        raise _error(array, f"is packed with filters {filters}; expected deflate, shuffle or none.")
     _require_memory(array, math.prod(size) * array.dtype.itemsize, MAX_BLOCK_BYTES)
     counts = [-(-length // chunk) for length, chunk in zip(array.shape, size, strict=True)]
     if math.prod(counts) > MAX_CHUNKS:
-        raise TrilightError(
-            f"{_name(array)}: has {math.prod(counts)} chunks; expected up to {MAX_CHUNKS}."
-        )
+        raise _error(array, f"has {math.prod(counts)} chunks; expected up to {MAX_CHUNKS}.")
     stored_offsets = _list_chunk_offsets(array)
-    for at in itertools.product(*(range(count) for count in counts)):
-        offset = tuple(i * chunk for i, chunk in zip(at, size, strict=True))
+    for where in array.iter_chunks():
+        offset = tuple(part.start for part in where)
         if offset not in stored_offsets:
-            raise TrilightError(f"{_name(array)}: the chunk at {list(offset)} is missing.")
+            raise _error(array, f"the chunk at {list(offset)} is missing.")
         _, packed = array.id.read_direct_chunk(offset)
         values = np.frombuffer(_unpack(array, packed, filters), array.dtype).reshape(size)
-        where = tuple(
-            slice(start, min(start + chunk, length))
-            for start, chunk, length in zip(offset, size, array.shape, strict=True)
-        )
-        yield where, values[tuple(slice(0, part.stop - part.start) for part in where)]
+        yield where, values[tuple(slice(part.stop - part.start) for part in where)]
 
 
 def _list_chunk_offsets(array: Any) -> set[tuple[int, ...]]:
@@ -195,15 +193,14 @@ def _unpack(array: Any, packed: bytes, filters: list[int]) -> bytes:
     if _DEFLATE in filters:
         inflater = zlib.decompressobj()
         try:
-            packed = inflater.decompress(
-                packed, num_bytes + 1
-            )  # one byte more than expected, whatever the data claims
+            # one byte more than expected, whatever the data claims
+            packed = inflater.decompress(packed, num_bytes + 1)
         except zlib.error as error:
-            raise TrilightError(f"{_name(array)}: a chunk is damaged.") from error
+            raise _error(array, "a chunk is damaged.") from error
         if not inflater.eof:
-            raise TrilightError(f"{_name(array)}: a chunk ends too early or too late.")
+            raise _error(array, "a chunk ends too early or too late.")
     if len(packed) != num_bytes:
-        raise TrilightError(f"{_name(array)}: a chunk holds other bytes than its shape needs.")
+        raise _error(array, "a chunk holds other bytes than its shape needs.")
     if _SHUFFLE in filters:
         planes = np.frombuffer(packed, np.uint8).reshape(array.dtype.itemsize, -1)
         packed = planes.T.tobytes()
@@ -212,13 +209,12 @@ def _unpack(array: Any, packed: bytes, filters: list[int]) -> bytes:
 
 def _require_memory(array: Any, num_bytes: int, most: int) -> None:
     if num_bytes > most:
-        raise TrilightError(
-            f"{_name(array)}: would take {num_bytes} bytes at once; expected at most {most}."
-        )
+        raise _error(array, f"would take {num_bytes} bytes at once; expected at most {most}.")
 
 
-def _name(array: Any) -> str:
-    return str(array.name).removeprefix("/")
+def _error(array: Any, text: str) -> TrilightError:
+    """Return an error of an array, whose name begins its message."""
+    return TrilightError(f"{str(array.name).removeprefix('/')}: {text}")
 
 
 def _format_shape(shape: Sequence[int | None]) -> str:

@@ -6,7 +6,6 @@ changed bytes. Scene k is the k-th `*.json` of the folder by name. An unusable f
 number: that scene is rejected, and a row of failures.jsonl states the reason.
 """
 
-import stat
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -26,6 +25,7 @@ from pipeline.exchange.renderformer_json import MAX_BYTES, read_cameras, read_re
 from pipeline.foreign.material_files import find_in_any_case
 from storage.digests import sha256_hex
 from storage.errors import EnvironmentFailure, Rejected, TrilightError
+from storage.records.safe_read import open_plain
 from storage.records.scene import Scene
 
 TEMPLATE = "renderformer-json"
@@ -87,11 +87,7 @@ def read_scene_cameras(root: Path, name: str) -> tuple[NDArray[np.float32], NDAr
     Raises:
         TrilightError: the file or a camera in it is unusable; the message names it.
     """
-    cameras = read_cameras(_read_scene_file(root, name), name)
-    try:
-        return build_cameras(cameras)
-    except TrilightError as error:
-        raise TrilightError(f"{name}: {error}") from error
+    return build_cameras(read_cameras(_read_scene_file(root, name), name), name)
 
 
 def build_scene(
@@ -100,9 +96,9 @@ def build_scene(
     settings: AssetSettings,
     *,
     licence: str,
-    num_views: int | None,
-    scene_index: int,
-    seed: int,
+    num_views: int | None = None,
+    scene_index: int = 0,
+    seed: int = 0,
     albedo_over_one: AlbedoOverOne = "scale",
     notes: list[str] | None = None,
 ) -> tuple[Scene, Mapping[str, str]]:
@@ -205,12 +201,10 @@ def load_mesh_file(
 
 
 def _read_scene_file(root: Path, name: str) -> bytes:
-    path = _below(root, name, name)
+    """Return the bytes of a scene file, as many as its reader accepts and one more."""
     try:
-        status = path.stat()
-        if not stat.S_ISREG(status.st_mode) or status.st_size > MAX_BYTES:
-            raise TrilightError(f"{name}: expected a regular file of at most {MAX_BYTES} bytes.")
-        return path.read_bytes()
+        with open_plain(_below(root, name, name)) as stream:
+            return stream.read(MAX_BYTES + 1)
     except OSError as error:
         raise TrilightError(f"{name}: cannot be read ({error.strerror}).") from error
 

@@ -7,7 +7,6 @@ reader of a scene format returns.
 
 import dataclasses
 import math
-from collections import Counter
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
@@ -25,9 +24,8 @@ from storage.records.material import (
     ROUGHNESS,
     default_rows,
     distinct_rows,
-    laid_out,
 )
-from storage.records.retextured import with_textures
+from storage.records.retextured import with_textures, without_constant_textures
 from storage.records.scene import ObjectKind, Scene, SceneObject
 from storage.records.texture import CONSTANT, TEXTURED, Texture
 
@@ -91,30 +89,14 @@ def join_triangles(
 ) -> TexturedTriangles:
     """Return the triangles of several parts, in the order of `places` [T], which they cover."""
     order = np.argsort(np.concatenate(places), kind="stable")
-    starts = np.cumsum([0, *(len(part.texture_sets) for part in parts)])
-    shifted = [
-        dataclasses.replace(part, texture_set_index=part.texture_set_index + start)
-        for part, start in zip(parts, starts, strict=False)
-    ]
     arrays: dict[str, Any] = {
-        name: np.concatenate([getattr(part, name) for part in shifted])[order]
+        name: np.concatenate([getattr(part, name) for part in parts])[order]
         for name in _PER_TRIANGLE
     }
-    return TexturedTriangles(
-        **arrays, texture_sets=[each for part in parts for each in part.texture_sets]
-    )
-
-
-@dataclass(frozen=True, kw_only=True, eq=False)
-class _Piece:
-    """An object of a scene with its textures."""
-
-    piece: ScenePiece
-    """Geometry and material rows of the object."""
-    uv: NDArray[np.float32]
-    """[T, 3, 2] texture coordinates of the corners."""
-    texture_sets: tuple[TextureSet, ...]
-    """Texture set of each material row of `piece`."""
+    starts = np.cumsum([0, *(len(part.texture_sets) for part in parts)])[:-1]
+    arrays["texture_set_index"] += np.repeat(starts, list(map(len, places)))[order]
+    texture_sets = [each for part in parts for each in part.texture_sets]
+    return TexturedTriangles(**arrays, texture_sets=texture_sets)
 
 
 def index_corners(
@@ -126,26 +108,6 @@ def index_corners(
     vertices = corners[first]
     faces = rows.astype(np.uint32).reshape(-1, 3)
     return vertices[:, :3].copy(), vertices[:, 3:].copy(), faces
-
-
-def _build_piece(entry: SceneObject, triangles: TexturedTriangles) -> _Piece:
-    """Build an object of a scene from its triangles."""
-    positions, normals, faces = index_corners(triangles.positions, triangles.normals)
-    rows = _with_means(triangles)
-    appearance = np.column_stack([rows, triangles.texture_set_index.astype(np.float32)])
-    palette, material_index = distinct_rows(appearance)
-    groups = np.zeros(len(faces), np.int64)
-    mesh = ShadedMesh(positions=positions, normals=normals, faces=faces, groups=groups)
-    return _Piece(
-        piece=ScenePiece(
-            entry=entry, mesh=mesh, materials=rows[palette], material_index=material_index
-        ),
-        uv=triangles.uv,
-        texture_sets=tuple(
-            _drop_constant_textures(triangles.texture_sets[row])
-            for row in triangles.texture_set_index[palette]
-        ),
-    )
 
 
 def build_lamp(
@@ -166,27 +128,6 @@ def build_lamp(
         texture_set_index=np.zeros(count, np.int64),
         texture_sets=(NO_TEXTURES,),
     )
-
-
-def _with_means(triangles: TexturedTriangles) -> NDArray[np.float32]:
-    """Return the rows with the means of textures, so that equal materials have equal rows."""
-    rows = triangles.rows.copy()
-    column_slices = {column.name: part for column, part in laid_out()}
-    for number, texture_set in enumerate(triangles.texture_sets):
-        chosen = np.flatnonzero(triangles.texture_set_index == number)
-        for name, texture in zip(TEXTURED, texture_set, strict=True):
-            if texture is not None and len(chosen):
-                same = texture.constant
-                rows[chosen, column_slices[name]] = texture.mean if same is None else same
-    return rows
-
-
-def _drop_constant_textures(textures: TextureSet) -> TextureSet:
-    """Replace textures of one color by None; the material columns hold their values."""
-    one, two, three = (
-        None if texture is None or texture.constant is not None else texture for texture in textures
-    )
-    return one, two, three
 
 
 def _fit_camera(points: NDArray[np.float32]) -> tuple[NDArray[np.float64], float]:
@@ -231,9 +172,11 @@ class SceneParts:
     def __init__(self, file: str) -> None:
         self._file = file
         self._names: dict[str, int] = {}
-        self._pieces: list[_Piece] = []
-        self._surfaces: list[_Piece] = []
-        self._counts = Counter[str]()
+        self._pieces: list[ScenePiece] = []
+        self._surfaces: list[ScenePiece] = []
+        self._uv: list[NDArray[np.float32]] = []
+        self._texture_sets: list[TextureSet] = []  # of each material row
+        self._num_triangles = 0
 
     def add(
         self, entry: SceneObject, triangles: TexturedTriangles, *, is_lamp: bool = False
@@ -249,24 +192,37 @@ class SceneParts:
         for kind, mask in kinds:
             if not mask.any():
                 continue
-            unique = dataclasses.replace(
-                entry, name=unique_name(entry.name, self._names), kind=kind
-            )
-            piece = _build_piece(unique, triangles.select(mask))
-            self._pieces.append(piece)
-            self._surfaces += [] if is_lamp else [piece]
-            self._counts["triangles"] += len(piece.piece.mesh.faces)
-            self._counts["materials"] += len(piece.piece.materials)
-            self._counts["objects"] += 1
-        for what, count in self._counts.items():
-            most = MAX_TRIANGLES if what == "triangles" else MAX_ROWS
+            name = unique_name(entry.name, self._names)
+            unique = dataclasses.replace(entry, name=name, kind=kind)
+            self._add_piece(unique, triangles.select(mask))
+            self._surfaces += [] if is_lamp else self._pieces[-1:]
+        for what, count, most in (
+            ("triangles", self._num_triangles, MAX_TRIANGLES),
+            ("materials", len(self._texture_sets), MAX_ROWS),
+            ("objects", len(self._pieces), MAX_ROWS),
+        ):
             if count > most:
                 raise TrilightError(f"{self._file}: more than {most} {what}.")
+
+    def _add_piece(self, entry: SceneObject, triangles: TexturedTriangles) -> None:
+        positions, normals, faces = index_corners(triangles.positions, triangles.normals)
+        rows = triangles.rows
+        appearance = np.column_stack([rows, triangles.texture_set_index.astype(np.float32)])
+        palette, index = distinct_rows(appearance)
+        groups = np.zeros(len(faces), np.int64)
+        mesh = ShadedMesh(positions=positions, normals=normals, faces=faces, groups=groups)
+        self._pieces.append(
+            ScenePiece(entry=entry, mesh=mesh, materials=rows[palette], material_index=index)
+        )
+        self._uv.append(triangles.uv)
+        set_index = triangles.texture_set_index[palette]
+        self._texture_sets += [triangles.texture_sets[row] for row in set_index]
+        self._num_triangles += len(faces)
 
     @property
     def has_emitters(self) -> bool:
         """Return whether any triangle emits."""
-        return any(one.piece.entry.kind == "emitter" for one in self._pieces)
+        return any(piece.entry.kind == "emitter" for piece in self._pieces)
 
     def surface_points(self) -> NDArray[np.float32]:
         """Return the vertices [V, 3] of all objects; lamps count where nothing else is.
@@ -277,29 +233,30 @@ class SceneParts:
         pieces = self._surfaces or self._pieces
         if not pieces:
             raise TrilightError(f"{self._file}: no triangle with an area is placed.")
-        return np.concatenate([one.piece.mesh.positions for one in pieces])
+        return np.concatenate([piece.mesh.positions for piece in pieces])
 
     def build(
         self,
-        cameras: Sequence[tuple[NDArray[np.float64], float]],
+        cameras: Sequence[tuple[NDArray[np.float64], float] | None],
         sky: Environment | None,
         provenance: Mapping[str, Any],
         lost: list[str],
     ) -> Scene:
         """Build and check the scene; a camera that sees everything is added where there is none.
 
-        `cameras` has the pose [4, 4] and full angle in degrees of each, `sky` the environment, if
-        any; `lost` receives a sentence for each loss.
+        `cameras` has the pose [4, 4] and full angle in degrees of each, or None for one that is
+        left out, `sky` the environment, if any; `lost` receives a sentence for each loss.
         """
         points = self.surface_points()
-        if not cameras:
+        usable = [camera for camera in cameras if camera is not None]
+        if not usable:
             lost.append("no camera: one was added that sees everything")
-            cameras = [_fit_camera(points)]
+            usable = [_fit_camera(points)]
         scene = Scene(
-            **concatenate_pieces([one.piece for one in self._pieces]),
-            objects=tuple(one.piece.entry for one in self._pieces),
-            c2w=np.stack([pose for pose, _ in cameras]).astype(np.float32),
-            fov_deg=np.array([angle for _, angle in cameras], np.float32),
+            **concatenate_pieces(self._pieces),
+            objects=tuple(piece.entry for piece in self._pieces),
+            c2w=np.stack([pose for pose, _ in usable]).astype(np.float32),
+            fov_deg=np.array([angle for _, angle in usable], np.float32),
             provenance=provenance,
             environment=sky,
         )
@@ -308,17 +265,17 @@ class SceneParts:
         return scene
 
     def _with_textures(self, scene: Scene) -> Scene:
+        sets = self._texture_sets
         textures: dict[str, Texture] = {}
-        sets = [texture_set for each in self._pieces for texture_set in each.texture_sets]
         for texture in (texture for texture_set in sets for texture in texture_set if texture):
             textures.setdefault(texture.sha256, texture)
         if not textures:
             return scene
         order = {sha256: row for row, sha256 in enumerate(textures)}
         index = [[order[each.sha256] if each else CONSTANT for each in row] for row in sets]
-        uv = np.concatenate([each.uv.reshape(-1, 2) for each in self._pieces]).astype(np.float32)
+        uv = np.concatenate(self._uv).reshape(-1, 2).astype(np.float32)
         rows = np.array(index, np.int32).reshape(-1, len(TEXTURED))
-        return with_textures(scene, uv, tuple(textures.values()), rows)
+        return without_constant_textures(with_textures(scene, uv, tuple(textures.values()), rows))
 
 
 def unique_name(base: str, counts: dict[str, int], key: Callable[[str], str] = str) -> str:

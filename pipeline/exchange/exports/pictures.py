@@ -1,4 +1,4 @@
-"""Exports as folders of pictures, for nerfstudio, `datasets` and COCO; writers of PNG and JSON.
+"""Exports as folders of pictures, for nerfstudio, `datasets` and COCO.
 
 A scene stands alone where nothing is behind its objects: no floor, no wall, no sky that cameras
 see. Its pictures get alpha, and pictures of normals and albedo beside them.
@@ -33,7 +33,7 @@ https://cocodataset.org/#format-data
 
 import io
 import json
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -84,8 +84,9 @@ def _frame(folder: Path, sample: Sample, view: int) -> dict[str, Any]:
     stream = io.BytesIO()
     np.save(stream, np.where(np.isfinite(depth), depth * _MM, np.float32(0)))
     write_atomically(folder / f"depths/{view}.npy", stream.getvalue())
-    picture = folder / f"images/{view}.png"
-    surfaces = _write_view(sample, view, picture, lambda name: folder / f"{name}s/{view}.png")
+    pngs = _encode_pngs(sample, view)
+    for name, data in pngs.items():
+        write_atomically(folder / f"{name}s/{view}.png", data)
     focal = float(focal_px(float(scene.fov_deg[view]), resolution))
     return {
         "file_path": f"images/{view}.png",
@@ -97,7 +98,7 @@ def _frame(folder: Path, sample: Sample, view: int) -> dict[str, Any]:
         "cy": resolution / 2,
         "w": resolution,
         "h": resolution,
-        **{f"{name}_file_path": f"{name}s/{view}.png" for name in surfaces},
+        **{f"{name}_file_path": f"{name}s/{view}.png" for name in pngs if name != "image"},
     }
 
 
@@ -105,17 +106,19 @@ def _row(folder: Path, sample: Sample, view: int) -> dict[str, Any]:
     scene = sample.scene
     record = sample.views[view]
     name = f"{sample.key}.{view}"
-    picture = folder / f"{name}.png"
-    surfaces = _write_view(sample, view, picture, lambda column: folder / f"{name}.{column}.png")
+    image, *surfaces = _encode_pngs(sample, view).items()
     passes = sample.view_passes(list(_PASSES.values()), view=view)
+    files = {"file_name": (f"{name}.png", image[1])}
     for column, pass_name in _PASSES.items():
         stream = io.BytesIO()
         Image.fromarray(passes[pass_name]).save(stream, "TIFF")  # lossless, 32 bits
-        write_atomically(folder / f"{name}.{column}.tiff", stream.getvalue())
+        files[f"{column}_file_name"] = (f"{name}.{column}.tiff", stream.getvalue())
+    for column, data in surfaces:
+        files[f"{column}_file_name"] = (f"{name}.{column}.png", data)
+    for path, data in files.values():
+        write_atomically(folder / path, data)
     return {
-        "file_name": f"{name}.png",
-        **{f"{column}_file_name": f"{name}.{column}.tiff" for column in _PASSES},
-        **{f"{column}_file_name": f"{name}.{column}.png" for column in surfaces},
+        **{column: path for column, (path, _) in files.items()},
         "scene": sample.key,
         "view": view,
         "c2w": scene.c2w[view].tolist(),
@@ -127,18 +130,6 @@ def _row(folder: Path, sample: Sample, view: int) -> dict[str, Any]:
     }
 
 
-def _write_view(
-    sample: Sample, view: int, picture: Path, surface: Callable[[str], Path]
-) -> list[str]:
-    """Write the picture of a view, and of its surfaces by name if its scene stands alone."""
-    alone = stands_alone(sample.scene)
-    write_png(picture, sample, view, alpha=alone)
-    surfaces = _surface_pictures(sample, view) if alone else {}
-    for name, pixels in surfaces.items():
-        write_atomically(surface(name), encode_png(pixels))
-    return list(surfaces)
-
-
 def stands_alone(scene: Scene) -> bool:
     """Return whether nothing is behind the objects of a scene."""
     sky = scene.environment
@@ -146,16 +137,17 @@ def stands_alone(scene: Scene) -> bool:
     return not has_shell and not (sky is not None and sky.is_seen)
 
 
-def write_png(path: Path, sample: Sample, view: int, *, alpha: bool = False) -> None:
-    """Write the picture of a view as 8-bit sRGB; radiance above 1 is clipped.
+def _encode_pngs(sample: Sample, view: int) -> dict[str, bytes]:
+    """Return the picture of a view as 8-bit sRGB, `image`; radiance above 1 is clipped.
 
-    `alpha` writes RGBA, of a scene that stands alone. Colors are straight: those of the surface
-    alone, without the black around it. Alpha is the share of 16 rays that meet a surface.
+    That of a scene that stands alone is RGBA. Its colors are straight: those of the surface alone,
+    without the black around it. Alpha is the share of 16 rays that meet a surface. It comes with
+    pictures of what the surfaces are, black where there is none. `normal`: the shading normal in
+    world axes, -1 to 1 as 0 to 255. `albedo`: diffuse and specular albedo together, sRGB-encoded.
     """
     radiance_rgb = sample.radiance_rgb[view]
-    if not alpha:
-        write_atomically(path, encode_png(preview_srgb8(radiance_rgb)))
-        return
+    if not stands_alone(sample.scene):
+        return {"image": encode_png(preview_srgb8(radiance_rgb))}
     resolution = len(radiance_rgb)
     seen = view_passes(
         sample.scene, ["coverage"], view=view, resolution=resolution, rays_a_side=_ALPHA_RAYS
@@ -163,19 +155,14 @@ def write_png(path: Path, sample: Sample, view: int, *, alpha: bool = False) -> 
     surface_rgb = radiance_rgb / np.where(seen > 0, seen, 1)[..., None]
     alpha8 = np.round(255 * seen[..., None]).astype(np.uint8)
     rgba = np.concatenate([preview_srgb8(surface_rgb), alpha8], axis=-1)
-    write_atomically(path, encode_png(np.where(alpha8 > 0, rgba, 0).astype(np.uint8)))
-
-
-def _surface_pictures(sample: Sample, view: int) -> dict[str, NDArray[np.uint8]]:
-    """Return 8-bit pictures [R, R, 3] of what a view's surfaces are, black where there is none.
-
-    `normal`: the shading normal in world axes, -1 to 1 as 0 to 255. `albedo`: diffuse and specular
-    albedo together, sRGB-encoded.
-    """
     names = ["shading_normal", "material_diffuse", "material_specular"]
     normal, diffuse, specular = sample.view_passes(names, view=view).values()
-    rgb8 = np.nan_to_num(np.round((normal + 1) * 127.5)).astype(np.uint8)
-    return {"normal": rgb8, "albedo": srgb8(np.nan_to_num(diffuse + specular))}
+    pictures = {
+        "image": np.where(alpha8 > 0, rgba, 0).astype(np.uint8),
+        "normal": np.nan_to_num(np.round((normal + 1) * 127.5)).astype(np.uint8),
+        "albedo": srgb8(np.nan_to_num(diffuse + specular)),
+    }
+    return {name: encode_png(pixels) for name, pixels in pictures.items()}
 
 
 def write_json(path: Path, value: Any) -> None:
@@ -194,7 +181,8 @@ def write_coco(samples: Iterator[tuple[str, Sample]], out: Path) -> None:
         tables = splits.setdefault(split, {"images": [], "annotations": []})
         for view in range(sample.scene.num_views):
             name = f"{sample.key}.{view}.png"
-            write_png(out / split / name, sample, view)
+            preview = preview_srgb8(sample.radiance_rgb[view])
+            write_atomically(out / split / name, encode_png(preview))
             size = sample.radiance_rgb.shape[2]
             image_id = len(tables["images"]) + 1
             tables["images"].append(

@@ -52,9 +52,7 @@ def _write_sample(form: str, sample: Sample, folder: Path) -> Sequence[str]:
 
 def write_scenes(samples: Iterator[tuple[str, Sample]], out: Path, form: str) -> Sequence[str]:
     """Write every sample in one format into a folder; return sentences about losses."""
-    lost: dict[str, None] = {}
-    for _, sample in samples:
-        lost |= dict.fromkeys(_write_sample(form, sample, out))
+    lost = dict.fromkeys(text for _, each in samples for text in _write_sample(form, each, out))
     return _limit_notes(form, list(lost))
 
 

@@ -30,7 +30,6 @@ from pipeline.foreign.gltf.materials import DEFAULT, GltfMaterials
 from pipeline.foreign.gltf.nodes import PlacedNode, entry, extension, placed_nodes
 from pipeline.foreign.gltf.primitives import PlacedPrimitive, placed_primitives
 from pipeline.foreign.limits import ReadLimits
-from pipeline.foreign.material import SourceMaterial
 from pipeline.foreign.numbers import read_number, read_numbers
 from pipeline.foreign.source_file import read_source
 from storage.conventions import latlong_direction, latlong_uv
@@ -76,6 +75,7 @@ class _GltfReader:
         self.name = name
         self.licence = licence
         self.lost: list[str] = []
+        self._attribution = str(document.tree.get("asset", {}).get("copyright", ""))[:1000]
         self._converter = PartConverter(self.lost)
         self._materials = GltfMaterials(
             document,
@@ -91,7 +91,12 @@ class _GltfReader:
         visible = [placed for placed in nodes if placed.is_visible]
         parts = SceneParts(self.name)
         for placed in visible:
-            self._add_mesh(placed, parts)
+            if "mesh" not in placed.node:
+                continue
+            mesh = entry(tree, "meshes", placed.node["mesh"])
+            name = placed.node.get("name") or mesh.get("name") or "object"
+            for primitive in placed_primitives(self.document, placed):
+                parts.add(self._entry(name), self._triangles(primitive))
         reach = float(np.linalg.norm(np.ptp(parts.surface_points(), axis=0)))
         suns = []
         for placed in visible:
@@ -110,23 +115,9 @@ class _GltfReader:
             self.lost.append("no light: an even sky of radiance 1 lights it")
             radiance_rgb = np.ones((1, 2, 3), np.float32)
             sky = Environment(radiance_rgb=radiance_rgb, source=MapSource(name="even light"))
-        usable = [camera for camera in cameras if camera is not None]
-        scene = parts.build(usable, sky, {"template": "gltf", "file": self.name}, self.lost)
+        scene = parts.build(cameras, sky, {"template": "gltf", "file": self.name}, self.lost)
         notes = dict.fromkeys([*self.document.unread, *self.lost])
         return LoadedScene(scene=scene, notes=tuple(notes))
-
-    def _add_mesh(self, placed: PlacedNode, parts: SceneParts) -> None:
-        if "mesh" not in placed.node:
-            return
-        mesh = entry(self.document.tree, "meshes", placed.node["mesh"])
-        name = placed.node.get("name") or mesh.get("name") or "object"
-        for primitive in placed_primitives(self.document, placed):
-            parts.add(self._entry(name), self._triangles(primitive))
-
-    def _material(self, number: int | None) -> SourceMaterial:
-        material = DEFAULT if number is None else self._materials.material(number)
-        self.lost += [f"{word} of materials" for word in material.lost if word != "emission"]
-        return material
 
     def _triangles(self, primitive: PlacedPrimitive) -> TexturedTriangles:
         corners = primitive.positions[primitive.faces]
@@ -147,16 +138,18 @@ class _GltfReader:
 
         number = primitive.material
         row = {} if number is None else entry(self.document.tree, "materials", number)
+        material = DEFAULT if number is None else self._materials.material(number)
+        self.lost += [f"{word} of materials" for word in material.lost if word != "emission"]
         part = Part(
             where="",
-            material=self._material(number),
+            material=material,
             positions=positions,
             normals=unit_normals(select(primitive.normals), flat),
             coordinates=coordinates,
             colors=select(primitive.colors),
         )
         name = str(row.get("name", ""))[:200]
-        source = MapSource(name=name, licence=self.licence, attribution=self._attribution())
+        source = MapSource(name=name, licence=self.licence, attribution=self._attribution)
         return self._converter.convert(part, source)
 
     def _light(self, placed: PlacedNode) -> dict[str, Any] | None:
@@ -168,15 +161,12 @@ class _GltfReader:
             extension(self.document.tree, "KHR_lights_punctual"), "lights", reference["light"]
         )
 
-    def _attribution(self) -> str:
-        return str(self.document.tree.get("asset", {}).get("copyright", ""))[:1000]
-
     def _entry(self, stated: Any) -> SceneObject:
         return SceneObject(
             name=str(stated)[:200].replace("\0", "_"),
             kind="object",
             licence=self.licence,
-            attribution=self._attribution(),
+            attribution=self._attribution,
         )
 
 

@@ -27,15 +27,9 @@ from pipeline.exchange.linear_maps import (
 from pipeline.exchange.textured_triangles import group_triangles
 from storage.atomic import write_atomically
 from storage.conventions import srgb8
-from storage.records.material import DIFFUSE, EMISSION, PUBLISHED_COLUMNS, ROUGHNESS, SPECULAR
-from storage.records.scene import ARRAY_FIELDS, Scene
+from storage.records.material import EMISSION, column_places
+from storage.records.scene import Scene
 from storage.records.texture import CONSTANT, NORMAL, TEXTURED, Texture
-
-CARRIED = frozenset(
-    {*ARRAY_FIELDS, "objects.name", "objects.kind", "textures", "normal_textures"} - {"materials"}
-    | {f"materials.{name}" for name in PUBLISHED_COLUMNS}
-)
-"""Members of a scene that the file holds (pipeline.exchange.formats)."""
 
 _TO_Y_UP = (-(0.5**0.5), 0.0, 0.0, 0.5**0.5)
 """Quaternion of the root node, which rotates +Z up to the +Y up of glTF."""
@@ -44,15 +38,14 @@ MOST_SPECULAR = 25.0
 """Specular factor of a mirror: 25 times the F0 = 0.04 of an ordinary dielectric."""
 _JSON = 0x4E4F534A
 _BIN = 0x004E4942
-FLOAT = 5126
-UNSIGNED = 5125
+_COMPONENTS = {"f": 5126, "u": 5125}
 """Component types of glTF accessors: float32, and unsigned 32-bit integers."""
 
 _USED = ["KHR_materials_specular", "KHR_materials_emissive_strength"]
 
 
 def write_gltf(path: Path, scene: Scene) -> tuple[str, ...]:
-    """Write a scene, and return sentences about members in CARRIED that lose something.
+    """Write a scene, and return sentences about members in it that lose something.
 
     Args:
         path: ends in `.glb`.
@@ -154,13 +147,13 @@ def _primitive(
     """Return the JSON of positions and normals [V, 3], and coordinates [V, 2] with v up."""
     points = points.astype("<f4")
     bounds = {"min": points.min(axis=0).tolist(), "max": points.max(axis=0).tolist()}
-    attributes = {"POSITION": file.accessor(points, "VEC3", FLOAT, bounds)}
+    attributes = {"POSITION": file.accessor(points, bounds)}
     if normals is not None:
-        attributes["NORMAL"] = file.accessor(normals.astype("<f4"), "VEC3", FLOAT)
+        attributes["NORMAL"] = file.accessor(normals.astype("<f4"))
     if uv is not None:
         from_top = np.stack([uv[:, 0], 1 - uv[:, 1]], axis=1).astype("<f4")
-        attributes["TEXCOORD_0"] = file.accessor(from_top, "VEC2", FLOAT)
-    index = file.accessor(indices.astype("<u4"), "SCALAR", UNSIGNED)
+        attributes["TEXCOORD_0"] = file.accessor(from_top)
+    index = file.accessor(indices.astype("<u4"))
     return {"attributes": attributes, "indices": index, "material": material}
 
 
@@ -204,8 +197,8 @@ def _material(
 
 def _maps(scene: Scene, row: int) -> Mapping[str, Map]:
     """Return the map of each column of a material that may be textured, and its normal map."""
-    column_slices = {"diffuse": DIFFUSE, "specular": SPECULAR, "roughness": ROUGHNESS}
-    maps = {name: constant_map(scene.materials[row, part]) for name, part in column_slices.items()}
+    places = column_places()
+    maps = {name: constant_map(scene.materials[row, places[name]]) for name in TEXTURED}
     if scene.material_textures is not None:
         for name, texture in zip(TEXTURED, scene.material_textures[row], strict=True):
             if texture >= 0:
@@ -229,12 +222,15 @@ class GlbFile:
         }
         self._data = bytearray()
 
-    def accessor(
-        self, values: NDArray, kind: str, component: int, more: Mapping[str, Any] | None = None
-    ) -> int:
-        """Add an array of numbers; return the index of its accessor."""
-        entry = {"bufferView": self._view(values.tobytes()), "componentType": component}
-        self.tree["accessors"].append({**entry, "count": len(values), "type": kind, **(more or {})})
+    def accessor(self, values: NDArray, more: Mapping[str, Any] | None = None) -> int:
+        """Add an array of numbers or vectors; return the index of its accessor."""
+        entry = {
+            "bufferView": self._view(values.tobytes()),
+            "componentType": _COMPONENTS[values.dtype.kind],
+            "count": len(values),
+            "type": "SCALAR" if values.ndim == 1 else f"VEC{values.shape[1]}",
+        }
+        self.tree["accessors"].append({**entry, **(more or {})})
         return len(self.tree["accessors"]) - 1
 
     def picture(self, values: NDArray[np.uint8]) -> int:

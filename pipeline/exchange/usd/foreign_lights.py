@@ -8,14 +8,14 @@ disks of USD emit to one, so a note is added.
 
 import dataclasses
 import math
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from pipeline.exchange.pictures import MAX_BYTES, decode_pixels, linear_rgb
-from pipeline.exchange.usd import prim_names as names
+from pipeline.exchange.usd import layout
 from pipeline.foreign.numbers import FINITE, read_number, read_numbers
 from pipeline.foreign.usd.placed import PlacedPrim
 from pipeline.foreign.usd.stage import OpenedStage
@@ -39,6 +39,8 @@ _NEUTRAL: Mapping[str, Any] = {
 }
 """Unsupported inputs, each with the value at which it has no effect."""
 
+_OLD_NAMES = ("intensity", "exposure", "color", "normalize", "radius", "width", "height")
+"""Names of inputs in stages of old programs."""
 
 _EXPOSURES = Within(-1000, 1000, unit="stops")
 
@@ -47,17 +49,9 @@ def light_triangles(placed: PlacedPrim, time: Any, lost: list[str]) -> NDArray[n
     """Return the world-space triangles [T, 3, 3] of a light; None where it has no area."""
     prim = placed.prim
     kind = str(prim.GetTypeName())
-
-    def size(name: str) -> float:
-        return _read(prim.GetAttribute(f"inputs:{name}"), time)
-
-    shapes: Mapping[str, Callable[[], NDArray[np.float64]]] = {
-        "RectLight": lambda: _square() * np.array([size("width"), size("height"), 1.0]),
-        "DiskLight": lambda: _disk() * size("radius"),
-        "SphereLight": lambda: _sphere() * size("radius"),
-        "CylinderLight": lambda: _build_tube() * [size("length"), size("radius"), size("radius")],
-    }
-    world = np.einsum("ij,tcj->tci", placed.to_world[:3, :3], shapes[kind]())
+    shape, sizes = _SHAPES[kind]
+    scale = [_read(prim.GetAttribute(f"inputs:{name}"), time) for name in sizes]
+    world = np.einsum("ij,tcj->tci", placed.to_world[:3, :3], shape() * np.array([*scale, 1.0][:3]))
     world = world + placed.to_world[:3, 3]
     area = sum_area(world)
     if not area > 0 or not np.isfinite(area):
@@ -110,30 +104,23 @@ def _read(attribute: Any, time: Any, within: Within = FINITE) -> float:
 
 def _note_losses(prim: Any, time: Any, lost: list[str]) -> None:
     where = prim.GetPath()
-    for name, neutral in _NEUTRAL.items():
-        attribute = prim.GetAttribute(name)
-        value = attribute.Get(time) if attribute and attribute.HasAuthoredValue() else None
-        if value is not None and value != neutral:
+    files = {"inputs:texture:file", "inputs:shaping:ies:file"}
+    if "Dome" in str(prim.GetTypeName()):
+        files.remove(layout.MAP_PATH)
+    for attribute in prim.GetAuthoredAttributes():
+        name = attribute.GetName()
+        value = attribute.Get(time)
+        is_lost = value is not None and value != _NEUTRAL.get(name, value)
+        if is_lost or (name in files and value and value.path):
             lost.append(f"{where}.{name}: has no place here")
-    for name in ("inputs:texture:file", "inputs:shaping:ies:file"):
-        attribute = prim.GetAttribute(name)
-        is_map = "Dome" in str(prim.GetTypeName()) and name == "inputs:texture:file"
-        if not is_map and attribute and attribute.Get(time) and attribute.Get(time).path:
-            lost.append(f"{where}.{name}: has no place here")
-    lost += [
-        f"{where}.{name}: USD has read inputs:{name} alone since 21.02"
-        for name in ("intensity", "exposure", "color", "normalize", "radius", "width", "height")
-        if prim.HasAttribute(name) and prim.GetAttribute(name).HasAuthoredValue()
-    ]
+        if name in _OLD_NAMES:
+            lost.append(f"{where}.{name}: USD has read inputs:{name} alone since 21.02")
+        if attribute.HasAuthoredConnections():
+            lost.append(f"{where}.{name}: a network that is not read")
     for relation in prim.GetRelationships():
         is_link = relation.GetName().startswith(("light:filters", "portals", "collection:"))
         if is_link and relation.HasAuthoredTargets():
             lost.append(f"{where}.{relation.GetName()}: has no place here")
-    lost += [
-        f"{where}.{attribute.GetName()}: a network that is not read"
-        for attribute in prim.GetAttributes()
-        if attribute.HasAuthoredConnections()
-    ]
 
 
 def sum_area(triangles: NDArray[np.floating]) -> float:
@@ -190,6 +177,14 @@ def _sphere() -> NDArray[np.float64]:
     return faces * math.sqrt(4 * math.pi / sum_area(faces))
 
 
+_SHAPES: Mapping[str, tuple[Callable[[], NDArray[np.float64]], Sequence[str]]] = {
+    "RectLight": (_square, ("width", "height")),
+    "DiskLight": (_disk, ("radius", "radius")),
+    "SphereLight": (_sphere, ("radius", "radius", "radius")),
+    "CylinderLight": (_build_tube, ("length", "radius", "radius")),
+}
+"""Shape of each light, and its sizes along the axes of the light."""
+
 _SAME_ROTATION = 1e-5
 """Tolerance for a rotation that Trilight wrote: other programs keep angles in float32."""
 
@@ -214,10 +209,10 @@ def read_foreign_dome(
     if np.linalg.det(rotation) < 0:
         opened.lost.append(f"{prim_path}: a mirrored dome; its light was left out")
         return None
-    visibility = prim.GetAttribute(names.VISIBLE_TO_CAMERA)
+    visibility = prim.GetAttribute(layout.VISIBLE_TO_CAMERA)
     sky = Environment(
         radiance_rgb=tinted.astype(np.float32),
-        rotation=(rotation @ names.TO_OUR_AXES.T).astype(np.float32),
+        rotation=(rotation @ layout.TO_OUR_AXES.T).astype(np.float32),
         is_seen=bool(visibility and visibility.Get(time)),
         source=MapSource(name=prim.GetName(), licence=licence),
     )
@@ -232,20 +227,20 @@ def read_foreign_dome(
 def _take_held(sky: Environment, dome: Any, time: Any) -> Environment:
     """Return an environment with the values that Trilight wrote on the prim of the scene."""
     stage = dome.GetStage()
-    holder = next((prim for prim in stage.Traverse() if prim.HasAttribute(names.SKY_SOURCE)), None)
+    holder = next((prim for prim in stage.Traverse() if prim.HasAttribute(layout.SKY_SOURCE)), None)
     if holder is None:
         return sky
 
     def read_value(name: str) -> Any:
         return holder.GetAttribute(name).Get(time)
 
-    held = names.parse_map_text(read_value(names.SKY_SOURCE))
+    held = layout.parse_map_text(read_value(layout.SKY_SOURCE))
     if held is None or held[0] != sky.sha256:
         return sky
     sky = dataclasses.replace(sky, source=held[1])
-    if not dome.HasAttribute(names.VISIBLE_TO_CAMERA):
-        sky = dataclasses.replace(sky, is_seen=bool(read_value(names.SKY_VISIBLE)))
-    rows = list(map(read_value, names.SKY_ROWS))
+    if not dome.HasAttribute(layout.VISIBLE_TO_CAMERA):
+        sky = dataclasses.replace(sky, is_seen=bool(read_value(layout.SKY_VISIBLE)))
+    rows = list(map(read_value, layout.SKY_ROWS))
     if None in rows or not np.allclose(rows, sky.rotation, atol=_SAME_ROTATION):
         return sky
     return dataclasses.replace(sky, rotation=np.array(rows, np.float32))
@@ -266,13 +261,13 @@ def _pole_rotation(prim: Any) -> NDArray[np.float64]:
 def _read_map(prim: Any, time: Any, opened: OpenedStage) -> NDArray[np.float64] | None:
     """Return the map [H, 2 H, 3] of a dome; uniform radiance 1 where it names no file."""
     prim_path = str(prim.GetPath())
-    attribute = prim.GetAttribute(names.MAP_PATH)
+    attribute = prim.GetAttribute(layout.MAP_PATH)
     asset = attribute.Get(time) if attribute else None
     if asset is None or not asset.path:
         return np.ones((1, 2, 3))
-    layout = prim.GetAttribute("inputs:texture:format").Get(time)
-    if layout not in (None, "automatic", "latlong"):
-        opened.lost.append(f"{prim_path}: a picture of format {layout}; expected latlong")
+    projection = prim.GetAttribute("inputs:texture:format").Get(time)
+    if projection not in (None, "automatic", "latlong"):
+        opened.lost.append(f"{prim_path}: a picture of format {projection}; expected latlong")
         return None
     specs = attribute.GetPropertyStack(time)
     resolved = opened.resolve(specs[0].layer if specs else opened.root, asset.path)

@@ -19,7 +19,6 @@ Picture files begin with the top row, textures of a scene with the bottom row. E
 a file.
 """
 
-import io
 import math
 from collections.abc import Mapping, Sequence
 from typing import Any
@@ -28,14 +27,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pipeline.documents.png import encode_png
-from pipeline.exchange.usd import prim_names as names
-from pipeline.exchange.usd.authoring import (
-    Attributes,
-    add_attributes,
-    add_prim,
-    text_attributes,
-    usd_value,
-)
+from pipeline.exchange.pictures import MAX_PIXELS
+from pipeline.exchange.usd import layout
+from pipeline.foreign.picture import decode_image
 from pipeline.foreign.usd.shaders import (
     IOR_OF_CONSTANT_ALBEDOS,
     note_unsupported,
@@ -45,13 +39,11 @@ from pipeline.foreign.usd.shaders import (
 )
 from pipeline.foreign.usd.stage import OpenedStage
 from pipeline.foreign.usd.texture_nodes import convert_to_rec709, find_sources, is_output
-from storage.errors import TrilightError
-from storage.records.exr import MAX_RESOLUTION, channel_names, decode_channels, encode_channels
+from storage.errors import Rejected, TrilightError
+from storage.records.environment import Environment
+from storage.records.exr import MAGIC, MAX_RESOLUTION, decode_channels, encode_channels
 from storage.records.material import (
-    DIFFUSE,
-    EMISSION,
-    ROUGHNESS,
-    SPECULAR,
+    column_places,
     laid_out,
     stored_columns,
 )
@@ -70,12 +62,7 @@ PREVIEW_INPUTS = {
 }
 """Input of the preview for each published column."""
 
-SHADERS = {
-    "diffuse": "DiffuseTexture",
-    "specular": "SpecularTexture",
-    "roughness": "RoughnessTexture",
-    NORMAL: "NormalTexture",
-}
+SHADERS = {name: f"{name.capitalize()}Texture" for name in (*TEXTURED, NORMAL)}
 """Name of the texture shader of each column, and of the normal map."""
 
 ST = "primvars:st"
@@ -95,7 +82,7 @@ _LINKS = {
 }
 """Type and name of the input, and name and type of its output, by column."""
 
-_TO_VECTORS: Attributes = {
+_TO_VECTORS: layout.Attributes = {
     "inputs:scale": ("float4", (2.0, 2.0, 2.0, 1.0)),
     "inputs:bias": ("float4", (-1.0, -1.0, -1.0, 0.0)),
     "inputs:fallback": ("float4", (0.0, 0.0, 1.0, 1.0)),
@@ -104,8 +91,6 @@ _TO_VECTORS: Attributes = {
 
 _CHANNELS = {1: "Y", 3: "RGB"}
 """OpenEXR channel names by channel count: a number or a color."""
-
-Color = tuple[float, float, float]
 
 Used = Mapping[str, tuple[int, Texture]]
 """Row and texture of each textured column of a material, and of its normal map."""
@@ -134,24 +119,24 @@ def add_materials(layer: Any, folder: str, scene: Scene) -> None:
     """
     from pxr import Sdf
 
-    add_prim(layer, folder, "Scope")
+    layout.add_prim(layer, folder, "Scope")
     first = None
     columns = stored_columns(scene.materials)
     for row, values in enumerate(scene.materials):
-        path = f"{folder}/{names.material_name(row)}"
+        path = f"{folder}/{layout.material_name(row)}"
         used = _used_textures(scene, row)
         copied = first is not None and not used
         if copied:
             Sdf.CopySpec(layer, first, layer, path)
         for below, attributes in material_tables(values, columns, used).items():
             if not copied:
-                prim = add_prim(layer, path + below, "Shader" if below else "Material")
-                add_attributes(prim, attributes, path)
+                prim = layout.add_prim(layer, path + below, "Shader" if below else "Material")
+                layout.add_attributes(prim, attributes, path)
                 continue
             prim = layer.GetPrimAtPath(path + below)
             for name, (kind, value, *_) in attributes.items():
                 if kind in ("color3f", "float", "float[]"):
-                    prim.attributes[name].default = usd_value(kind, value)
+                    prim.attributes[name].default = layout.usd_value(kind, value)
         first = first if used else first or path
 
 
@@ -170,33 +155,32 @@ def _used_textures(scene: Scene, row: int) -> Used:
 
 def material_tables(
     values: NDArray[np.float32], columns: Sequence[str], used: Used
-) -> dict[str, Attributes]:
+) -> dict[str, layout.Attributes]:
     """Return the attributes of a material row's prims, by their path below the material.
 
     The row has all declared columns; `columns` names the stored ones, and `used` its textures.
     """
-    diffuse, specular, emission = (_rgb(values[part]) for part in (DIFFUSE, SPECULAR, EMISSION))
-    roughness = float(values[ROUGHNESS])
+    stated = {name: values[part].tolist() for name, part in column_places().items()}
     material = _exact_attributes(values, columns)
     for name, (_, texture) in used.items():
-        source = names.format_map(texture.sha256, texture.source)
-        material[names.texture_attribute(name)] = ("string", source)
+        source = layout.format_map(texture.sha256, texture.source)
+        material[layout.texture_attribute(name)] = ("string", source)
     material["outputs:surface"] = ("token", None, f"{PREVIEW}.outputs:surface")
     preview: _Table = {
         "info:id": ("uniform token", "UsdPreviewSurface"),
         "inputs:useSpecularWorkflow": ("int", 1),
-        "inputs:diffuseColor": ("color3f", diffuse),
-        "inputs:specularColor": ("color3f", specular),
-        "inputs:roughness": ("float", roughness),
-        "inputs:emissiveColor": ("color3f", emission),
+        "inputs:diffuseColor": ("color3f", stated["diffuse"]),
+        "inputs:specularColor": ("color3f", stated["specular"]),
+        "inputs:roughness": ("float", stated["roughness"][0]),
+        "inputs:emissiveColor": ("color3f", stated["emission"]),
         "inputs:ior": ("float", IOR_OF_CONSTANT_ALBEDOS),
         "outputs:surface": ("token", None),
     }
-    tables: dict[str, Attributes] = {"": material, f"/{PREVIEW}": preview}
+    tables: dict[str, layout.Attributes] = {"": material, f"/{PREVIEW}": preview}
     if not used:
         material["outputs:mtlx:surface"] = ("token", None, f"{OPENPBR}.outputs:out")
-        inputs = openpbr_inputs(diffuse, specular, roughness, emission)
-        return {**tables, f"/{OPENPBR}": {**inputs, "outputs:out": ("token", None)}}
+        tables[f"/{OPENPBR}"] = {**_openpbr_inputs(stated), "outputs:out": ("token", None)}
+        return tables
     for name, (row, texture) in used.items():
         kind, socket, output, output_kind = _LINKS[name]
         value = preview[socket][1] if socket in preview else None
@@ -225,19 +209,14 @@ def _exact_attributes(values: NDArray[np.float32], columns: Sequence[str]) -> _T
     for column, part in laid_out():
         if column.name in columns:
             kind = "color3f" if column.is_colour else "float" if column.width == 1 else "float[]"
-            value = _rgb(values[part]) if column.is_colour else values[part]
-            attributes[names.column_attribute(column.name)] = (
+            value = values[part].tolist() if column.is_colour else values[part]
+            attributes[layout.column_attribute(column.name)] = (
                 kind,
                 float(value[0]) if kind == "float" else value,
             )
-    if added := [name for name in columns if name not in names.MATERIAL_ATTRIBUTES]:
-        attributes[names.ADDED_COLUMNS] = ("string", " ".join(added))
+    if added := [name for name in columns if name not in layout.MATERIAL_ATTRIBUTES]:
+        attributes[layout.ADDED_COLUMNS] = ("string", " ".join(added))
     return attributes
-
-
-def _rgb(values: NDArray[np.float32]) -> Color:
-    red, green, blue = (float(value) for value in values)
-    return red, green, blue
 
 
 def _texture_table(row: int, texture: Texture) -> _Table:
@@ -249,14 +228,20 @@ def _texture_table(row: int, texture: Texture) -> _Table:
         "inputs:wrapS": ("token", "repeat"),
         "inputs:wrapT": ("token", "repeat"),
         "inputs:fallback": ("float4", (*mean, 1.0)),
-        names.TEXTURE_ROW: ("int", row),
-        **text_attributes(names.MAP_TEXTS, texture.source),
+        layout.TEXTURE_ROW: ("int", row),
+        **layout.text_attributes(layout.MAP_TEXTS, texture.source),
     }
 
 
-def texture_files(scene: Scene) -> dict[str, bytes]:
-    """Return the texture files of a scene by name; raises TrilightError."""
-    return {texture_file(texture): encode_texture(texture) for texture in scene.textures}
+def map_files(scene: Scene) -> dict[str, bytes]:
+    """Return the files of the textures and the sky of a scene by name; raises TrilightError."""
+    files = {
+        texture_file(texture): _encode_map(texture.texels[::-1], "texture")
+        for texture in scene.textures
+    }
+    if (sky := scene.environment) is not None:
+        files[sky_file(sky)] = _encode_map(sky.radiance_rgb, "environment")
+    return files
 
 
 def texture_file(texture: Texture) -> str:
@@ -265,86 +250,78 @@ def texture_file(texture: Texture) -> str:
     return f"texture-{texture.sha256[:16]}.{suffix}"
 
 
-def encode_texture(texture: Texture) -> bytes:
-    """Return the bytes of a texture's file; they contain no time stamp.
+def sky_file(sky: Environment) -> str:
+    """Return the file name of a map; equal maps share a file."""
+    return f"sky-{sky.sha256[:16]}.exr"
+
+
+def _encode_map(texels: NDArray[Any], what: str) -> bytes:
+    """Return the bytes of a picture [H, W, C], the top row first; they contain no time stamp.
 
     Raises:
-        TrilightError: the texture is larger than the USD reader accepts.
+        TrilightError: the picture, which the message calls `what`, is larger than the USD reader
+            accepts.
     """
-    height, width, channels = texture.texels.shape
+    height, width, channels = texels.shape
     if max(height, width) > MAX_RESOLUTION:
         raise TrilightError(
-            f"texture: {width} x {height} texels; expected at most {MAX_RESOLUTION} each way in "
+            f"{what}: {width} x {height} texels; expected at most {MAX_RESOLUTION} each way in "
             "USD. Write it as .safetensors, or make it smaller."
         )
-    picture: NDArray[Any] = np.ascontiguousarray(texture.texels[::-1])
+    picture = np.ascontiguousarray(texels if channels == 3 else texels[..., 0])
     if picture.dtype == np.float32:
-        values = picture if channels == 3 else picture[..., 0]
-        return encode_channels({_CHANNELS[channels]: np.ascontiguousarray(values)})
-    return encode_png(picture if channels == 3 else picture[..., 0])
+        return encode_channels({_CHANNELS[channels]: picture})
+    return encode_png(picture)
 
 
-def decode_texture(data: bytes, *, is_exr: bool, is_srgb: bool, source: MapSource) -> Texture:
-    """Decode a file of `encode_texture`.
+def decode_texture(
+    data: bytes, name: str, column: str, *, is_srgb: bool, source: MapSource
+) -> Texture:
+    """Decode the file of the texture of a material's column, or of its normal map.
 
     Raises:
-        LookupError: `encode_texture` did not write the file.
+        LookupError: `map_files` did not write the file.
     """
+    channels = 1 if column == "roughness" else 3
+    is_exr = data.startswith(MAGIC)
     try:
-        texels: NDArray[Any] = _exr_texels(data) if is_exr else _png_texels(data)
-        texture = Texture(texels=np.ascontiguousarray(texels), is_srgb=is_srgb, source=source)
+        if is_exr:
+            pixels = decode_channels(data, _CHANNELS[channels])[_CHANNELS[channels]]
+            texels = pixels.reshape(*pixels.shape[:2], -1)[::-1]
+        else:
+            texels = decode_image(data, name, MAX_PIXELS, [])[..., :channels]
+        is_encoded = is_srgb and not is_exr
+        texels = np.ascontiguousarray(texels)
+        texture = Texture(texels=texels, is_srgb=is_encoded, source=source)
         texture.check("texture")
-    except (TrilightError, OSError, SyntaxError, ValueError) as error:
+    except (TrilightError, Rejected) as error:
         raise LookupError("it is no texture that was written here") from error
     return texture
 
 
-def _exr_texels(data: bytes) -> NDArray[np.float32]:
-    name = "Y" if channel_names(data) == ["Y"] else "RGB"
-    pixels = decode_channels(data, name, lambda header: None)[name]
-    texels: NDArray[np.float32] = pixels.reshape(*pixels.shape[:2], -1)[::-1]
-    return texels
-
-
-def _png_texels(data: bytes) -> NDArray[np.uint8]:
-    from PIL import Image
-
-    with Image.open(io.BytesIO(data), formats=("PNG",)) as image:
-        if max(image.size) > MAX_RESOLUTION or image.mode not in ("L", "RGB"):
-            raise ValueError(f"{image.size} in mode {image.mode}")
-        pixels: NDArray[np.uint8] = np.asarray(image, np.uint8)
-    return pixels.reshape(*pixels.shape[:2], -1)[::-1]
-
-
-def openpbr_inputs(
-    diffuse: Color, specular: Color, roughness: float, emission: Color
-) -> Attributes:
+def _openpbr_inputs(columns: Mapping[str, Sequence[float]]) -> layout.Attributes:
     """Return the attributes of the shader of a material's columns."""
-    max_specular = max(specular)
-    max_emission = max(emission)
-    root = math.sqrt(min(max_specular, _MOST_REFLECTING))
+    specular = columns["specular"]
+    emission = columns["emission"]
+    root = math.sqrt(min(max(specular), _MOST_REFLECTING))
     return {
         "info:id": ("uniform token", _OPENPBR_SHADER),
-        "inputs:base_color": ("color3f", diffuse),
+        "inputs:base_color": ("color3f", columns["diffuse"]),
         "inputs:base_weight": ("float", 1.0),
         "inputs:base_diffuse_roughness": ("float", 0.0),
-        "inputs:specular_weight": ("float", 1.0 if max_specular > 0 else 0.0),
-        "inputs:specular_color": ("color3f", _divide_by_largest(specular, max_specular)),
-        "inputs:specular_roughness": ("float", roughness),
-        "inputs:specular_ior": ("float", _round_to_float32((1 + root) / (1 - root))),
-        "inputs:emission_luminance": ("float", max_emission),
-        "inputs:emission_color": ("color3f", _divide_by_largest(emission, max_emission)),
+        "inputs:specular_weight": ("float", 1.0 if max(specular) > 0 else 0.0),
+        "inputs:specular_color": ("color3f", _divide_by_largest(specular)),
+        "inputs:specular_roughness": ("float", columns["roughness"][0]),
+        "inputs:specular_ior": ("float", float(np.float32((1 + root) / (1 - root)))),
+        "inputs:emission_luminance": ("float", max(emission)),
+        "inputs:emission_color": ("color3f", _divide_by_largest(emission)),
     }
 
 
 def written_columns(columns: Mapping[str, NDArray]) -> dict[str, NDArray[np.float64]]:
     """Return the columns [3] that the shader written for a material's columns states."""
-    diffuse, specular, roughness, emission = (
-        tuple(np.maximum(columns[name], 0).tolist()) for name in _INPUTS
-    )
-    table = openpbr_inputs(diffuse, specular, roughness[0], emission)
-    constants = {name.removeprefix("inputs:"): value for name, (_, value, *_) in table.items()}
-    return _multiply(constants)
+    table = _openpbr_inputs({name: np.maximum(columns[name], 0).tolist() for name in _INPUTS})
+    return _multiply({name.removeprefix("inputs:"): each[1] for name, each in table.items()})
 
 
 def read_openpbr(material: Any, time: Any, opened: OpenedStage) -> dict[str, NDArray[np.float64]]:
@@ -388,13 +365,7 @@ def _multiply(values: Mapping[str, Any]) -> dict[str, NDArray[np.float64]]:
     return columns
 
 
-def _divide_by_largest(rgb: Color, largest: float) -> Color:
+def _divide_by_largest(rgb: Sequence[float]) -> list[float]:
     """Return a color divided by its largest channel; white for black."""
-    if largest <= 0:
-        return 1.0, 1.0, 1.0
-    red, green, blue = (_round_to_float32(value / largest) for value in rgb)
-    return red, green, blue
-
-
-def _round_to_float32(value: float) -> float:
-    return float(np.float32(value))
+    scaled = np.array(rgb) / max(rgb) if max(rgb) > 0 else np.ones(3)
+    return [float(value) for value in scaled.astype(np.float32)]

@@ -2,7 +2,7 @@
 
 Stages are Z up, in meters, with a default prim; textures and an environment map are files next to
 the stage, or in the archive. Equal scenes give equal bytes.
-`prim_names` lists the paths; `read_usd` reads them.
+`layout` lists the paths; `read_usd` reads them.
 A camera has a pose and a lens, in tenths of a meter, on a square film of 36 mm. A `.usdz` file is a
 zip archive of uncompressed members that begin at multiples of 64 bytes.
 
@@ -26,23 +26,15 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from pipeline.exchange.usd import prim_names as names
-from pipeline.exchange.usd.authoring import (
-    Attributes,
-    add_attributes,
-    add_prim,
-    add_relationship,
-    text_attributes,
-)
-from pipeline.exchange.usd.write_materials import ST, add_materials, texture_files
+from pipeline.exchange.usd import layout
+from pipeline.exchange.usd.write_materials import ST, add_materials, map_files, sky_file
 from storage.atomic import write_atomically
 from storage.conventions import SCHEMA_VERSION
 from storage.digests import canonical_json
 from storage.errors import TrilightError
 from storage.records.environment import Environment
-from storage.records.exr import MAX_RESOLUTION, encode_channels
 from storage.records.retextured import without_constant_textures
-from storage.records.scene import ARRAY_FIELDS, Scene
+from storage.records.scene import Scene
 from storage.records.scene_file import scene_digest
 
 SUFFIXES = (".usda", ".usdc", ".usdz")
@@ -50,22 +42,16 @@ SUFFIXES = (".usda", ".usdc", ".usdz")
 ENVIRONMENT = "Environment"
 """Name of the prim of an environment."""
 
-CARRIED = frozenset(
-    {*ARRAY_FIELDS, "provenance", "textures", "normal_textures", "environment"}
-    | {f"objects.{field}" for field in names.OBJECT_TEXTS}
-)
-"""Members of a scene that the file holds (pipeline.exchange.formats)."""
-
 
 def write_usd(path: Path, scene: Scene) -> tuple[()]:
-    """Write one scene; the file appears whole or not at all. Nothing in CARRIED loses anything.
+    """Write one scene; the file appears whole or not at all. No member loses anything.
 
     Raises:
         TrilightError: the suffix is not USD's, the scene breaks a law or holds text that USD cannot
             store, or the file cannot be written.
     """
-    layer = _new_layer(path, names.ROOT)
-    _save(path, layer, _add_scene(layer, names.ROOT, scene))
+    layer = _new_layer(path, layout.ROOT)
+    _save(path, layer, _add_scene(layer, layout.ROOT, scene))
     return ()
 
 
@@ -77,34 +63,34 @@ def write_usd_shard(path: Path, scenes: Iterable[tuple[str, Scene]]) -> None:
     """
     from pxr import Sdf
 
-    layer = _new_layer(path, names.SHARD_ROOT)
-    root = add_prim(layer, names.SHARD_ROOT, "Xform")
-    root.variantSetNameList.Prepend(names.VARIANT_SET)
+    layer = _new_layer(path, layout.SHARD_ROOT)
+    root = layout.add_prim(layer, layout.SHARD_ROOT, "Xform")
+    root.variantSetNameList.Prepend(layout.VARIANT_SET)
     keys = []
     files = dict[str, bytes]()
     for key, scene in scenes:
-        variant = f"{names.SHARD_ROOT}{{{names.VARIANT_SET}={key}}}"
+        variant = f"{layout.SHARD_ROOT}{{{layout.VARIANT_SET}={key}}}"
         Sdf.CreatePrimInLayer(layer, variant)
-        files |= _add_scene(layer, variant + names.ROOT.removeprefix("/"), scene)
+        files |= _add_scene(layer, variant + layout.ROOT.removeprefix("/"), scene)
         keys.append(key)
     if not keys:
         raise TrilightError(f"{path.name}: no scenes to write; expected at least one.")
-    root.variantSelections[names.VARIANT_SET] = keys[0]
+    root.variantSelections[layout.VARIANT_SET] = keys[0]
     _save(path, layer, files)
 
 
-def root_attributes(scene: Scene) -> Attributes:
+def root_attributes(scene: Scene) -> layout.Attributes:
     """Return the attributes of the prim of a scene."""
     unused = np.ones(len(scene.vertex_positions), np.bool_)
     unused[scene.faces] = False
     rows = np.flatnonzero(unused)
     return {
-        names.VERSION: ("int", SCHEMA_VERSION),
-        names.DIGEST: ("string", scene_digest(scene)),
-        names.PROVENANCE: ("string", canonical_json(dict(scene.provenance)).decode()),
-        names.UNUSED_ROWS: ("int[]", rows.astype(np.int32)),
-        names.UNUSED_POSITIONS: ("point3f[]", scene.vertex_positions[rows]),
-        names.UNUSED_NORMALS: ("normal3f[]", scene.vertex_normals[rows]),
+        layout.VERSION: ("int", SCHEMA_VERSION),
+        layout.DIGEST: ("string", scene_digest(scene)),
+        layout.PROVENANCE: ("string", canonical_json(dict(scene.provenance)).decode()),
+        layout.UNUSED_ROWS: ("int[]", rows.astype(np.int32)),
+        layout.UNUSED_POSITIONS: ("point3f[]", scene.vertex_positions[rows]),
+        layout.UNUSED_NORMALS: ("normal3f[]", scene.vertex_normals[rows]),
         **_sky_attributes(scene.environment),
     }
 
@@ -114,14 +100,14 @@ def _add_scene(layer: Any, path: str, scene: Scene) -> dict[str, bytes]:
     scene.check()
     scene = without_constant_textures(scene)
     records: list[tuple[Any, dict[str, str]]] = [
-        (entry, names.OBJECT_TEXTS) for entry in scene.objects
+        (entry, layout.OBJECT_TEXTS) for entry in scene.objects
     ]
-    records += [(texture.source, names.MAP_TEXTS) for texture in scene.textures]
+    records += [(texture.source, layout.MAP_TEXTS) for texture in scene.textures]
     for text in (getattr(record, field) for record, fields in records for field in fields):
         if "\0" in text or any("\ud800" <= letter <= "\udfff" for letter in text):
             raise TrilightError(f"names: {text!r:.80} has a character that USD cannot store.")
     author_scene(layer, path, scene)
-    return texture_files(scene) | _map_files(scene.environment)
+    return map_files(scene)
 
 
 def author_scene(layer: Any, path: str, scene: Scene) -> Any:
@@ -129,14 +115,14 @@ def author_scene(layer: Any, path: str, scene: Scene) -> Any:
     from pxr import Sdf
 
     with Sdf.ChangeBlock():
-        root = add_prim(layer, path, "Xform")
-        add_attributes(root, root_attributes(scene))
+        root = layout.add_prim(layer, path, "Xform")
+        layout.add_attributes(root, root_attributes(scene))
         add_materials(layer, f"{path}/Materials", scene)
         _add_objects(layer, f"{path}/Objects", scene, f"{path}/Materials")
         _add_cameras(layer, f"{path}/Cameras", scene)
         if scene.environment is not None:
-            dome = add_prim(layer, f"{path}/{ENVIRONMENT}", "DomeLight")
-            add_attributes(dome, _dome_attributes(scene.environment))
+            dome = layout.add_prim(layer, f"{path}/{ENVIRONMENT}", "DomeLight")
+            layout.add_attributes(dome, _dome_attributes(scene.environment))
     return root
 
 
@@ -158,16 +144,15 @@ def new_layer(suffix: str, root: str) -> Any:
 
 
 def _save(path: Path, layer: Any, files: Mapping[str, bytes]) -> None:
-    with tempfile.TemporaryDirectory(dir=path.parent if path.parent.is_dir() else None) as folder:
-        plain = Path(folder) / "scene.usdc"
-        if (
-            path.suffix.lower() == ".usda"
-        ):  # Export would change file modes, which a confined child may not
-            data = layer.ExportToString().encode()
-        elif layer.Export(str(plain)):
+    if path.suffix.lower() == ".usda":  # Export would change file modes, which a child may not
+        data = layer.ExportToString().encode()
+    else:
+        within = path.parent if path.parent.is_dir() else None
+        with tempfile.TemporaryDirectory(dir=within) as folder:
+            plain = Path(folder) / _LAYER_NAME
+            if not layer.Export(str(plain)):
+                raise TrilightError(f"{path.name}: USD could not write the scene.")
             data = plain.read_bytes()
-        else:
-            raise TrilightError(f"{path.name}: USD could not write the scene.")
     if path.suffix.lower() == ".usdz":
         write_atomically(path, encode_usdz(data, files))
         return
@@ -177,14 +162,14 @@ def _save(path: Path, layer: Any, files: Mapping[str, bytes]) -> None:
 
 
 _BINDING = "material:binding"
-_LIGHT: Attributes = {
+_LIGHT: layout.Attributes = {
     "inputs:intensity": ("float", 1.0),
     "inputs:exposure": ("float", 0.0),
     "inputs:color": ("color3f", (1.0, 1.0, 1.0)),
     "inputs:normalize": ("bool", False),
     "light:materialSyncMode": ("uniform token", "materialGlowTintsLight"),
 }
-_MESH: Attributes = {
+_MESH: layout.Attributes = {
     "doubleSided": ("uniform bool", True),
     "orientation": ("uniform token", "rightHanded"),
     "subdivisionScheme": ("uniform token", "none"),
@@ -193,7 +178,7 @@ _MESH: Attributes = {
 CENTER = "xformOp:translate"
 """Name of the transform to the center, which USD's common API sets."""
 
-_SUBSET: Attributes = {
+_SUBSET: layout.Attributes = {
     "elementType": ("uniform token", "face"),
     "familyName": ("uniform token", "materialBind"),
 }
@@ -201,7 +186,7 @@ _SUBSET: Attributes = {
 
 def _add_objects(layer: Any, folder: str, scene: Scene, materials: str) -> None:
     """Write a prim for each object below `folder`; the materials are below `materials`."""
-    add_prim(layer, folder, "Scope")
+    layout.add_prim(layer, folder, "Scope")
     order = np.argsort(scene.object_index, kind="stable")
     counts = np.bincount(scene.object_index, minlength=len(scene.objects))
     starts = np.concatenate([[0], np.cumsum(counts)])
@@ -231,29 +216,29 @@ def _add_object(
     entry = scene.objects[row]
     emits = entry.kind == "emitter"
     attributes = {
-        names.INDEX: ("int", row),
-        **text_attributes(names.OBJECT_TEXTS, entry),
-        names.VISIBLE_TO_CAMERA: ("bool", not emits),
+        layout.INDEX: ("int", row),
+        **layout.text_attributes(layout.OBJECT_TEXTS, entry),
+        layout.VISIBLE_TO_CAMERA: ("bool", not emits),
         **(_LIGHT if emits else {}),
     }
     if len(faces) == 0:
-        add_attributes(add_prim(layer, path, "Xform"), attributes)
+        layout.add_attributes(layout.add_prim(layer, path, "Xform"), attributes)
         return
     schemas = ["MaterialBindingAPI", *(["MeshLightAPI"] if emits else [])]
-    prim = add_prim(layer, path, "Mesh", schemas)
-    add_attributes(prim, {**attributes, **_MESH, **_mesh_arrays(scene, faces)})
+    prim = layout.add_prim(layer, path, "Mesh", schemas)
+    layout.add_attributes(prim, {**attributes, **_MESH, **_mesh_arrays(scene, faces)})
     prim.attributes["normals"].SetInfo("interpolation", "vertex")
     if scene.uv is not None:
         prim.attributes[ST].SetInfo("interpolation", "faceVarying")
     index = scene.material_index[faces]
     used = np.unique(index)
-    add_relationship(prim, _BINDING, f"{materials}/{names.material_name(used[0])}")
+    layout.add_relationship(prim, _BINDING, f"{materials}/{layout.material_name(used[0])}")
     for material in used:
-        name = names.material_name(material)
-        subset = add_prim(layer, f"{path}/{name}", "GeomSubset", ["MaterialBindingAPI"])
+        name = layout.material_name(material)
+        subset = layout.add_prim(layer, f"{path}/{name}", "GeomSubset", ["MaterialBindingAPI"])
         chosen = np.flatnonzero(index == material).astype(np.int32)
-        add_attributes(subset, {**_SUBSET, "indices": ("int[]", chosen)})
-        add_relationship(subset, _BINDING, f"{materials}/{name}")
+        layout.add_attributes(subset, {**_SUBSET, "indices": ("int[]", chosen)})
+        layout.add_relationship(subset, _BINDING, f"{materials}/{name}")
 
 
 def sum_positions(center: NDArray[np.float64], points: NDArray[np.float32]) -> NDArray[np.float32]:
@@ -261,7 +246,7 @@ def sum_positions(center: NDArray[np.float64], points: NDArray[np.float32]) -> N
     return (points.astype(np.float64) + center).astype(np.float32)
 
 
-def _mesh_arrays(scene: Scene, faces: NDArray[np.intp]) -> Attributes:
+def _mesh_arrays(scene: Scene, faces: NDArray[np.intp]) -> layout.Attributes:
     """Return the arrays of a mesh, with exact positions where center plus point differs."""
     rows, corners = np.unique(scene.faces[faces], return_inverse=True)
     positions = scene.vertex_positions[rows]
@@ -275,66 +260,45 @@ def _mesh_arrays(scene: Scene, faces: NDArray[np.intp]) -> Attributes:
     return {
         CENTER: ("double3", center.tolist()),
         "xformOpOrder": ("uniform token[]", (CENTER,)),
-        names.EXACT_ROWS: ("int[]", exact.astype(np.int32)),
-        names.EXACT_POSITIONS: ("point3f[]", positions[exact]),
+        layout.EXACT_ROWS: ("int[]", exact.astype(np.int32)),
+        layout.EXACT_POSITIONS: ("point3f[]", positions[exact]),
         "faceVertexCounts": ("int[]", np.full(len(faces), 3, np.int32)),
         "faceVertexIndices": ("int[]", corners.ravel().astype(np.int32)),
         "points": ("point3f[]", points),
         "normals": ("normal3f[]", scene.vertex_normals[rows]),
         "extent": ("float3[]", np.stack([points.min(axis=0), points.max(axis=0)])),
-        names.VERTEX_ROWS: ("int[]", rows.astype(np.int32)),
-        names.FACE_ROWS: ("int[]", faces.astype(np.int32)),
+        layout.VERTEX_ROWS: ("int[]", rows.astype(np.int32)),
+        layout.FACE_ROWS: ("int[]", faces.astype(np.int32)),
         **({} if uv is None else {ST: ("texCoord2f[]", uv)}),
     }
 
 
-def _map_files(sky: Environment | None) -> dict[str, bytes]:
-    """Return the map file of an environment by name.
-
-    Raises:
-        TrilightError: the map is larger than the OpenEXR reader accepts.
-    """
-    if sky is None:
-        return {}
-    if max(sky.radiance_rgb.shape) > MAX_RESOLUTION:
-        raise TrilightError(
-            f"environment: {sky.radiance_rgb.shape[1]} texels wide; expected at most "
-            f"{MAX_RESOLUTION} in USD. Write it as .safetensors, or make it smaller."
-        )
-    return {_map_file(sky): encode_channels({"RGB": sky.radiance_rgb})}
-
-
-def _map_file(sky: Environment) -> str:
-    """Return the file name of a map; equal maps share a file."""
-    return f"sky-{sky.sha256[:16]}.exr"
-
-
-def _dome_attributes(sky: Environment) -> Attributes:
+def _dome_attributes(sky: Environment) -> layout.Attributes:
     """Return the attributes of the prim of an environment."""
     to_world = np.eye(4)
-    to_world[:3, :3] = sky.rotation.astype(np.float64) @ names.TO_OUR_AXES
+    to_world[:3, :3] = sky.rotation.astype(np.float64) @ layout.TO_OUR_AXES
     return {
         "xformOp:transform": ("matrix4d", to_world.T.tolist()),  # USD multiplies from the left
         "xformOpOrder": ("uniform token[]", ("xformOp:transform",)),
-        names.MAP_PATH: ("asset", f"./{_map_file(sky)}"),
+        layout.MAP_PATH: ("asset", f"./{sky_file(sky)}"),
         "inputs:texture:format": ("token", "latlong"),
         "inputs:intensity": ("float", 1.0),
-        names.VISIBLE_TO_CAMERA: ("bool", sky.is_seen),
-        **text_attributes(names.MAP_TEXTS, sky.source),
+        layout.VISIBLE_TO_CAMERA: ("bool", sky.is_seen),
+        **layout.text_attributes(layout.MAP_TEXTS, sky.source),
     }
 
 
-def _sky_attributes(sky: Environment | None) -> Attributes:
+def _sky_attributes(sky: Environment | None) -> layout.Attributes:
     """Return the attributes of a scene's prim about its environment; empty without one."""
     if sky is None:
         return {}
     return {
         **{
             name: ("float3", tuple(map(float, row)))
-            for name, row in zip(names.SKY_ROWS, sky.rotation, strict=True)
+            for name, row in zip(layout.SKY_ROWS, sky.rotation, strict=True)
         },
-        names.SKY_VISIBLE: ("bool", sky.is_seen),
-        names.SKY_SOURCE: ("string", names.format_map(sky.sha256, sky.source)),
+        layout.SKY_VISIBLE: ("bool", sky.is_seen),
+        layout.SKY_SOURCE: ("string", layout.format_map(sky.sha256, sky.source)),
     }
 
 
@@ -346,11 +310,11 @@ _CLIP_METERS = (1e-3, 1e4)
 
 def _add_cameras(layer: Any, folder: str, scene: Scene) -> None:
     """Write a prim for each camera below `folder`."""
-    add_prim(layer, folder, "Scope")
+    layout.add_prim(layer, folder, "Scope")
     for row, (c2w, fov_deg) in enumerate(zip(scene.c2w, scene.fov_deg.tolist(), strict=True)):
         focal = _APERTURE / (2 * math.tan(math.radians(fov_deg) / 2))
-        camera = add_prim(layer, f"{folder}/{names.camera_name(row)}", "Camera")
-        attributes: Attributes = {
+        camera = layout.add_prim(layer, f"{folder}/{layout.camera_name(row)}", "Camera")
+        attributes: layout.Attributes = {
             # USD multiplies rows from the left
             "xformOp:transform": ("matrix4d", c2w.astype(np.float64).T.tolist()),
             "xformOpOrder": ("uniform token[]", ("xformOp:transform",)),
@@ -359,9 +323,9 @@ def _add_cameras(layer: Any, folder: str, scene: Scene) -> None:
             "horizontalAperture": ("float", float(np.float32(_APERTURE))),
             "verticalAperture": ("float", float(np.float32(_APERTURE))),
             "clippingRange": ("float2", _CLIP_METERS),
-            names.FOV_DEG: ("float", fov_deg),
+            layout.FOV_DEG: ("float", fov_deg),
         }
-        add_attributes(camera, attributes)
+        layout.add_attributes(camera, attributes)
 
 
 _ALIGNMENT = 64

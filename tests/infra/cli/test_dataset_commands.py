@@ -17,7 +17,7 @@ from infra.repair import repair
 from infra.run_record import is_run, run_facts
 from model.open import open_network
 from model.weights import encode_weights
-from pipeline.exchange import convert as convert_scene
+from pipeline.exchange import reader
 from pipeline.exchange.open_scene import load_source, scene_source
 from pipeline.exchange.renderformer_h5 import read_renderformer_h5
 from pipeline.exchange.renderformer_json import describe_scene
@@ -443,9 +443,9 @@ def test_a_crash_in_native_code_is_one_line(
 ) -> None:
     stage = write_stage(tmp_path)
     use_processes(monkeypatch)
-    monkeypatch.setattr(convert_scene, "source_keys", crash)
+    monkeypatch.setattr(reader, "source_keys", crash)
     told = refused("convert", stage, tmp_path / "a.json")
-    assert told.startswith("stage.usda: could not be converted (crashed_signal_11")
+    assert "stage.usda: could not be read (crashed_signal_11" in told
 
 
 @pytest.fixture

@@ -299,7 +299,7 @@ def test_a_path_is_a_list_of_cameras_or_any_scene(tmp_path: Path) -> None:
     np.testing.assert_array_equal([camera.c2w for camera in own], tiny_scene().c2w)
     for broken, message in (
         ({**listed, "look_at": [2, 0, 1]}, r"path.json: cameras\[0\] looks from"),
-        ({**listed, "fov": 180}, r"path.json: cameras\[0\]: fov is 180"),
+        ({**listed, "fov": 180}, r"path.json: cameras.0.fov is 180"),
     ):
         path.write_text(json.dumps({"cameras": [broken]}))
         with pytest.raises(TrilightError, match=message):

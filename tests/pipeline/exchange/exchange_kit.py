@@ -37,8 +37,7 @@ def errors_of(stage: Any) -> list[str]:
 
 def build_json(folder: Path, name: str, **more: Any) -> Scene:
     """Return the scene of a RenderFormer file."""
-    asked = {"licence": "CC0-1.0", "num_views": None, "scene_index": 0, "seed": 0, **more}
-    return build_scene(folder.resolve(), name, AssetSettings(), **asked)[0]
+    return build_scene(folder.resolve(), name, AssetSettings(), **{"licence": "CC0-1.0", **more})[0]
 
 
 def json_and_back(scene: Scene, folder: Path) -> tuple[Scene, tuple[str, ...]]:

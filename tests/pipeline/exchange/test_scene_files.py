@@ -148,7 +148,7 @@ def test_a_pipe_is_no_scene_file_and_no_mesh(folder: Path) -> None:
     os.mkfifo(folder / "c.json")
     unusable = find_scene_files(str(folder)).unusable
     assert list(unusable) == ["c.json"]
-    assert "c.json: expected a regular file" in unusable["c.json"]
+    assert "c.json: cannot be read (not a plain file)" in unusable["c.json"]
 
 
 def test_remesh_keeps_the_place_and_the_number(folder: Path) -> None:

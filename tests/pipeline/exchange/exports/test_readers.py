@@ -2,8 +2,8 @@
 
 Packages at pinned versions: here webdataset with torch, Hugging Face datasets and NVIDIA Energon;
 in test_scenes.py nerfstudio's parser and COCO's tools. By their published arithmetic: here
-RenderFormer-Studio's validator and weights; in test_scenes.py RenderFormer's loader, and Hypersim's
-layout.
+RenderFormer-Studio's weights, whose validator's list test_renderformer_h5.py holds; in
+test_scenes.py RenderFormer's loader, and Hypersim's layout.
 """
 
 import io
@@ -14,7 +14,6 @@ from collections import Counter
 from pathlib import Path
 from typing import Any
 
-import h5py
 import numpy as np
 import OpenEXR
 import pytest
@@ -155,32 +154,6 @@ def test_energon(dataset: Path, tmp_path: Path, foreign: None) -> None:
     assert "copies whole shards, and --scene names a sample" in str(refused.exception)
     refused = trilight([*words[:4], "--out", str(tmp_path / "one"), "--split", "test"])
     assert "no shard in split test; expected one of train, validation" in str(refused.exception)
-
-
-STUDIO_SHAPES = {
-    "triangles": ("float32", ("T", 3, 3)),
-    "texture": ("float32", ("T", 13, 32, 32)),
-    "vn": ("float32", ("T", 3, 3)),
-    "c2w": ("float32", ("V", 4, 4)),
-    "fov": ("float32", ("V",)),
-    "mvp": ("float32", ("V", 4, 4)),
-}
-"""What RenderFormer-Studio's `renderformer data validate-h5` asks of the first version's files
-(src/renderformer/data/h5/validate.py at a5daa311)."""
-
-
-def test_what_the_validator_of_renderformer_studio_asks(dataset: Path, tmp_path: Path) -> None:
-    words = ["export", str(dataset), "--form", "h5", "--out", str(tmp_path / "h5"), "--json"]
-    ended = trilight(words)
-    assert ended.exit_code == 0, ended.exception
-    paths = sorted((tmp_path / "h5").glob("*.h5"))
-    assert len(paths) == TRAIN + VALIDATION
-    for path in paths:
-        with h5py.File(path) as file:
-            sizes = {"T": file["triangles"].shape[0], "V": file["c2w"].shape[0]}
-            for name, (dtype, shape) in STUDIO_SHAPES.items():
-                assert file[name].dtype == dtype, name
-                assert file[name].shape == tuple(sizes.get(str(n), n) for n in shape), name
 
 
 STUDIO_STAGES = {

@@ -327,15 +327,6 @@ def test_hypersim(dataset: Path) -> None:
     np.testing.assert_allclose(world[hit], read(f"{geometry}.normal_world.hdf5")[hit], atol=1e-6)
 
 
-def test_hypersim_needs_the_lobes_apart(tmp_path: Path) -> None:
-    shards = {"train-000000.tar": [sample(0, furnished(["a"]))]}
-    write_dataset(tmp_path / "data", shards, objects=[locked("a", "CC-BY-4.0")])
-    words = ["export", str(tmp_path / "data"), "--form", "hypersim", "--out", str(tmp_path / "x")]
-    refused = str(trilight(words).exception)
-    assert "keeps all light together; expected diffuse and specular light apart" in refused
-    assert "--set renders.split_lobes=true" in refused
-
-
 @for_each("form", FORMS)
 def test_the_same_dataset_gives_the_same_bytes(dataset: Path, form: str) -> None:
     first = _files(exported(dataset, form, "--split", "test"))
@@ -365,6 +356,11 @@ def test_mistakes(dataset: Path, tmp_path: Path) -> None:
     )
     other = trilight(["export", str(tmp_path / "full"), "--form", "coco", *new])
     assert "no manifest.json" in str(other.exception)
+    shards = {"train-000000.tar": [sample(0, furnished(["a"]))]}
+    write_dataset(tmp_path / "one", shards, objects=[locked("a", "CC-BY-4.0")])
+    whole = str(trilight(["export", str(tmp_path / "one"), "--form", "hypersim", *new]).exception)
+    assert "keeps all light together; expected diffuse and specular light apart" in whole
+    assert "--set renders.split_lobes=true" in whole
 
 
 def _alone(*, seen_sky: bool | None = None) -> Scene:

@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 from PIL import Image
-from pxr import Sdf, Usd, UsdGeom
+from pxr import Gf, Sdf, Usd, UsdGeom
 
 from infra.bench.workloads import cycles as environment
 from infra.bench.workloads.traced_pictures import fixed_samples, render_shot
@@ -278,33 +278,21 @@ def test_a_column_that_blender_drops_is_named(tmp_path: Path) -> None:
     assert notes and all(f"{WAVES.name!r}" in text for text in notes)
 
 
-def test_moved_objects_are_read_as_moved(tmp_path: Path) -> None:
+def test_objects_are_read_as_moved_and_turned_about_their_centers(tmp_path: Path) -> None:
     def move(layer: Any) -> None:
         stage = Usd.Stage.Open(layer)
         light = UsdGeom.Xformable(stage.GetPrimAtPath("/Scene/Objects/light"))
-        center = np.array(light.GetPrim().GetAttribute(CENTER).Get())
-        assert UsdGeom.XformCommonAPI(light).SetTranslate((center + MOVE).tolist())
+        center = light.GetPrim().GetAttribute(CENTER)
+        center.Set(center.Get() + Gf.Vec3d(*MOVE))
+        light.AddRotateZOp().Set(180)
 
     scene = tiny_scene()
     found = edited(tmp_path, scene, move)
     assert any("changed since Trilight wrote it: read as any other" in text for text in found.notes)
     was, now = (s.vertex_positions[s.faces[2]] for s in (scene, found.scene))
-    assert now == pytest.approx(was + MOVE, abs=1e-6)
-
-
-def test_objects_turn_about_their_centers(tmp_path: Path) -> None:
-    def turn(layer: Any) -> None:
-        stage = Usd.Stage.Open(layer)
-        UsdGeom.Xformable(stage.GetPrimAtPath("/Scene/Objects/light")).AddRotateZOp().Set(180)
-
-    scene = tiny_scene()
-    found = edited(tmp_path, scene, turn)
-    assert any("changed since Trilight wrote it: read as any other" in text for text in found.notes)
-    was, now = (s.vertex_positions[s.faces[2]] for s in (scene, found.scene))
-    assert now.mean(axis=0)[2] == 2
     assert np.array_equal(rows(found.scene)[2], scene.materials[LIGHT])
     middle = (was.min(axis=0) + was.max(axis=0)) / 2
-    assert now == pytest.approx((middle - was) * [1, 1, 0] + middle, abs=1e-6)
+    assert now == pytest.approx((middle - was) * [1, 1, 0] + middle + MOVE, abs=1e-6)
 
 
 def test_a_file_with_the_older_name_of_centers_is_exact(tmp_path: Path) -> None:
@@ -318,8 +306,8 @@ def test_a_file_with_the_older_name_of_centers_is_exact(tmp_path: Path) -> None:
     assert not again.notes and encode_scene(again.scene) == encode_scene(found.scene)
 
 
-def run_blender(process: str, folder: Path, request: dict[str, Any]) -> NDArray[np.float32]:
-    """Run a script of this folder in Blender's Python; return the picture [R, R, 3] that it makes.
+def run_blender(folder: Path, request: dict[str, Any]) -> NDArray[np.float32]:
+    """Run the script in Blender's Python; return the picture [R, R, 3] that it makes.
 
     Skips where Blender has not been installed: that is 380 MB, which tests do not download.
     """
@@ -328,7 +316,7 @@ def run_blender(process: str, folder: Path, request: dict[str, Any]) -> NDArray[
     folder.mkdir(exist_ok=True)
     asked = {"bounces": 8, "denoise": True, "seed": 0, "threads": 2, **request}
     (folder / "request.json").write_text(json.dumps(asked))
-    environment.run_blender(Path(__file__).with_name(process), folder)
+    environment.run_blender(Path(__file__).with_name("blender_process.py"), folder)
     picture: NDArray[np.float32] = np.load(folder / "picture.npy")
     return picture
 
@@ -380,7 +368,7 @@ def test_the_tutorial_keeps_everything(
     asked: dict[str, Any] = {"usd": str(tmp_path / "a.usdz"), "export": str(tmp_path / "back.usdc")}
     asked |= {"lamp": scene.objects[lamp].name, "material": f"material_{painted}"}
     asked |= {"color": COLOR, "resolution": RESOLUTION, "spp": SPP, "denoise": name == "cbox"}
-    theirs = run_blender("blender_usd_process.py", tmp_path / "blender", asked)
+    theirs = run_blender(tmp_path / "blender", asked)
     assert_shown(json.loads((tmp_path / "blender/facts.json").read_text()), scene)
     agreement = _db(scene, theirs)
     print(f"{name}: {agreement:.2f} dB")  # noqa: T201
@@ -485,9 +473,7 @@ def test_a_scene_that_blender_exports_looks_as_blender_renders_it(
     light); a rectangle emits to one side there. The bounds leave 1.4 dB, and 2 % of radiance, to
     the noise of 128 samples on another processor. A light 10 % brighter gives 27.7 dB.
     """
-    theirs = run_blender(
-        "blender_scene_process.py", tmp_path, {"resolution": SCENE_PX, "spp": SCENE_SPP}
-    )
+    theirs = run_blender(tmp_path, {"resolution": SCENE_PX, "spp": SCENE_SPP})
     found = read_usd(tmp_path / "scene.usdc", None, None, "LicenseRef-user-provided")
     picture = ours(found.scene, SCENE_PX, SCENE_SPP)
     both = np.concatenate([preview_srgb8(theirs), preview_srgb8(picture)], axis=1)

@@ -1,12 +1,16 @@
-"""Runs in Blender's own Python: makes a scene, renders it with Cycles, and exports it as USD.
+"""Runs in Blender's own Python: opens one of our scenes or makes one, renders it, exports as USD.
 
-    python -I blender_scene_process.py FOLDER
+    python -I blender_process.py FOLDER
 
-FOLDER/request.json holds what infra.bench.workloads.blender_process takes. Receives scene.usdc and,
-with instances instead of copies, instances.usdc; their textures; and picture.npy.
+FOLDER/request.json holds what infra.bench.workloads.blender_process takes; picture.npy is received.
 
-The scene is what Blender's users make: a grid of quads with a picture on it, a cylinder of n-gons,
-smooth quads, a collection that stands twice, a metal, and a rectangle that lights.
+With `usd` it does what the tutorial does with one of our scenes: our script opens that file, the
+picture is taken, then `lamp`, `material` and `color` say what is changed, and `export` the USD file
+to write. Receives facts.json.
+
+Without, it makes what Blender's users make: a grid of quads with a picture on it, a cylinder of
+n-gons, smooth quads, a collection that stands twice, a metal, and a rectangle that lights. Receives
+scene.usdc and, with instances instead of copies, instances.usdc; and their textures.
 """
 
 import importlib.util
@@ -97,16 +101,58 @@ def make_scene(folder: Path) -> None:
     bpy.context.object.data.angle = math.radians(42)
 
 
+def facts() -> dict[str, Any]:
+    meshes = {
+        item.name: {
+            "triangles": len(item.data.polygons),
+            "custom_normals": item.data.has_custom_normals,
+            "off_center": np.abs(np.array(item.bound_box).mean(axis=0)).max(),
+            "visible": item.visible_camera,
+        }
+        for item in bpy.data.objects
+        if item.type == "MESH"
+    }
+    materials = {}
+    for material in bpy.data.materials:
+        inputs = material.node_tree.nodes["Principled BSDF"].inputs
+        materials[material.name] = {
+            "diffuse": list(inputs["Base Color"].default_value)[:3],
+            "specular": list(inputs["Specular Tint"].default_value)[:3],
+            "roughness": inputs["Roughness"].default_value,
+            "emission": list(inputs["Emission Color"].default_value)[:3],
+            "strength": inputs["Emission Strength"].default_value,
+        }
+    return {"meshes": meshes, "materials": materials}
+
+
+def change(request: dict[str, Any]) -> None:
+    """Move, turn and scale a lamp; color a material; make another one rough by its property."""
+    lamp = bpy.data.objects[request["lamp"]]
+    lamp.location.x += 0.125
+    lamp.rotation_euler.z += np.pi / 2
+    lamp.scale = (0.5, 0.5, 0.5)
+    nodes = bpy.data.materials[request["material"]].node_tree.nodes
+    nodes["Principled BSDF"].inputs["Base Color"].default_value = (*request["color"], 1.0)
+
+
 def main(folder: Path) -> None:
     request = json.loads((folder / "request.json").read_text())
     cycles = module("infra/bench/workloads/blender_process.py")
-    bpy.ops.wm.read_factory_settings(use_empty=True)
-    make_scene(folder)
-    for name, instances in (("scene", False), ("instances", True)):
-        bpy.ops.wm.usd_export(filepath=str(folder / f"{name}.usdc"), use_instancing=instances)
+    if "usd" in request:
+        sys.argv = ["blender", "--", request["usd"]]
+        module("infra/blender/exact_materials.py").main()
+        (folder / "facts.json").write_text(json.dumps(facts(), default=float))
+    else:
+        bpy.ops.wm.read_factory_settings(use_empty=True)
+        make_scene(folder)
+        for name, instances in (("scene", False), ("instances", True)):
+            bpy.ops.wm.usd_export(filepath=str(folder / f"{name}.usdc"), use_instancing=instances)
     cycles.set_up_cycles(request, folder / "render.exr")
     cycles.render(samples=request["spp"])
     np.save(folder / "picture.npy", cycles.pixels(folder / "render.exr"), allow_pickle=False)
+    if "usd" in request:
+        change(request)
+        bpy.ops.wm.usd_export(filepath=request["export"])
 
 
 if __name__ == "__main__":

@@ -1,4 +1,4 @@
-"""Names of the prims of a scene in a USD stage, and of Trilight's attributes.
+"""Layout of a scene in a USD stage: names of its prims and attributes, and how both are written.
 
     /Scene                        Xform, the default prim: provenance and digest
     /Scene/Materials/material_<m> one per material row: UsdPreviewSurface, and OpenPBR or textures
@@ -12,10 +12,14 @@ their textures, and the scene its sky.
 A shard is `/Scenes` with a variant set `scene`: one variant per sample, named by its key, each with
 a `/Scenes/Scene` as above. Attributes in the namespace `trilight:` are exact; the rest of a
 prim states the same as closely as USD can.
+
+Prims and attributes are written straight into a layer, with a hundredth of the calls of schemas.
 """
 
 import dataclasses
+import functools
 import json
+from collections.abc import Callable, Mapping, Sequence
 from typing import Any
 
 import numpy as np
@@ -104,10 +108,11 @@ def column_attribute(column: str) -> str:
     return MATERIAL_ATTRIBUTES.get(column, _ADDED_COLUMN + column)
 
 
-def added_column(attribute: str) -> str | None:
-    """Return the added column of an attribute name; None for other attributes."""
-    column = attribute.removeprefix(_ADDED_COLUMN)
-    return None if column == attribute else column
+def column_of(attribute: str) -> str | None:
+    """Return the material column of an attribute name; None for other attributes."""
+    published = {name: column for column, name in MATERIAL_ATTRIBUTES.items()}
+    added = attribute.removeprefix(_ADDED_COLUMN)
+    return published.get(attribute, None if added == attribute else added)
 
 
 def texture_attribute(column: str) -> str:
@@ -146,3 +151,88 @@ def parse_camera_row(name: str) -> int | None:
     """Return the camera row in a prim's name; None for other names."""
     row = name.removeprefix("camera_")
     return int(row) if row.isdecimal() and camera_name(int(row)) == name else None
+
+
+Attributes = Mapping[str, tuple[str, Any] | tuple[str, Any, str]]
+"""Type name, value and connected output, if any, of each attribute by name.
+
+The prefix "uniform " of a type sets its variability. Inputs and outputs may have the value None. An
+output is named by its path below the material.
+"""
+
+UNIFORM = "uniform "
+
+
+def text_attributes(fields: Mapping[str, str], record: Any) -> dict[str, tuple[str, Any]]:
+    """Return attributes of a record's fields that are texts; `fields` has their names."""
+    return {name: ("string", getattr(record, field)) for field, name in fields.items()}
+
+
+def add_prim(layer: Any, path: str, type_name: str, schemas: Sequence[str] = ()) -> Any:
+    """Return a new prim of a type, with API schemas applied."""
+    from pxr import Sdf
+
+    prim = Sdf.CreatePrimInLayer(layer, path)
+    prim.specifier = Sdf.SpecifierDef
+    prim.typeName = type_name
+    if schemas:
+        prim.SetInfo("apiSchemas", Sdf.TokenListOp.Create(prependedItems=list(schemas)))
+    return prim
+
+
+def add_attributes(prim: Any, attributes: Attributes, material: str = "") -> None:
+    """Write attributes with default values, and connections to outputs below `material`."""
+    from pxr import Sdf
+
+    for name, (kind, value, *sources) in attributes.items():
+        uniform = kind.startswith(UNIFORM)
+        attribute = Sdf.AttributeSpec(
+            prim,
+            name,
+            _value_type(kind),
+            Sdf.VariabilityUniform if uniform else Sdf.VariabilityVarying,
+            name.startswith(NAMESPACE),
+        )
+        if value is not None:
+            attribute.default = usd_value(kind, value)
+        if sources:
+            paths = [_target(f"{material}/{source}") for source in sources]
+            attribute.connectionPathList.explicitItems = paths
+
+
+def add_relationship(prim: Any, name: str, target: str) -> None:
+    """Write a relationship to one prim."""
+    from pxr import Sdf
+
+    relationship = Sdf.RelationshipSpec(prim, name, False)
+    relationship.targetPathList.explicitItems = [_target(target)]
+
+
+def _target(path: str) -> Any:
+    """Return the path of a prim as other prims name it, without variant selections."""
+    from pxr import Sdf
+
+    return Sdf.Path(path).StripAllVariantSelections()
+
+
+@functools.cache
+def _value_type(kind: str) -> Any:
+    from pxr import Sdf
+
+    return Sdf.ValueTypeNames.Find(kind.removeprefix(UNIFORM))
+
+
+def usd_value(kind: str, value: Any) -> Any:
+    """Return a value as the USD type `kind`."""
+    return _converter(kind)(value)
+
+
+@functools.cache
+def _converter(kind: str) -> Callable[[Any], Any]:
+    """Return the converter to a USD type; cached, since scenes have 10^5 values."""
+    from pxr import Sdf
+
+    python_class = Sdf.AssetPath if kind == "asset" else _value_type(kind).type.pythonClass
+    if hasattr(python_class, "FromNumpy"):
+        return lambda values: python_class.FromNumpy(np.ascontiguousarray(values))
+    return python_class or (lambda value: value)  # numbers and texts have no class
