@@ -21,7 +21,7 @@ from pathlib import Path, PurePosixPath
 from typing import Annotated, Any, BinaryIO, Literal
 
 from storage.atomic import atomic_writer
-from storage.conventions import MANIFEST_VERSION, READABLE_MANIFESTS, SPLITS, require_readable
+from storage.conventions import MANIFEST_VERSION, READABLE_MANIFESTS, SPLITS
 from storage.dataset.layout import numbered_path
 from storage.dataset.shard import scan_samples
 from storage.digests import canonical_json, sha256_hex, sha256_of_stream
@@ -29,7 +29,7 @@ from storage.errors import TrilightError
 from storage.records.safe_read import open_plain
 from storage.remote.store import MAX_FILE_BYTES
 from storage.settings.ranges import Within
-from storage.typed_json import DROPPED, FINITE, Sha256, ShortText, Spelled, read_json
+from storage.typed_json import DROPPED, FINITE, Sha256, ShortText, Spelled, read_versioned
 
 SHARD_NAME = re.compile(rf"(?:part-\d{{4,6}}/)?({'|'.join(SPLITS)})-(\d{{6}})\.tar")
 """Names are relative to the manifest and cannot leave its folder."""
@@ -260,20 +260,6 @@ def decode_manifest(data: bytes, place: str) -> Manifest:
     """Return the manifest of a file, called `place`; raises as `read_manifest`."""
     if len(data) > _HEAD_BYTES + _ROW_BYTES * data.count(b'.tar"'):
         raise TrilightError(f"{place}: {len(data)} bytes are too many for the shards in it.")
-    try:
-        stored = read_json(data, StoredManifest, place)
-    except TrilightError:
-        if (version := _version_of(data)) is not None:
-            require_readable(version, place, READABLE_MANIFESTS)
-        raise
-    require_readable(stored.schema_version, place, READABLE_MANIFESTS)
+    stored = read_versioned(data, StoredManifest, place, READABLE_MANIFESTS)
     fields = {field.name: getattr(stored, field.name) for field in dataclasses.fields(_Fields)}
     return Manifest(stored=stored, **fields)
-
-
-def _version_of(data: bytes) -> object:
-    """Return the version that a manifest of unknown form states; None where it states none."""
-    try:
-        return json.loads(data)["schema_version"]
-    except (ValueError, LookupError, TypeError, RecursionError):
-        return None

@@ -9,9 +9,7 @@ before the first one that uses it (storage.records.packed_maps). Readers
 return the members of a sample together with those of its maps; writers take the same form.
 """
 
-import contextlib
 import io
-import json
 import os
 import re
 import tarfile
@@ -22,7 +20,7 @@ from typing import BinaryIO
 
 from storage.atomic import atomic_writer
 from storage.errors import ShardMissing, TrilightError
-from storage.records.packed_maps import MAP_NAME, referenced_maps
+from storage.records.packed_maps import MAP_NAME, map_member
 from storage.records.safe_read import open_plain
 
 
@@ -193,12 +191,9 @@ class ShardReader:
             )
         selected = {name: member for name, member in self.samples[key].items() if accepts(name)}
         members = {name: self.read(member) for name, member in selected.items()}
-        names: Iterable[str] = ()
-        if self.maps and "json" in members:
-            with contextlib.suppress(ValueError, RecursionError):  # its decoder says what is wrong
-                names = referenced_maps(json.loads(members["json"]))
+        digests = re.findall("[0-9a-f]{64}", members.get("json", b"").decode(errors="replace"))
+        maps = {name: self.maps[name] for name in map(map_member, digests) if name in self.maps}
         start = min(member.offset for member in self.samples[key].values())
-        maps = {name: self.maps[name] for name in names if name in self.maps}
         before = {name: map_ for name, map_ in maps.items() if map_.offset < start}
         return members | {name: self.read(map_) for name, map_ in before.items()}
 

@@ -10,6 +10,7 @@ from collections.abc import Callable, Iterable, Iterator
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Annotated
 
 from storage.atomic import write_atomically
 from storage.dataset.dataset import Dataset
@@ -27,7 +28,7 @@ from storage.digests import canonical_json
 from storage.errors import TrilightError
 from storage.records.objects import Failure, decode_failures, encode_failures, read_failures
 from storage.records.safe_read import read_plain
-from storage.typed_json import read_json
+from storage.typed_json import Converted, read_json
 
 _SUFFIX = ".json"
 _AT_ONCE = 32
@@ -39,18 +40,12 @@ class ShardNote:
     """Contents of the note on a finished shard."""
 
     shard: ShardEntry
-    failures: tuple[Failure, ...]
-    """Scenes that were given up, and rejected attempts."""
+    failures: Annotated[
+        tuple[Failure, ...], Converted(lambda text: tuple(decode_failures(str(text).encode())))
+    ]
+    """Scenes that were given up, and rejected attempts; in the file, lines as in failures.jsonl."""
     scenes: Scenes | None = None
     """Scenes so far of a shard in a bucket that still grows; None for a full shard."""
-
-
-@dataclass(frozen=True, kw_only=True)
-class _Note(ShardNote):
-    """File of a note."""
-
-    failures: str = ""  # type: ignore[assignment]
-    """Lines as in failures.jsonl."""
 
 
 def rejections_of_shard(folder: DatasetFolder, name: str) -> Path:
@@ -83,9 +78,7 @@ def encode_note(note: ShardNote) -> bytes:
 
 def decode_note(data: bytes, source: str) -> ShardNote:
     """Return the note of a file; raises TrilightError, naming `source`, where it is none."""
-    note = read_json(data, _Note, source)
-    failures = tuple(decode_failures(note.failures.encode()))
-    return ShardNote(shard=note.shard, failures=failures, scenes=note.scenes)
+    return read_json(data, ShardNote, source)
 
 
 def noted_shard(folder: DatasetFolder, name: str) -> ShardNote:

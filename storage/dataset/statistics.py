@@ -1,6 +1,5 @@
 """Statistics of a dataset, read without its pictures."""
 
-import json
 from array import array
 from collections import Counter
 from collections.abc import Mapping, Sequence
@@ -17,7 +16,8 @@ from storage.dataset.shard import ShardReader
 from storage.digests import sha256_hex
 from storage.errors import TrilightError
 from storage.records.profiles import PACKED, PLAIN, unpack_arrays
-from storage.records.scene_file import scene_provenance
+from storage.records.sample import SampleJson, ViewRecord
+from storage.records.scene_file import read_scene_record, scene_provenance
 
 MOST_SCENES = 20_000
 """Scenes that are read to describe a dataset: of a percentile over as many, chance moves less than
@@ -169,27 +169,27 @@ class _Tally:
     parts: dict[str, "array[float]"] = field(default_factory=dict)
     scene_members: dict[str, str] = field(default_factory=dict)
 
-    def add_views(self, views: Sequence[Mapping[str, Any]]) -> None:
-        """Count the views of a scene."""
-        for view in views:
-            for name, column in self.views.items():
-                column.append(view[name])
-            if "expected" in view:
-                self.expected.append(view["expected"]["noise_floor_db"])
-            for name, part in view.get("parts", {}).items():
-                self.parts.setdefault(name, array("d")).append(part["noise_floor_db"])
+    def add_view(self, view: ViewRecord) -> None:
+        """Count a view of a scene."""
+        for name, column in self.views.items():
+            column.append(getattr(view, name))
+        if view.expected is not None:
+            self.expected.append(view.expected.noise_floor_db)
+        for name, part in (view.parts or {}).items():
+            self.parts.setdefault(name, array("d")).append(part.noise_floor_db)
 
 
 def _count_shard(opened: ShardReader, tally: _Tally) -> None:
     for key, members in opened.samples.items():
         arrays = {name: opened.read(members[name]) for name in (PLAIN, PACKED) if name in members}
         tally.scene_members[f"{key}.{PLAIN}"] = sha256_hex(unpack_arrays(arrays))
-        record = json.loads(opened.read(members["json"]))
-        provenance = scene_provenance(record["provenance"])
+        record = read_scene_record(opened.read(members["json"]), SampleJson, f"member {key}.json")
+        provenance = scene_provenance(record.provenance)
         tally.templates[provenance.get("template", "unknown")] += 1
         if excursion := provenance.get("excursion"):
             tally.excursions[excursion["axis"]] += 1
-        tally.add_views(record["views"])
+        for view in record.views:
+            tally.add_view(view)
 
 
 def digest_of_scenes(members: Mapping[str, str]) -> str:

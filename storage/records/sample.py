@@ -15,7 +15,6 @@ WebDataset reads names.
 
 import contextlib
 import dataclasses
-import json
 import math
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
@@ -42,14 +41,13 @@ from storage.records.profiles import Profile, pack_arrays, pack_picture, unpack_
 from storage.records.retextured import without_constant_textures
 from storage.records.scene import Scene
 from storage.records.scene_file import (
+    SceneJson,
     decode_arrays,
     encode_arrays,
     read_scene_record,
-    scene_of_record,
     scene_record,
 )
-from storage.settings.ranges import Within
-from storage.typed_json import read_json
+from storage.settings.ranges import Law, Within
 
 Plausible = Annotated[float, Within(-1000, 1000, low_open=True, high_open=True)]
 """Number within bounds beyond any stated error in dB and any share."""
@@ -65,6 +63,18 @@ class PartFloor:
     """The same error as psnr_linear_db."""
     object_noise_floor_db: Plausible
     """The same error as object_psnr_log_db: over pixels that show geometry."""
+
+
+@dataclass(frozen=True)
+class KnownParts(Law):
+    """Law of the floors of parts: one of the sets that there are, in the order of their sum."""
+
+    expected: str = f"floors of {'; '.join(', '.join(names) for names in KNOWN_PARTS)}"
+
+    def require(self, value: Any) -> Any:
+        if tuple(sorted(value)) not in KNOWN_PARTS:
+            raise ValueError(self.expected)
+        return dict(sorted(value.items()))
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -87,7 +97,7 @@ class ViewRecord(PartFloor):
     expected: PartFloor | None = None
     """Errors that are as often better as worse, where the stated errors are calibrated bounds; a
     record whose floors are bounds by estimate and allowances is written without this field."""
-    parts: Mapping[str, PartFloor] | None = None
+    parts: Annotated[Mapping[str, PartFloor], KnownParts()] | None = None
     """Floors of the parts that are stored, by name (storage.records.lights); a record that has none
     is written without this field."""
     lights: tuple[PartFloor, ...] | None = None
@@ -99,6 +109,13 @@ def error_text(view: ViewRecord) -> str:
     """Return the stated error of a view and the expected one, as `38.2 dB, probably 40.5`."""
     probably = "" if view.expected is None else f", probably {view.expected.noise_floor_db:.1f}"
     return f"{view.noise_floor_db:.1f} dB{probably}"
+
+
+@dataclass(frozen=True, kw_only=True)
+class SampleJson(SceneJson):
+    """Record of a sample: what is no array and no picture of it, as JSON."""
+
+    views: tuple[ViewRecord, ...]
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -288,29 +305,11 @@ def decode_scene(
     if "json" not in members:
         raise TrilightError(f"sample {key}: member {key}.json is missing.")
     with name_errors(key):
-        record = read_scene_record(members["json"], f"member {key}.json")
-        views = _views(record["views"])
-        maps = record.get("maps")
+        record = read_scene_record(members["json"], SampleJson, f"member {key}.json")
+        maps = record.maps
         fields = {} if maps is None else unpacked_maps(maps, members, held)
         fields |= decode_arrays(unpack_arrays(members), maps)
-        scene = scene_of_record(record, **fields)
-    return SceneRecord(key=key, scene=scene, views=views)
-
-
-@dataclass(frozen=True, kw_only=True)
-class _Views:
-    views: tuple[ViewRecord, ...]
-
-
-def _views(value: Any) -> tuple[ViewRecord, ...]:
-    """Return the records of views; sorted, since parts are summed in the order of their names."""
-    views = read_json(json.dumps({"views": value}, sort_keys=True), _Views, "record").views
-    for row, view in enumerate(views):
-        if view.parts is not None and tuple(view.parts) not in KNOWN_PARTS:
-            known = "; ".join(", ".join(names) for names in KNOWN_PARTS)
-            named = ", ".join(view.parts) or "none"
-            raise TrilightError(f"views.{row}.parts are {named:.60}; expected floors of {known}.")
-    return views
+        return SceneRecord(key=key, scene=record.scene(**fields), views=record.views)
 
 
 @contextlib.contextmanager

@@ -388,15 +388,15 @@ def _with_arrays(**changes: Any) -> bytes:
         (_stating(schema_version=99), "schema version 99"),
         (_stating(schema_version=None), "schema version None"),
         (_stating(objects={}), "objects is {}"),
-        (_stating(objects=[1, 2]), r"objects\[0\] is 1"),
-        (_stating(objects=[{"name": "x", "kind": "shell"}]), "exactly the fields attribution"),
-        (_with_object(kind="lamp"), r"objects\[1\].kind is "),
-        (_with_object(name=3), r"objects\[1\].name is "),
-        (_with_object(uid=["x"]), r"objects\[1\].uid is "),
+        (_stating(objects=[1, 2]), r"objects\.0 is 1"),
+        (_stating(objects=[{"name": "x", "kind": "shell"}]), r"objects\.0\.uid is missing"),
+        (_with_object(kind="lamp"), r"objects\.1\.kind is .* expected object, shell or emitter"),
+        (_with_object(name=3), r"objects\.1\.name is "),
+        (_with_object(uid=["x"]), r"objects\.1\.uid is "),
         (_stating(provenance=[]), r"provenance is \[\]"),
         (_stating(provenance={"template": [5]}), r"provenance.template is \[5\]; expected text"),
         (_stating(provenance={"excursion": {"axis": "x"}}), "excursion is .* expected an axis"),
-        (_stating(provenance={"x": float("nan")}), "NaN is no JSON number"),
+        (_stating(provenance={"x": float("nan")}), "provenance is .*nan.*finite numbers"),
     ],
 )
 def test_arrays_and_metadata_are_exactly_those_of_a_scene(data: bytes, message: str) -> None:
@@ -442,7 +442,7 @@ def test_a_large_file_is_refused_before_it_is_read(tmp_path: Path) -> None:
     path = tmp_path / "large.safetensors"
     with path.open("wb") as stream:
         stream.truncate(MAX_FILE_BYTES + 1)  # a hole: it takes no room
-    with pytest.raises(TrilightError, match="large.safetensors: expected a regular file"):
+    with pytest.raises(TrilightError, match="large.safetensors: expected a file of at most"):
         read_scene_file(path)
     with pytest.raises(TrilightError, match="cannot be read"):
         read_scene_file(tmp_path / "absent.safetensors")
