@@ -125,12 +125,16 @@ class Manifest(_Fields):
     def num_bytes(self) -> int:
         return sum(shard.num_bytes for shard in self.shards)
 
+    def setting(self, group: str, name: str, kind: Any) -> Any:
+        """Return one of its settings of a kind; None where they do not say it, or another kind."""
+        settings = self.settings.get(group)
+        value = settings.get(name) if isinstance(settings, Mapping) else None
+        return value if isinstance(value, kind) else None
+
     @property
     def passes(self) -> tuple[str, ...]:
         """Names of the passes of each picture; none where the settings do not name them."""
-        storage = self.settings.get("storage")
-        names = storage.get("passes") if isinstance(storage, Mapping) else None
-        return tuple(map(str, names)) if isinstance(names, list | tuple) else ()
+        return tuple(map(str, self.setting("storage", "passes", list | tuple) or ()))
 
     @property
     def identity(self) -> object:

@@ -9,6 +9,7 @@ before the first one that uses it (storage.records.packed_maps). Readers
 return the members of a sample together with those of its maps; writers take the same form.
 """
 
+import contextlib
 import io
 import os
 import re
@@ -20,8 +21,9 @@ from typing import BinaryIO
 
 from storage.atomic import atomic_writer
 from storage.errors import ShardMissing, TrilightError
-from storage.records.packed_maps import MAP_NAME, map_member
+from storage.records.packed_maps import MAP_NAME, HeldMaps, map_member
 from storage.records.safe_read import open_plain
+from storage.records.sample import Sample, StoredSample, decode_sample, stored_sample
 
 
 def write_shard(path: Path, samples: Iterable[tuple[str, Mapping[str, bytes]]]) -> None:
@@ -150,12 +152,13 @@ def scan_samples(
 class ShardReader:
     """An open shard, which gives any of its samples, in any order and to several threads."""
 
-    def __init__(self, stream: BinaryIO, name: str) -> None:
+    def __init__(self, stream: BinaryIO, name: str, held: HeldMaps | None = None) -> None:
         """Read the headers; raises TrilightError as `scan_samples`, and closes the file then.
 
         Args:
             stream: the shard, a file of this machine.
             name: of the shard, for messages.
+            held: maps of other shards that were unpacked already.
         """
         self.name = name
         self.maps: dict[str, Member] = {}
@@ -168,6 +171,36 @@ class ShardReader:
             raise
         self.samples: Mapping[str, Mapping[str, Member]] = samples
         """Members by suffix of each sample by key, in the order of the file."""
+        self.keys = list(samples)
+        """The keys of its samples, in the order of the file."""
+        self._held = HeldMaps() if held is None else held
+
+    def sample(self, row: int) -> Sample:
+        """Return a sample that passes `Sample.check`.
+
+        Raises:
+            TrilightError: it is not whole, not readable or breaks a law; names shard and sample.
+        """
+        with self._name_errors():
+            sample = decode_sample(self.keys[row], self.members(self.keys[row]), self._held)
+            sample.check()
+            return sample
+
+    def stored_sample(self, row: int) -> StoredSample:
+        """Return a sample whose pictures are unpacked when they are asked for.
+
+        Raises:
+            TrilightError: its scene is not readable or breaks a law; names shard and sample.
+        """
+        with self._name_errors():
+            return stored_sample(self.keys[row], self.members(self.keys[row]), self._held)
+
+    @contextlib.contextmanager
+    def _name_errors(self) -> Iterator[None]:
+        try:
+            yield
+        except TrilightError as error:
+            raise TrilightError(f"{self.name}: {error}") from error
 
     def members(
         self, key: str, accepts: Callable[[str], bool] = lambda suffix: True
@@ -184,10 +217,9 @@ class ShardReader:
             TrilightError: there is no such sample, or the shard has become shorter.
         """
         if key not in self.samples:
-            keys = list(self.samples)
-            held = f"{keys[0]} to {keys[-1]}" if keys else "none"
+            held = f"{self.keys[0]} to {self.keys[-1]}" if self.keys else "none"
             raise TrilightError(
-                f"{self.name}: no sample {key}; expected one of its {len(keys)}: {held}."
+                f"{self.name}: no sample {key}; expected one of its {len(self.keys)}: {held}."
             )
         selected = {name: member for name, member in self.samples[key].items() if accepts(name)}
         members = {name: self.read(member) for name, member in selected.items()}

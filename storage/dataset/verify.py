@@ -4,6 +4,7 @@ from collections import Counter, deque
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
 from dataclasses import dataclass, field
+from functools import partial
 from pathlib import Path
 from tempfile import TemporaryFile
 from typing import BinaryIO
@@ -12,6 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from storage.dataset.dataset import Dataset, open_dataset, published_manifest
+from storage.dataset.layout import shard_names_in
 from storage.dataset.manifest import Manifest, ShardEntry, Totals, decode_manifest, index_stream
 from storage.dataset.planned import is_whole
 from storage.dataset.shard import ShardReader
@@ -86,7 +88,9 @@ def verify_dataset(
     rows = [] if problems else decode_objects_lock(lock or b"", "objects.lock.jsonl")
     locked = None if problems else {row.uid: row for row in rows}
     problems += _check_manifest(dataset)
-    problems += [f"{name}: not in the manifest" for name in _list_unlisted(dataset)]
+    names = sorted(shard_names_in(dataset.local.root)) if dataset.local else []
+    listed = {shard.name for shard in manifest.shards}
+    problems += [f"{name}: not in the manifest" for name in names if name not in listed]
     where: dict[str, str] = {}
     bad: list[str] = []
     threads = available_cores() if dataset.local else REMOTE_THREADS
@@ -136,14 +140,6 @@ def _ahead(
         yield shard, running.popleft().result()
         if row + _AHEAD < len(shards):
             running.append(pool.submit(check, shards[row + _AHEAD]))
-
-
-def _list_unlisted(dataset: Dataset) -> list[str]:
-    """Return shard files that the manifest does not list; of a remote dataset, none."""
-    listed = {shard.name for shard in dataset.manifest.shards}
-    folder = dataset.local
-    names = map(folder.name_of, folder.shard_files()) if folder else ()
-    return [name for name in names if name not in listed]
 
 
 def _check_lock(lock: bytes | None, dataset: Dataset) -> Iterator[str]:
@@ -268,16 +264,15 @@ def _check_pictures(sample: Sample, manifest: Manifest) -> Iterator[str]:
         sample.scene.check()
     except TrilightError as error:
         yield str(error)
-    renders = manifest.settings.get("renders")
-    renders = renders if isinstance(renders, Mapping) else {}
-    resolution = renders.get("resolution")
+    renders = partial(manifest.setting, "renders", kind=int)
+    resolution = renders("resolution")
     expected = (manifest.num_views, resolution, resolution, 3)
     if sample.radiance_rgb.shape != expected or sample.scene.num_views != manifest.num_views:
         yield f"pictures {sample.radiance_rgb.shape}; expected {expected}"
     if not (np.isfinite(sample.radiance_rgb).all() and (sample.radiance_rgb >= 0).all()):
         yield "a picture holds a value that is not finite or negative"
-    yield from _check_lights(sample, per_light=bool(renders.get("per_light")))
-    bounces, lobes = (bool(renders.get(name)) for name in ("split", "split_lobes"))
+    yield from _check_lights(sample, per_light=bool(renders("per_light")))
+    bounces, lobes = (bool(renders(name)) for name in ("split", "split_lobes"))
     yield from _check_parts(sample, part_names(bounces=bounces, lobes=lobes))
     yield from _check_passes(sample, manifest.passes)
 

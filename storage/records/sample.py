@@ -240,14 +240,14 @@ def decode_sample(key: str, members: Mapping[str, bytes], held: HeldMaps | None 
         every = range(len(record.views))
         radiance_rgb = np.stack([decode_exr(members[f"{view}.exr"]) for view in every])
         size = radiance_rgb.shape[1:3]
-        lights_rgb = _decode_lights(record.scene, every, size, members)
-        lit = None if lights_rgb is None else record.scene
+        lights = _decode_parts("lights", (ALL_LIGHT,), every, size, record.scene, members)
         names = tuple(record.views[0].parts or ())
+        lit = record.scene if lights else None
         return Sample(
             **vars(record),
             radiance_rgb=radiance_rgb,
-            lights_rgb=lights_rgb,
-            parts_rgb=_decode_parts("parts", names, every, size, lit, members),
+            lights_rgb=lights.get(ALL_LIGHT),
+            parts_rgb=_decode_parts("parts", names, every, size, lit, members) or None,
             passes_exr=_of_views("passes", every, members),
         )
 
@@ -261,14 +261,6 @@ def _of_views(
     return tuple(members[f"{view}.{what}.exr"] for view in views)
 
 
-def _decode_lights(
-    scene: Scene, views: Sequence[int], size: tuple[int, ...], members: Mapping[str, bytes]
-) -> NDArray[np.float32] | None:
-    """Return the lights [V, L, R, R, 3] of some views; None where they are together."""
-    parts = _decode_parts("lights", (ALL_LIGHT,), views, size, scene, members)
-    return None if parts is None else parts[ALL_LIGHT]
-
-
 def _decode_parts(
     what: str,
     names: Sequence[str],
@@ -276,15 +268,15 @@ def _decode_parts(
     size: tuple[int, ...],
     scene: Scene | None,
     members: Mapping[str, bytes],
-) -> dict[str, NDArray[np.float32]] | None:
-    """Return what the members `<view>.<what>.exr` hold of some views; None where there are none.
+) -> dict[str, NDArray[np.float32]]:
+    """Return what the members `<view>.<what>.exr` hold of some views; nothing where there are none.
 
     `scene` is None where lights are together. It raises KeyError for a member that is missing, and
     as `decode_parts_exr`.
     """
     packed = _of_views(what, views, members)
     if packed is None:
-        return None
+        return {}
     height, width = size
     num_lights = None if scene is None else num_light_pictures(scene)
     by_view = [decode_parts_exr(data, names, (height, width), num_lights) for data in packed]
@@ -409,11 +401,10 @@ class StoredSample(SceneRecord):
         """
         with name_errors(self.key):
             size = (resolution, resolution)
-            lights_rgb = _decode_lights(self.scene, views, size, self.members)
-        if lights_rgb is not None:
-            for view, lights in zip(views, lights_rgb, strict=True):
-                check_radiance(self.key, "", lights[None], first_view=view)
-        return lights_rgb
+            lights = _decode_parts("lights", (ALL_LIGHT,), views, size, self.scene, self.members)
+        for view, of_view in zip(views, lights.get(ALL_LIGHT, ()), strict=bool(lights)):
+            check_radiance(self.key, "", of_view[None], first_view=view)
+        return lights.get(ALL_LIGHT)
 
 
 def stored_sample(

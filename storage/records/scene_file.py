@@ -49,6 +49,7 @@ from storage.records.scene import (
 )
 from storage.records.scene_laws import wrong_value
 from storage.records.texture import MAX_MAPS_BYTES, Texture
+from storage.settings.ranges import Law
 from storage.typed_json import FINITE, read_versioned
 
 MAX_FILE_BYTES = (256 << 20) + MAX_MAPS_BYTES
@@ -184,6 +185,13 @@ def decode_scene_file(data: bytes, name: str) -> Scene:
     return scene
 
 
+class LawfulProvenance(Law):
+    """Law of `scene_provenance`."""
+
+    def require(self, value: Any) -> Any:
+        return scene_provenance(value)
+
+
 @dataclass(frozen=True, kw_only=True)
 class StatedObject:
     """Row of the objects in a scene's record: a `SceneObject`, all of it stated."""
@@ -202,7 +210,7 @@ class SceneJson:
 
     schema_version: int
     objects: tuple[StatedObject, ...]
-    provenance: Annotated[Mapping[str, Any], FINITE]
+    provenance: Annotated[Mapping[str, Any], FINITE, LawfulProvenance()]
     maps: Maps | None = None
     material_columns: str | None = None
     """Columns of the materials in a scene file (storage.records.material), if they are others than
@@ -211,9 +219,9 @@ class SceneJson:
     """Encoding of each texture in a scene file."""
 
     def scene(self, **fields: Any) -> Scene:
-        """Return the scene with all other fields; raises as `scene_provenance`, checks no law."""
+        """Return the scene with all other fields, whose laws are not checked."""
         objects = tuple(SceneObject(**vars(entry)) for entry in self.objects)
-        return Scene(objects=objects, provenance=scene_provenance(self.provenance), **fields)
+        return Scene(objects=objects, provenance=self.provenance, **fields)
 
 
 Record = TypeVar("Record", bound=SceneJson)

@@ -26,7 +26,7 @@ def require_rotations(rotations: NDArray[np.float32], name: str, values: NDArray
     rotations64 = rotations.astype(np.float64)
     gram = rotations64.transpose(0, 2, 1) @ rotations64
     is_orthonormal = abs(gram - np.eye(3)).max(axis=(1, 2)) <= ROTATION_TOLERANCE
-    lawful = is_orthonormal & (np.linalg.det(rotations64) > 0)
+    lawful = np.linalg.det(np.where(is_orthonormal[:, None, None], rotations64, 0)) > 0
     require_law(lawful, name, values, "an orthonormal rotation without mirroring")
 
 
