@@ -33,7 +33,10 @@ _NEAR: Range = (-0.05, 0.05)
 _FAR: Range = (-0.25, 0.25)
 _RAISED: Range = (0.15, 0.25)
 _FREE: Range = (-0.05, 0.25)
-_STILL = SideRanges()
+_EXACT: Range = (0.0, 0.0)
+_STILL = SideRanges(
+    spin_deg=0.0, tilt_deg=0.0, scale=(1.0, 1.0), shift_x=_EXACT, shift_y=_EXACT, shift_z=_EXACT
+)
 _UNTURNED = SeparateSides(
     floor=_STILL, wall0=_STILL, wall1=_STILL, wall2=_STILL, wall2_faces_out=False
 )
