@@ -205,9 +205,8 @@ def _encode_rows(manifest: Manifest, seal: str) -> Iterator[bytes]:
     for name in ("extensions", "documents", "growing"):  # as manifests were before there were any
         if not record[name]:
             del record[name]
-    head, mark, tail = json.dumps(record, indent=1, sort_keys=True).partition(
-        '\n "shards": ['
-    )  # no text of JSON holds a line break
+    text = json.dumps(record, indent=1, sort_keys=True)  # no text of JSON holds a line break
+    head, mark, tail = text.partition('\n "shards": [')
     yield f"{head}{mark}".encode()
     for number, shard in enumerate(manifest.shards):
         row = json.dumps(shard_row(shard), sort_keys=True)

@@ -9,7 +9,6 @@ before the first one that uses it (storage.records.packed_maps). Readers
 return the members of a sample together with those of its maps; writers take the same form.
 """
 
-import contextlib
 import io
 import os
 import re
@@ -20,7 +19,7 @@ from pathlib import Path
 from typing import BinaryIO
 
 from storage.atomic import atomic_writer
-from storage.errors import ShardMissing, TrilightError
+from storage.errors import ShardMissing, TrilightError, prefix_errors
 from storage.records.packed_maps import MAP_NAME, HeldMaps, map_member
 from storage.records.safe_read import open_plain
 from storage.records.sample import Sample, StoredSample, decode_sample, stored_sample
@@ -181,7 +180,7 @@ class ShardReader:
         Raises:
             TrilightError: it is not whole, not readable or breaks a law; names shard and sample.
         """
-        with self._name_errors():
+        with prefix_errors(self.name):
             sample = decode_sample(self.keys[row], self.members(self.keys[row]), self._held)
             sample.check()
             return sample
@@ -192,15 +191,8 @@ class ShardReader:
         Raises:
             TrilightError: its scene is not readable or breaks a law; names shard and sample.
         """
-        with self._name_errors():
+        with prefix_errors(self.name):
             return stored_sample(self.keys[row], self.members(self.keys[row]), self._held)
-
-    @contextlib.contextmanager
-    def _name_errors(self) -> Iterator[None]:
-        try:
-            yield
-        except TrilightError as error:
-            raise TrilightError(f"{self.name}: {error}") from error
 
     def members(
         self, key: str, accepts: Callable[[str], bool] = lambda suffix: True

@@ -257,18 +257,18 @@ def _level(
     record: LevelRecord, skins: Mapping[str, SkinQuality], arrays: Mapping[str, NDArray]
 ) -> Level:
     end = f"_{record.budget}"
-    own = {name.removesuffix(end): each for name, each in arrays.items() if name.endswith(end)}
+    of_level = {name.removesuffix(end): each for name, each in arrays.items() if name.endswith(end)}
     skin = None
     if (quality := skins.get(str(record.budget))) is not None:
-        first, second, third = (own[column].tobytes() for column in TEXTURED)
+        first, second, third = (of_level[column].tobytes() for column in TEXTURED)
         skin = LevelSkin(
-            uv=own["uv"],
+            uv=of_level["uv"],
             packed=(first, second, third),
-            packed_normal=own[NORMAL].tobytes() if NORMAL in own else None,
+            packed_normal=of_level[NORMAL].tobytes() if NORMAL in of_level else None,
             quality=quality,
-            emission=own.get("emission"),
+            emission=of_level.get("emission"),
         )
-    return Level(record=record, positions=own["positions"], faces=own["faces"], skin=skin)
+    return Level(record=record, positions=of_level["positions"], faces=of_level["faces"], skin=skin)
 
 
 @dataclass(frozen=True, kw_only=True)

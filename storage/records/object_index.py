@@ -30,9 +30,7 @@ from storage.records.safe_read import MAX_HEADER_BYTES, open_plain, safetensors_
 from storage.typed_json import read_json
 
 _FORMAT = 1
-_TYPES: Mapping[str, np.dtype[Any]] = {
-    "U8": np.dtype("<u1"), "U16": np.dtype("<u2"), "U32": np.dtype("<u4"), "U64": np.dtype("<u8"),
-}  # fmt: skip
+_TYPES = {"U8": "<u1", "U16": "<u2", "U32": "<u4", "U64": "<u8"}
 _NAME_BYTES = 16
 
 

@@ -26,7 +26,7 @@ from storage.conventions import (
     SCHEMA_VERSION,
 )
 from storage.digests import canonical_json, sha256_hex
-from storage.errors import TrilightError
+from storage.errors import TrilightError, prefix_errors
 from storage.records.material import chosen_columns, completed_rows, stored_columns, stored_names
 from storage.records.objects import text_record
 from storage.records.packed_maps import (
@@ -167,7 +167,7 @@ def decode_scene_file(data: bytes, name: str) -> Scene:
     """
     if len(data) > MAX_FILE_BYTES:
         raise TrilightError(f"{name}: {len(data)} bytes; expected at most {MAX_FILE_BYTES}.")
-    try:
+    with prefix_errors(name):
         arrays, metadata = read_safetensors(data, MAX_HEADER_BYTES)
         _check_names(arrays)
         if _METADATA not in metadata:
@@ -180,9 +180,7 @@ def decode_scene_file(data: bytes, name: str) -> Scene:
         fields |= {name: arrays[name] for name in (*ARRAY_FIELDS, *MAP_ARRAYS) if name in arrays}
         scene = record.scene(**fields)
         scene.check()
-    except TrilightError as error:
-        raise TrilightError(f"{name}: {error}") from error
-    return scene
+        return scene
 
 
 class LawfulProvenance(Law):
