@@ -194,18 +194,14 @@ def require_same_extensions(what: str, before: Mapping[str, str], now: Mapping[s
         if before.get(name) == now.get(name):
             continue
         if name not in now:
-            said = f"was begun with the extension {name}, which is not given"
-            step = f"add --extend {name} (in other processes {VARIABLE} names it)"
+            said = f"with the extension {name}, which is not given; add --extend {name} (in other "
+            said += f"processes {VARIABLE} names it)"
         elif name not in before:
-            said = f"was begun without the extension {name}"
-            step = f"leave --extend {name} away"
+            said = f"without the extension {name}; leave --extend {name} away"
         else:
-            said = (
-                f"was begun with another extension {name}: its sha256 was {before[name][:12]}, "
-                f"now {now[name][:12]}"
-            )
-            step = "restore that file"
-        raise TrilightError(f"{what} {said}; {step}, or choose another --out.")
+            said = f"with another extension {name}: its sha256 was {before[name][:12]}, now "
+            said += f"{now[name][:12]}; restore that file"
+        raise TrilightError(f"{what} was begun {said}, or choose another --out.")
 
 
 def _read(path: Path, display_path: str) -> bytes:
@@ -215,12 +211,10 @@ def _read(path: Path, display_path: str) -> bytes:
         )
     try:
         return path.read_bytes()
-    except FileNotFoundError as error:
-        raise TrilightError(f"extension {display_path}: no such file; {_EXPECTED}.") from error
     except OSError as error:
-        raise TrilightError(
-            f"extension {display_path}: cannot be read ({error.strerror})."
-        ) from error
+        is_missing = isinstance(error, FileNotFoundError)
+        why = f"no such file; {_EXPECTED}" if is_missing else f"cannot be read ({error.strerror})"
+        raise TrilightError(f"extension {display_path}: {why}.") from error
 
 
 def _run(path: Path, data: bytes, digest: str) -> Extension:

@@ -8,7 +8,6 @@ import itertools
 import math
 
 import numpy as np
-import pytest
 from numpy.typing import NDArray
 
 from scene_templates.layout import CameraPose
@@ -18,7 +17,7 @@ from scene_templates.sample_camera import CameraSettings, Sector, sample_camera
 from scene_templates.sample_lights import LightSettings, sample_lights
 from scene_templates.templates import TEMPLATES
 from tests.for_each import for_each
-from tests.scene_templates.balls import DEFAULTS, MANY, Drawn, drawn, drawn_once, template_settings
+from tests.scene_templates.balls import Drawn, drawn, template_settings
 from tests.scene_templates.published import side_row
 from tests.scene_templates.statistics import (
     Table,
@@ -138,33 +137,6 @@ def _place_table(scenes: list[Drawn]) -> Table:
 
 def test_a_single_object_is_placed_evenly_and_rests_half_the_time() -> None:
     require_plausible(_place_table(drawn(template_settings("plane", ROOM), COUNT)))
-
-
-@pytest.mark.slow("statistics")
-def test_how_far_crowding_shifts_sizes_and_shares() -> None:
-    """The price of objects that do not meet, with solid balls: the most crowded there are.
-
-    Sizes are drawn again where none fits, so that smaller ones remain. For one object the greatest
-    distance of the distribution functions stays below 0.1, for two below 0.25, for three below 0.4
-    (measured: 0.03, 0.21, 0.30). Balls claim all of their spheres; for meshes see
-    tests/pipeline/scenes. Resting needs the floor, and is rarer by at most 0.05 (measured: 0.47).
-    """
-    rests: list[bool] = []
-    sizes: dict[int, list[float]] = {1: [], 2: [], 3: []}
-    for one in drawn_once(DEFAULTS, MANY):
-        low, high = one.plan.family.object_scale
-        for row, placement in enumerate(one.layout.objects):
-            size = (4 * placement.pose.radius - low) / (high - low)
-            sizes[one.plan.num_objects].append(size)
-            rests.append(_rests(one, row))
-    for count, most in ((1, 0.1), (2, 0.25), (3, 0.4)):
-        values = np.sort(sizes[count])
-        assert values[0] >= 0
-        assert values[-1] <= 1
-        apart = np.abs(values - np.arange(len(values)) / len(values)).max()
-        assert apart < most
-    # 4000 tosses have a standard deviation of 0.008, nearly four of which are 0.03.
-    assert 0.45 - 0.03 < np.mean(rests) < 0.5 + 0.03
 
 
 def _off_deg(directions: NDArray[np.float64], sector: Sector) -> NDArray[np.float64]:

@@ -1,18 +1,15 @@
 """Surfaces: texels, finishes, what is laid and made of them, and which are drawn."""
 
 import dataclasses
-import math
 
 import numpy as np
 import pytest
 
 from scene_templates.surfaces.maps import MOST_ALBEDO, finish
 from scene_templates.surfaces.procedural_textures import (
-    HEXAGONS,
     OUR_SURFACES,
     SURFACES,
     SurfaceMapSettings,
-    _hexagon_of,
     draw_surface,
     exceeded_by,
     lay_rows,
@@ -147,19 +144,6 @@ def test_pieces_tile_the_map() -> None:
     d = 0.03
     expected = 1 - (1 - 2 * d * columns) * (1 - 2 * d * rows)
     assert (pieces.edge < d).mean() == pytest.approx(expected, abs=0.02)
-
-
-@pytest.mark.parametrize("name", HEXAGONS)
-def test_hexagons_are_equal_and_nearly_regular(name: str) -> None:
-    columns, rows = HEXAGONS[name]
-    assert columns / rows == pytest.approx(math.sqrt(0.75), rel=0.04)
-    index, edge = _hexagon_of(Texels(512), columns, rows)
-    counts = np.bincount(index.ravel(), minlength=columns * rows)
-    # of some 1,500 to 8,700 texels, those on the rim, of about 6 x 30, may fall to either side
-    assert np.abs(counts / (512 * 512 / columns / rows) - 1).max() < 0.06
-    # a hexagon of unit width shrunk by d on all sides keeps (1 - 2 d)^2 of its area
-    assert (edge > 0.1).mean() == pytest.approx(0.8 * 0.8, abs=0.02)
-    assert edge.min() > -0.02
 
 
 @for_each("share", [0.0, 0.1, 0.5, 1.0])

@@ -4,7 +4,6 @@ Scene and asset files come back exactly; what is none is refused before it takes
 """
 
 import dataclasses
-import io
 import json
 import math
 from pathlib import Path
@@ -12,10 +11,8 @@ from typing import Any
 
 import numpy as np
 import pytest
-import trimesh
 from safetensors.numpy import save
 
-from pipeline.objects.generated import encode_ply
 from storage.digests import sha256_hex
 from storage.errors import TrilightError
 from storage.records.asset import Asset, Level, LevelRecord, decode_asset, encode_asset
@@ -509,17 +506,3 @@ def test_judgements_follow_from_the_facts() -> None:
     assert not dataclasses.replace(SOURCE, nonmanifold_edges=1).watertight
     assert dataclasses.replace(SOURCE, num_faces_turned=1).repaired
     assert dataclasses.replace(SOURCE, num_faces=SOURCE.num_faces_read - 1).repaired
-
-
-@for_each("num_faces", [0, 300])
-def test_ply_reads_back_in_another_program(num_faces: int) -> None:
-    rng = np.random.default_rng(1)
-    positions = rng.random((50, 3)).astype(np.float32)
-    faces = rng.integers(0, 50, (num_faces, 3)).astype(np.uint32)
-    data = encode_ply(positions, faces)
-    header = data[: data.index(b"end_header\n") + 11]
-    assert len(data) == len(header) + 50 * 12 + num_faces * 13
-    if num_faces:
-        mesh = trimesh.load_mesh(io.BytesIO(data), file_type="ply", process=False)
-        assert np.array_equal(np.asarray(mesh.vertices, np.float32), positions)
-        assert np.array_equal(np.asarray(mesh.faces), faces)
