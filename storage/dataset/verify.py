@@ -14,10 +14,10 @@ from numpy.typing import NDArray
 
 from storage.dataset.dataset import Dataset, open_dataset, published_manifest
 from storage.dataset.layout import shard_names_in
-from storage.dataset.manifest import Manifest, ShardEntry, Totals, decode_manifest, index_stream
+from storage.dataset.manifest import Manifest, ShardEntry, Totals, decode_manifest
 from storage.dataset.planned import is_whole
 from storage.dataset.shard import ShardReader
-from storage.digests import seal_of, sha256_hex
+from storage.digests import seal_of, sha256_hex, sha256_of_stream
 from storage.errors import EnvironmentFailure, ShardMissing, TrilightError, Unreadable
 from storage.licences import mixed_share_alike
 from storage.machine import available_cores
@@ -193,14 +193,15 @@ def _check_shard(
             findings.unread += ["its server states no size"] * (num_bytes is None)
             return findings
         with _open_shard(dataset, shard) as stream:
-            if fast:
-                findings.keys += ShardReader(stream, shard.name).samples
-                if len(findings.keys) != shard.num_samples:
-                    findings.faults.append(
-                        f"{len(findings.keys)} samples; expected {shard.num_samples}"
-                    )
-            else:
-                _check_content(stream, shard, dataset.manifest, locked, findings)
+            opened = ShardReader(stream, shard.name)
+            findings.keys = opened.keys
+            if (count := len(opened.keys)) != shard.num_samples:
+                findings.faults.append(f"{count} samples; expected {shard.num_samples}")
+            if not fast:
+                stream.seek(0)
+                if sha256_of_stream(stream) != shard.sha256:
+                    findings.faults.append("sha256 differs from the manifest")
+                findings.faults += _check_content(opened, shard, dataset.manifest, locked)
     except EnvironmentFailure:
         raise
     except ShardMissing:
@@ -228,27 +229,22 @@ def _open_shard(dataset: Dataset, shard: ShardEntry) -> BinaryIO:
 
 
 def _check_content(
-    stream: BinaryIO,
+    opened: ShardReader,
     shard: ShardEntry,
     manifest: Manifest,
     locked: Mapping[str, LockedObject] | None,
-    findings: _ShardFindings,
-) -> None:
-    if index_stream(stream, shard.name) != shard:
-        findings.faults.append("sha256 or number of samples differs from the manifest")
-    opened = ShardReader(stream, shard.name)
+) -> Iterator[str]:
     unused = set(opened.maps)
     held = HeldMaps()
     for key, members in opened:
-        findings.keys.append(key)
         unused -= members.keys()
         try:
             sample = decode_sample(key, members, held)
         except TrilightError as error:
-            findings.faults.append(str(error))
-            continue
-        findings.faults += check_sample(sample, shard.split, manifest, locked)
-    findings.faults += [f"map {name} is used by no sample" for name in sorted(unused)]
+            yield str(error)
+        else:
+            yield from check_sample(sample, shard.split, manifest, locked)
+    yield from (f"map {name} is used by no sample" for name in sorted(unused))
 
 
 def check_sample(
