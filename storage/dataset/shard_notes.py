@@ -76,11 +76,6 @@ def encode_note(note: ShardNote) -> bytes:
     return canonical_json({"shard": shard_row(note.shard), "failures": failures, **cut})
 
 
-def decode_note(data: bytes, source: str) -> ShardNote:
-    """Return the note of a file; raises TrilightError, naming `source`, where it is none."""
-    return read_json(data, ShardNote, source)
-
-
 def noted_shard(folder: DatasetFolder, name: str) -> ShardNote:
     """Return what is known of a shard that is there: its note, or else by reading the shard.
 
@@ -94,7 +89,7 @@ def noted_shard(folder: DatasetFolder, name: str) -> ShardNote:
     shard = folder.shard(name)
     # a kill before the note leaves none; then, and where it is no note, the shard itself is read
     with contextlib.suppress(OSError, TrilightError):
-        note = decode_note(read_plain(path), str(path))
+        note = read_json(read_plain(path), ShardNote, str(path))
         if folder.is_sent(name):
             return note
         facts = shard.stat()
@@ -122,7 +117,7 @@ def fetch_notes(
 
     def fetch_note(name: str) -> ShardNote:
         try:
-            note = decode_note(read(name) or b"", name)
+            note = read_json(read(name) or b"", ShardNote, name)
             if not name.endswith(f"/{note.shard.name}{_SUFFIX}"):
                 raise TrilightError(note.shard.name)
         except TrilightError as error:
