@@ -7,6 +7,7 @@ colours, and from which side the camera looks.
 
 import dataclasses
 import math
+from collections.abc import Mapping
 from typing import Any
 
 from scene_templates.checks import Range
@@ -18,15 +19,35 @@ from scene_templates.settings import Excursion, SceneSettings
 _MEDIAN_EMISSION = 3750.0
 _MEDIAN_SIZE = 2.25
 
-_SURFACES = (
-    "checker", "stripes", "bricks", "tiles", "hexagons", "planks", "wood", "marble",
-    "terrazzo", "cobbles", "concrete", "rust", "brushed_metal", "fabric", "camouflage",
-)  # fmt: skip
-_SKIES = (
-    "sun_and_sky", "clouds", "night", "softboxes", "window_wall", "lobes", "gradient",
-    "constant",
-)  # fmt: skip
-_WITH_SUN = ("sun_and_sky",)
+_TEXTURED: Mapping[str, Any] = {
+    "textures.share": 1.0,
+    "textures.tile_m": (0.8, 0.8),
+    "textures.surfaces.families": (
+        "checker", "stripes", "bricks", "tiles", "hexagons", "planks", "wood", "marble",
+        "terrazzo", "cobbles", "concrete", "rust", "brushed_metal", "fabric", "camouflage",
+    ),
+    "textures.surfaces.size": 256,
+    "textures.surfaces.natural_share": 0.7,
+    "textures.surfaces.albedo": (0.02, 0.9),
+    "textures.surfaces.roughness_clip": (0.01, 1.0),
+}  # fmt: skip
+"""Every number of the surfaces is stated, since textures are in no scene of the base."""
+
+_BELOW_SKY: Mapping[str, Any] = {
+    "skies.share": 1.0,
+    "skies.over_lamps_log": (1.0, 1.0),
+    "skies.seen_share": 0.0,
+    "skies.maps.families": (
+        "sun_and_sky", "clouds", "night", "softboxes", "window_wall", "lobes", "gradient",
+        "constant",
+    ),
+    "skies.maps.height": 256,
+    "skies.maps.mean_radiance": (0.2, 2.0),
+    "skies.maps.coloured_share": 0.1,
+    "skies.maps.sun_elevation_deg": (2.0, 75.0),
+    "skies.maps.sun_to_sky": (2.0, 2.0),
+}  # fmt: skip
+"""Every number of the skies is stated, since the base has none."""
 
 
 def median_settings(max_triangles: int) -> SceneSettings:
@@ -82,18 +103,28 @@ def out_of_range_settings(max_triangles: int) -> SceneSettings:
 def out_of_range_2_settings(max_triangles: int) -> SceneSettings:
     """Return the same with excursions of what came later: 12 values of five axes of maps."""
     before = out_of_range_settings(max_triangles)
+    below_sun = {**_BELOW_SKY, "skies.maps.families": ("sun_and_sky",)}
     return dataclasses.replace(
         before,
         excursions=(
             *before.excursions,
-            *(_texture_excursion("textured", share, share, 0.8) for share in (0.5, 1.0)),
             *(
-                _texture_excursion("texture_tile_m", tile_m, 1.0, tile_m)
-                for tile_m in (0.1, 0.4, 1.6, 6.4)
+                _excursion("textured", share, {**_TEXTURED, "textures.share": share})
+                for share in (0.5, 1.0)
             ),
-            *(_sky("sky", over_lamps, over_lamps=over_lamps) for over_lamps in (0.1, 1.0, 10.0)),
-            _sky("sky_seen", 1, seen_share=1.0),
-            *(_sky("sun_to_sky", v, families=_WITH_SUN, sun_to_sky=v) for v in (8.0, 64.0)),
+            *(
+                _excursion("texture_tile_m", v, {**_TEXTURED, "textures.tile_m": _point(v)})
+                for v in (0.1, 0.4, 1.6, 6.4)
+            ),
+            *(
+                _excursion("sky", v, {**_BELOW_SKY, "skies.over_lamps_log": _point(v)})
+                for v in (0.1, 1.0, 10.0)
+            ),
+            _excursion("sky_seen", 1, {**_BELOW_SKY, "skies.seen_share": 1.0}),
+            *(
+                _excursion("sun_to_sky", v, {**below_sun, "skies.maps.sun_to_sky": _point(v)})
+                for v in (8.0, 64.0)
+            ),
         ),
     )
 
@@ -127,41 +158,3 @@ def _objects(count: int) -> Excursion:
     """So many objects of median size do not fit without overlap; published ones overlap too."""
     changes = {"families.num_objects": (count, count), "placement.overlap_share": 1.0}
     return _excursion("objects", count, changes)
-
-
-def _texture_excursion(axis: str, value: float, share: float, tile_m: float) -> Excursion:
-    """Every number of the surfaces is stated, since textures are in no scene of the base."""
-    changes = {
-        "textures.share": share,
-        "textures.tile_m": _point(tile_m),
-        "textures.surfaces.families": _SURFACES,
-        "textures.surfaces.size": 256,
-        "textures.surfaces.natural_share": 0.7,
-        "textures.surfaces.albedo": (0.02, 0.9),
-        "textures.surfaces.roughness_clip": (0.01, 1.0),
-    }
-    return _excursion(axis, value, changes)
-
-
-def _sky(
-    axis: str,
-    value: float,
-    *,
-    over_lamps: float = 1.0,
-    seen_share: float = 0.0,
-    families: tuple[str, ...] = _SKIES,
-    sun_to_sky: float = 2.0,
-) -> Excursion:
-    """Every number of the skies is stated, since the base has none."""
-    changes = {
-        "skies.share": 1.0,
-        "skies.over_lamps_log": _point(over_lamps),
-        "skies.seen_share": seen_share,
-        "skies.maps.families": families,
-        "skies.maps.height": 256,
-        "skies.maps.mean_radiance": (0.2, 2.0),
-        "skies.maps.coloured_share": 0.1,
-        "skies.maps.sun_elevation_deg": (2.0, 75.0),
-        "skies.maps.sun_to_sky": _point(sun_to_sky),
-    }
-    return _excursion(axis, value, changes)

@@ -35,9 +35,8 @@ class ScenePlan:
 def scene_plan(settings: SceneSettings, *, seed: int, scene_index: int) -> ScenePlan:
     """Return the plan of a scene; a pure function of its arguments."""
     rng = rng_for(seed, "scene-plan", scene_index)
-    round_number = scene_index // max(
-        1, len(settings.excursions)
-    )  # every excursion meets every family
+    # every excursion meets every family
+    round_number = scene_index // max(1, len(settings.excursions))
     settings = settings.of_scene(scene_index)
     family = _sample_family(rng, settings, round_number)
     return ScenePlan(

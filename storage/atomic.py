@@ -31,9 +31,8 @@ def atomic_writer(path: Path, *, replace: bool = True) -> Iterator[BinaryIO]:
     Raises:
         TrilightError: the disk is full (an EnvironmentFailure), or the place cannot be written.
     """
-    unique_suffix = (
-        f"{os.getpid()}-{os.urandom(4).hex()}"  # containers give all their processes number 1
-    )
+    # containers give all their processes number 1
+    unique_suffix = f"{os.getpid()}-{os.urandom(4).hex()}"
     temporary = path.with_name(f"{path.name}.{unique_suffix}{TEMPORARY_SUFFIX}")
     try:
         path.parent.mkdir(parents=True, exist_ok=True)

@@ -1,6 +1,7 @@
 """Errors: a user's mistake, a failure of the environment, an unusable item, a removed setting."""
 
-from collections.abc import Iterable, Mapping
+import contextlib
+from collections.abc import Iterable, Iterator, Mapping
 from difflib import get_close_matches
 from typing import Any, ClassVar
 
@@ -14,6 +15,15 @@ class TrilightError(ValueError):
 
     exit_status: ClassVar[int] = 1
     """Exit status of a process that ends with this error."""
+
+
+@contextlib.contextmanager
+def prefix_errors(prefix: str) -> Iterator[None]:
+    """Let the message of a TrilightError in the block begin with what it is about."""
+    try:
+        yield
+    except TrilightError as error:
+        raise TrilightError(f"{prefix}: {error}") from error
 
 
 class EnvironmentFailure(TrilightError):
@@ -44,9 +54,8 @@ class Rejected(Exception):
     """
 
     def __init__(self, reason: str, message: str) -> None:
-        super().__init__(
-            reason, message
-        )  # both in args, so that it survives the way out of a child
+        # both in args, so that it survives the way out of a child
+        super().__init__(reason, message)
         self.reason = reason
         self.message = message
 

@@ -163,7 +163,7 @@ def load_reference(reference: str) -> Iterator[Any]:
             f"{expected_one_of(match['function'], defined)}."
         )
     member = members[match["function"]]
-    with _as_loading(extension), _mistakes_of(extension.path):
+    with _as_loading(extension), mistakes_of_entry(file=extension.name):
         yield member() if callable(member) else member
 
 
@@ -194,18 +194,14 @@ def require_same_extensions(what: str, before: Mapping[str, str], now: Mapping[s
         if before.get(name) == now.get(name):
             continue
         if name not in now:
-            said = f"was begun with the extension {name}, which is not given"
-            step = f"add --extend {name} (in other processes {VARIABLE} names it)"
+            said = f"with the extension {name}, which is not given; add --extend {name} (in other "
+            said += f"processes {VARIABLE} names it)"
         elif name not in before:
-            said = f"was begun without the extension {name}"
-            step = f"leave --extend {name} away"
+            said = f"without the extension {name}; leave --extend {name} away"
         else:
-            said = (
-                f"was begun with another extension {name}: its sha256 was {before[name][:12]}, "
-                f"now {now[name][:12]}"
-            )
-            step = "restore that file"
-        raise TrilightError(f"{what} {said}; {step}, or choose another --out.")
+            said = f"with another extension {name}: its sha256 was {before[name][:12]}, now "
+            said += f"{now[name][:12]}; restore that file"
+        raise TrilightError(f"{what} was begun {said}, or choose another --out.")
 
 
 def _read(path: Path, display_path: str) -> bytes:
@@ -215,12 +211,10 @@ def _read(path: Path, display_path: str) -> bytes:
         )
     try:
         return path.read_bytes()
-    except FileNotFoundError as error:
-        raise TrilightError(f"extension {display_path}: no such file; {_EXPECTED}.") from error
     except OSError as error:
-        raise TrilightError(
-            f"extension {display_path}: cannot be read ({error.strerror})."
-        ) from error
+        is_missing = isinstance(error, FileNotFoundError)
+        why = f"no such file; {_EXPECTED}" if is_missing else f"cannot be read ({error.strerror})"
+        raise TrilightError(f"extension {display_path}: {why}.") from error
 
 
 def _run(path: Path, data: bytes, digest: str) -> Extension:
@@ -231,7 +225,7 @@ def _run(path: Path, data: bytes, digest: str) -> Extension:
     _loaded[path.name] = extension  # first: what it imports may load named extensions
     sys.modules[module.__name__] = module
     try:
-        with _as_loading(extension), _mistakes_of(path):
+        with _as_loading(extension), mistakes_of_entry(file=extension.name):
             exec(compile(data, str(path), "exec", dont_inherit=True), vars(module))
     except TrilightError:
         unload(extension)
@@ -251,32 +245,23 @@ def _as_loading(extension: Extension) -> Iterator[None]:
 
 
 @contextmanager
-def _mistakes_of(path: Path) -> Iterator[None]:
-    """Turn what code of an extension raises into one line with the line of the file.
+def mistakes_of_entry(entry: str = "", *, file: str = "") -> Iterator[None]:
+    """Turn what code of an extension raises into one line with its place.
 
-    Raises:
-        TrilightError: the code raised something.
-    """
-    try:
-        yield
-    except (Exception, SystemExit) as error:
-        raise mistake_in_extension(error) or _mistake(path.name, None, error) from error
-
-
-@contextmanager
-def mistakes_of_entry(entry: str) -> Iterator[None]:
-    """Turn what an extension's entry, such as a family, raises into one line with its place.
+    Args:
+        entry: what the code makes, such as a family.
+        file: name of the extension that runs; empty where other code may raise something too.
 
     Raises:
         TrilightError: the code raised something; other code's errors are raised as they are.
     """
     try:
         yield
-    except Exception as error:
+    except (Exception, SystemExit) as error:
         its_author = mistake_in_extension(error, entry)
-        if its_author is None:
+        if its_author is None and not file:
             raise
-        raise its_author from error
+        raise its_author or _mistake(file, None, error) from error
 
 
 def mistake_in_extension(error: BaseException, entry: str = "") -> TrilightError | None:

@@ -47,9 +47,8 @@ def order_installed_first(paths: Sequence[str]) -> list[str]:
     if folder in [*_named_paths(), str(IMPORT_ROOT)]:
         return list(paths)
     other_paths = [path for path in paths if path not in ("", folder)]
-    ours = (
-        [] if str(IMPORT_ROOT) in other_paths else [str(IMPORT_ROOT)]
-    )  # a hook of pip's finds us later
+    # a hook of pip's finds us later
+    ours = [] if str(IMPORT_ROOT) in other_paths else [str(IMPORT_ROOT)]
     return [*other_paths, *ours, *(path for path in paths if path in ("", folder))]
 
 

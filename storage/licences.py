@@ -18,35 +18,21 @@ DUTIES: Mapping[str, str] = {
 }
 """Everything that a licence may ask for, with what it means here, in the order of documents."""
 
-_NONE = ()
-_NOTICE = ("notice",)
-_NOTICE_CHANGES = ("changes", "notice")
 _SHARED_CODE = ("changes", "notice", "share-alike")
 
-_KNOWN: Mapping[str, tuple[str, ...]] = {
-    "0BSD": _NONE,
-    "CC-PDDC": _NONE,
-    "CC0-1.0": _NONE,
-    "MIT-0": _NONE,
-    "PDDL-1.0": _NONE,
-    "Unlicense": _NONE,
-    "BSD-2-Clause": _NOTICE,
-    "BSD-3-Clause": _NOTICE,
-    "CDLA-Permissive-1.0": _NOTICE,
-    "CDLA-Permissive-2.0": _NOTICE,
-    "ISC": _NOTICE,
-    "MIT": _NOTICE,
-    "Apache-2.0": _NOTICE_CHANGES,
-    "ODC-By-1.0": ("attribution", "notice"),
-    "CDLA-Sharing-1.0": ("attribution", *_SHARED_CODE),
-    "LAL-1.3": ("attribution", *_SHARED_CODE),
-    "MPL-2.0": _SHARED_CODE,
-    "ODbL-1.0": ("attribution", "notice", "share-alike"),
-} | {
-    f"{family}-{suffix}": _SHARED_CODE
-    for family in ("GPL-2.0", "GPL-3.0", "LGPL-2.1", "LGPL-3.0", "AGPL-3.0")
-    for suffix in ("only", "or-later")
+_BY_DUTIES: Mapping[tuple[str, ...], str] = {
+    (): "0BSD CC-PDDC CC0-1.0 MIT-0 PDDL-1.0 Unlicense",
+    ("notice",): ("BSD-2-Clause BSD-3-Clause CDLA-Permissive-1.0 CDLA-Permissive-2.0 ISC MIT"),
+    ("changes", "notice"): "Apache-2.0",
+    ("attribution", "notice"): "ODC-By-1.0",
+    ("attribution", "notice", "share-alike"): "ODbL-1.0",
+    ("attribution", *_SHARED_CODE): "CDLA-Sharing-1.0 LAL-1.3",
+    _SHARED_CODE: (
+        "AGPL-3.0-only AGPL-3.0-or-later GPL-2.0-only GPL-2.0-or-later GPL-3.0-only "
+        "GPL-3.0-or-later LGPL-2.1-only LGPL-2.1-or-later LGPL-3.0-only LGPL-3.0-or-later MPL-2.0"
+    ),
 }
+_KNOWN = {name: duties for duties, names in _BY_DUTIES.items() for name in names.split()}
 _BY_FOLDED = {name.casefold(): name for name in _KNOWN}
 
 _CREATIVE_COMMONS = re.compile(

@@ -54,31 +54,27 @@ class Registry(Mapping[str, Entry], Generic[Entry]):
         something is made of it and no file is being loaded, so that nothing could record it.
         """
         extension = loading()
+        stated_name = getattr(entry, "name", name)
+        refusal = ""
         if extension is None and self._decides:
-            raise TrilightError(
-                f"{self.what} {name!r} is registered outside an extension, so what is made with it "
-                "could not record its origin; expected the call in a file that --extend names, or "
-                "that storage.extensions.load_extension loads."
+            refusal = (
+                " is registered outside an extension, so what is made with it could not record its "
+                "origin; expected the call in a file that --extend names, or that "
+                "storage.extensions.load_extension loads."
             )
-        if not isinstance(name, str) or not _NAME.fullmatch(name):
-            raise TrilightError(
-                f"{self.what} {name!r}: not a valid name; expected up to 64 letters, digits and "
-                "_ . + : -"
-            )
-        if name in self:
+        elif not isinstance(name, str) or not _NAME.fullmatch(name):
+            refusal = ": not a valid name; expected up to 64 letters, digits and _ . + : -"
+        elif name in self:
             origin = self._origins.get(name)
             owner = origin.name if origin else "Trilight itself"
-            raise TrilightError(f"{self.what} {name!r} is taken by {owner}; expected another name.")
-        if not isinstance(entry, self._kind):
+            refusal = f" is taken by {owner}; expected another name."
+        elif not isinstance(entry, self._kind):
             expected_type = getattr(self._kind, "__name__", str(self._kind))
-            raise TrilightError(
-                f"{self.what} {name!r} is a {type(entry).__name__}; expected a {expected_type}."
-            )
-        stated_name = getattr(entry, "name", name)
-        if stated_name != name:
-            raise TrilightError(
-                f"{self.what} {name!r} has the name {stated_name!r} itself; expected the same."
-            )
+            refusal = f" is a {type(entry).__name__}; expected a {expected_type}."
+        elif stated_name != name:
+            refusal = f" has the name {stated_name!r} itself; expected the same."
+        if refusal:
+            raise TrilightError(f"{self.what} {name!r}{refusal}")
         self._entries[name] = entry
         if extension:
             self._origins[name] = extension

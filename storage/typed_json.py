@@ -7,9 +7,11 @@ The type is a dataclass, or made of dataclasses; ranges and spellings are notes 
 """
 
 import json
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import Annotated, Any, TypeVar, cast
 
+from storage.conventions import require_readable
 from storage.errors import TrilightError
 from storage.settings.ranges import Law
 
@@ -42,17 +44,20 @@ class Finite(Law):
         return value
 
 
-class Dropped:
-    """Note at a field whose JSON is read and not kept."""
+@dataclass(frozen=True)
+class Converted:
+    """Note at a field that holds what a function makes of its JSON."""
+
+    convert: Callable[[Any], Any]
 
     def __get_pydantic_core_schema__(self, source: Any, handler: Any) -> Any:
-        """Let pydantic take anything, for None."""
+        """Let pydantic take anything, and call the function."""
         from pydantic_core import core_schema
 
-        return core_schema.no_info_plain_validator_function(lambda value: None)
+        return core_schema.no_info_plain_validator_function(self.convert)
 
 
-DROPPED = Dropped()
+DROPPED = Converted(lambda value: None)
 FINITE = Finite()
 Sha256 = Annotated[str, Spelled("[0-9a-f]{64}", "64 hexadecimal digits")]
 ShortText = Annotated[str, Spelled(".{0,1000}", "a text of at most 1000 characters")]
@@ -76,6 +81,32 @@ def read_json(data: bytes | str, kind: type[T], source: str) -> T:
     if value is None:
         raise TrilightError(f"{source}: null; expected the file as it was written.")
     return cast(T, value)
+
+
+def read_versioned(data: bytes | str, kind: type[T], source: str, versions: Sequence[int]) -> T:
+    """Return the value of a JSON text that states its `schema_version`; otherwise as `read_json`.
+
+    A text of another version need not be of this type: then its version says more.
+
+    Args:
+        data, kind, source: as `read_json`.
+        versions: those that are read.
+    """
+    try:
+        value = read_json(data, kind, source)
+    except TrilightError:
+        require_readable(_stated_version(data, versions[0]), source, versions)
+        raise
+    require_readable(vars(value)["schema_version"], source, versions)
+    return value
+
+
+def _stated_version(data: bytes | str, default: int) -> object:
+    """Return the version that a text of unknown form states; `default` where it states none."""
+    try:
+        return json.loads(data)["schema_version"]
+    except (ValueError, LookupError, TypeError, RecursionError):
+        return default
 
 
 def read_json_lines(data: bytes, kind: type[T], source: str, *, torn_end: bool = False) -> list[T]:

@@ -379,7 +379,7 @@ def quantities_page() -> str:
 def maps_page() -> str:
     """Return the page of the distributions of procedural surfaces and skies, in natural colors."""
     albedo = SurfaceMapSettings().albedo
-    skies = SkyMapSettings()
+    skies = SkyMapSettings(coloured_share=0.0)
     parts = [_MAPS.format(least_tint=LEAST_TINT, palest=PALEST), "## Surfaces\n"]
     for name in OUR_SURFACES:
         parts += _family(
@@ -390,10 +390,7 @@ def maps_page() -> str:
     for name in OUR_SKIES:
         parts += _family(
             name, SKIES[name], SkyTexels(1), ("coloured lights",),
-            lambda rng: SkyDraws(
-                rng, coloured_share=0.0, sun_elevation_deg=skies.sun_elevation_deg,
-                sun_to_sky=skies.sun_to_sky,
-            ),
+            lambda rng: SkyDraws(rng, skies),
         )  # fmt: skip
     return "\n".join(parts)
 

@@ -31,7 +31,7 @@ from storage.dataset.progress import announce_downloads, announce_objects, count
 from storage.dataset.splits import require_objects, split_of_object, split_of_shard
 from storage.digests import canonical_json, sha256_hex
 from storage.errors import EnvironmentFailure, TrilightError
-from storage.records.object_index import IndexedObject, ObjectIndex, write_object_index
+from storage.records.object_index import IndexedObject, IndexFacts, ObjectIndex, write_object_index
 from storage.records.objects import (
     OBJECT,
     Failure,
@@ -335,15 +335,14 @@ class ObjectLock:
                         )
                     )
                 offset += len(line)
-        write_object_index(
-            folder.staged_index,
-            objects,
+        facts = IndexFacts(
             lock_sha256=self.writer.manifest.objects_lock_sha256,
             lock_bytes=offset,
-            request_digest=self._digest,
+            asked=self._digest,
             num_found=num_found,
             num_maps=len(locked) - len(objects),
         )
+        write_object_index(folder.staged_index, objects, facts)
         self.writer.publish(folder.staged_index)
 
 

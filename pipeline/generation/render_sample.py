@@ -17,7 +17,7 @@ from pipeline.renders.renderer import SceneRenderer
 from pipeline.renders.results import RenderedView
 from pipeline.scenes.views import ViewCamera, Visibility, cameras_of, cameras_of_view, with_cameras
 from storage.dataset.layout import DatasetFolder
-from storage.dataset.progress import forget_views, tell_views
+from storage.dataset.progress import tell_views
 from storage.errors import Rejected
 from storage.records.objects import Failure
 from storage.records.passes.pictures import passes_exr
@@ -52,7 +52,7 @@ class ViewProgress:
     def end(self) -> None:
         """Delete the progress of the scene."""
         if self._folder is not None:
-            forget_views(self._folder, self._scene_index)
+            tell_views(self._folder, self._scene_index, None)
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)

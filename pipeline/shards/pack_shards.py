@@ -413,7 +413,7 @@ def _forget_unused(folder: DatasetFolder) -> None:
         if read_head(folder.manifest).objects_lock_sha256:
             return
         folder.objects_lock.unlink(missing_ok=True)  # a kill came before the manifest named it
-        if not folder.shard_files() and not any(folder.staged_samples.rglob("*.tar")):
+        if not any(shard_names_in(folder.root)) and not any(folder.staged_samples.rglob("*.tar")):
             folder.manifest.unlink()
 
 

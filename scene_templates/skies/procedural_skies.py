@@ -64,26 +64,16 @@ def planckian_rgb(mired: float) -> Numbers:
 class SkyDraws(RecordedSampler):
     """Draws by name, and colours of lights that follow the sky's own choice."""
 
-    def __init__(
-        self,
-        rng: np.random.Generator,
-        *,
-        coloured_share: float,
-        sun_elevation_deg: tuple[float, float] = (2.0, 75.0),
-        sun_to_sky: tuple[float, float] = (0.5, 8.0),
-    ) -> None:
+    def __init__(self, rng: np.random.Generator, settings: "SkyMapSettings") -> None:
         """Begin a sky.
 
         Args:
             rng: where the numbers come from.
-            coloured_share: probability of lights of any colour, for all lights of the sky.
-            sun_elevation_deg: range of the sun's elevation.
-            sun_to_sky: range of the sun's irradiance over the sky's.
+            settings: ranges of the sky's sun, and probability of lights of any colour.
         """
         super().__init__(rng)
-        self._coloured = self.holds("coloured lights", coloured_share)
-        self.sun_elevation_deg = sun_elevation_deg
-        self.sun_to_sky = sun_to_sky
+        self._coloured = self.holds("coloured lights", settings.coloured_share)
+        self.settings = settings
 
     def light(self, name: str, *, mired: tuple[float, float]) -> Numbers:
         """Return the colour [3], of mean 1, of a light.
@@ -120,8 +110,8 @@ def sun_and_sky(draws: SkyDraws, texels: SkyTexels) -> Numbers:
     multiple of what the rest of the upper half sends onto a horizontal plane, wherever a texel of
     it is above the horizon.
     """
-    towards = draws.direction("sun", *draws.sun_elevation_deg)
-    ratio = draws.uniform("irradiance of the sun over that of the sky", *draws.sun_to_sky)
+    towards = draws.direction("sun", *draws.settings.sun_elevation_deg)
+    ratio = draws.uniform("irradiance of the sun over that of the sky", *draws.settings.sun_to_sky)
     zenith = draws.blue("zenith")
     horizon = draws.light("horizon", mired=(120, 170))
     brightening = draws.uniform("horizon over zenith", 1.5, 5.0)
@@ -305,14 +295,14 @@ _OURS: tuple[SkyFamily, ...] = (
     sun_and_sky, clouds, night, softboxes, window_wall, lobes, gradient, constant,
 )  # fmt: skip
 
-OUR_SKIES = tuple(make.__name__ for make in _OURS)
-"""What skies are drawn from unless the settings say otherwise; registering another does not change
-it."""
-
 SKIES: Registry[SkyFamily] = Registry(
-    "sky", Callable, dict(zip(OUR_SKIES, _OURS, strict=True)), decides=("data",)
+    "sky", Callable, {make.__name__: make for make in _OURS}, decides=("data",)
 )
 """Every name that `SkyMapSettings.families` admits."""
+
+OUR_SKIES = tuple(SKIES)
+"""What skies are drawn from unless the settings say otherwise; registering another does not change
+it."""
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -364,12 +354,7 @@ def draw_sky(rng: np.random.Generator, settings: SkyMapSettings) -> SkyMap:
     """
     name = settings.families[int(rng.integers(len(settings.families)))]
     texels = SkyTexels(settings.height)
-    draws = SkyDraws(
-        rng,
-        coloured_share=settings.coloured_share,
-        sun_elevation_deg=settings.sun_elevation_deg,
-        sun_to_sky=settings.sun_to_sky,
-    )
+    draws = SkyDraws(rng, settings)
     mean = draws.uniform("mean radiance", *settings.mean_radiance)
     shape = SKIES[name](draws, texels)
     red, green, blue = texels.flux(shape)

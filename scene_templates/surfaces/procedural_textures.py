@@ -430,14 +430,14 @@ _OURS: tuple[SurfaceFamily, ...] = (
     concrete, rust, brushed_metal, fabric, camouflage,
 )  # fmt: skip
 
-OUR_SURFACES = tuple(make.__name__ for make in _OURS)
-"""What surfaces are drawn from unless the settings say otherwise; registering another does not
-change it."""
-
 SURFACES: Registry[SurfaceFamily] = Registry(
-    "surface", Callable, dict(zip(OUR_SURFACES, _OURS, strict=True)), decides=("data",)
+    "surface", Callable, {make.__name__: make for make in _OURS}, decides=("data",)
 )
 """Every name that `SurfaceMapSettings.families` admits."""
+
+OUR_SURFACES = tuple(SURFACES)
+"""What surfaces are drawn from unless the settings say otherwise; registering another does not
+change it."""
 
 
 @checked("surface settings")

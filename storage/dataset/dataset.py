@@ -109,13 +109,15 @@ class Dataset:
         """The dataset digest (storage.dataset.manifest)."""
         return self.manifest.dataset_digest
 
-    def shards_of(self, split: str) -> list[ShardEntry]:
-        """Return the shards of one split, by name."""
-        return [shard for shard in self.manifest.shards if shard.split == split]
+    def shards_of(self, split: str | None) -> list[ShardEntry]:
+        """Return the shards of one split, or of all, by name."""
+        if split not in (None, *SPLITS):
+            raise TrilightError(f"split is {split!r}; expected one of {', '.join(SPLITS)}.")
+        return [shard for shard in self.manifest.shards if split in (None, shard.split)]
 
     def scenes(self, split: str | None = None) -> Iterator[SceneRecord]:
         """Yield the scenes of a split, or of all, without their pictures; as `read_scenes`."""
-        for shard in self._shards(split):
+        for shard in self.shards_of(split):
             yield from self.read_scenes(shard)
 
     def samples(self, split: str | None = None) -> Iterator[Sample]:
@@ -124,15 +126,8 @@ class Dataset:
         `sample.radiance_rgb` is [V, R, R, 3] float32 linear radiance of the cameras of
         `sample.scene`, and `sample.views` says of each how it was rendered, and its error.
         """
-        for shard in self._shards(split):
+        for shard in self.shards_of(split):
             yield from self.read_shard(shard)
-
-    def _shards(self, split: str | None) -> list[ShardEntry]:
-        if split is None:
-            return list(self.manifest.shards)
-        if split not in SPLITS:
-            raise TrilightError(f"split is {split!r}; expected one of {', '.join(SPLITS)}.")
-        return self.shards_of(split)
 
     def read_shard(self, shard: ShardEntry) -> Iterator[Sample]:
         """Yield the samples of a shard in the order of the file, after checking its digest.

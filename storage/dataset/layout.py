@@ -183,10 +183,6 @@ class DatasetFolder:
         """Return whether a shard is known to be in the bucket; its bytes need not be here."""
         return bool(self.bucket) and (self.staged_sent / name).exists()
 
-    def shard_files(self) -> list[Path]:
-        """Return every file that is called like a shard, listed in the manifest or not."""
-        return sorted(self.root / name for name in shard_names_in(self.root))
-
     @property
     def is_at_work(self) -> bool:
         """True while a process of this machine, or one whose locks reach here, works on it."""

@@ -21,7 +21,7 @@ from pathlib import Path, PurePosixPath
 from typing import Annotated, Any, BinaryIO, Literal
 
 from storage.atomic import atomic_writer
-from storage.conventions import MANIFEST_VERSION, READABLE_MANIFESTS, SPLITS, require_readable
+from storage.conventions import MANIFEST_VERSION, READABLE_MANIFESTS, SPLITS
 from storage.dataset.layout import numbered_path
 from storage.dataset.shard import scan_samples
 from storage.digests import canonical_json, sha256_hex, sha256_of_stream
@@ -29,7 +29,7 @@ from storage.errors import TrilightError
 from storage.records.safe_read import open_plain
 from storage.remote.store import MAX_FILE_BYTES
 from storage.settings.ranges import Within
-from storage.typed_json import DROPPED, FINITE, Sha256, ShortText, Spelled, read_json
+from storage.typed_json import DROPPED, FINITE, Sha256, ShortText, Spelled, read_versioned
 
 SHARD_NAME = re.compile(rf"(?:part-\d{{4,6}}/)?({'|'.join(SPLITS)})-(\d{{6}})\.tar")
 """Names are relative to the manifest and cannot leave its folder."""
@@ -125,12 +125,16 @@ class Manifest(_Fields):
     def num_bytes(self) -> int:
         return sum(shard.num_bytes for shard in self.shards)
 
+    def setting(self, group: str, name: str, kind: Any) -> Any:
+        """Return one of its settings of a kind; None where they do not say it, or another kind."""
+        settings = self.settings.get(group)
+        value = settings.get(name) if isinstance(settings, Mapping) else None
+        return value if isinstance(value, kind) else None
+
     @property
     def passes(self) -> tuple[str, ...]:
         """Names of the passes of each picture; none where the settings do not name them."""
-        storage = self.settings.get("storage")
-        names = storage.get("passes") if isinstance(storage, Mapping) else None
-        return tuple(map(str, names)) if isinstance(names, list | tuple) else ()
+        return tuple(map(str, self.setting("storage", "passes", list | tuple) or ()))
 
     @property
     def identity(self) -> object:
@@ -201,9 +205,8 @@ def _encode_rows(manifest: Manifest, seal: str) -> Iterator[bytes]:
     for name in ("extensions", "documents", "growing"):  # as manifests were before there were any
         if not record[name]:
             del record[name]
-    head, mark, tail = json.dumps(record, indent=1, sort_keys=True).partition(
-        '\n "shards": ['
-    )  # no text of JSON holds a line break
+    text = json.dumps(record, indent=1, sort_keys=True)  # no text of JSON holds a line break
+    head, mark, tail = text.partition('\n "shards": [')
     yield f"{head}{mark}".encode()
     for number, shard in enumerate(manifest.shards):
         row = json.dumps(shard_row(shard), sort_keys=True)
@@ -260,20 +263,6 @@ def decode_manifest(data: bytes, place: str) -> Manifest:
     """Return the manifest of a file, called `place`; raises as `read_manifest`."""
     if len(data) > _HEAD_BYTES + _ROW_BYTES * data.count(b'.tar"'):
         raise TrilightError(f"{place}: {len(data)} bytes are too many for the shards in it.")
-    try:
-        stored = read_json(data, StoredManifest, place)
-    except TrilightError:
-        if (version := _version_of(data)) is not None:
-            require_readable(version, place, READABLE_MANIFESTS)
-        raise
-    require_readable(stored.schema_version, place, READABLE_MANIFESTS)
+    stored = read_versioned(data, StoredManifest, place, READABLE_MANIFESTS)
     fields = {field.name: getattr(stored, field.name) for field in dataclasses.fields(_Fields)}
     return Manifest(stored=stored, **fields)
-
-
-def _version_of(data: bytes) -> object:
-    """Return the version that a manifest of unknown form states; None where it states none."""
-    try:
-        return json.loads(data)["schema_version"]
-    except (ValueError, LookupError, TypeError, RecursionError):
-        return None

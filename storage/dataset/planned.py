@@ -4,7 +4,7 @@ from storage.dataset.derived import derivation_of
 from storage.dataset.manifest import Manifest, ShardEntry, number_of_shard
 from storage.dataset.settings import SplitSettings
 from storage.dataset.splits import cut_splits, scenes_of_shard, shard_name, shards_for
-from storage.errors import TrilightError
+from storage.errors import TrilightError, prefix_errors
 from storage.settings.described import from_record
 
 
@@ -63,7 +63,5 @@ def num_planned(manifest: Manifest) -> int:
 
 
 def _splits(manifest: Manifest) -> SplitSettings:
-    try:
+    with prefix_errors("manifest: settings.splits"):
         return from_record(SplitSettings, manifest.settings.get("splits"))
-    except TrilightError as error:
-        raise TrilightError(f"manifest: settings.splits: {error}") from error

@@ -134,21 +134,19 @@ def _scenes_given_up(folder: DatasetFolder, manifest: Manifest) -> int:
     return 0
 
 
-def tell_views(folder: DatasetFolder, scene_index: int, views: float) -> None:
+def tell_views(folder: DatasetFolder, scene_index: int, views: float | None) -> None:
     """Record how many views of an unfinished scene are done; the current one counts in part.
 
-    The note only shows progress, so failing to write it is no error.
+    None deletes the note: the scene is finished, or starts again. It only shows progress, so
+    failing to write it is no error.
     """
+    path = folder.staged_at_work / numbered_path(scene_index, f"{scene_index:09d}")
     with contextlib.suppress(OSError):
-        path = folder.staged_at_work / numbered_path(scene_index, f"{scene_index:09d}")
-        path.parent.mkdir(parents=True, exist_ok=True)
-        path.write_text(f"{views:.3f}")
-
-
-def forget_views(folder: DatasetFolder, scene_index: int) -> None:
-    """Delete the note of `tell_views`: the scene is finished, or starts again."""
-    with contextlib.suppress(OSError):
-        (folder.staged_at_work / numbered_path(scene_index, f"{scene_index:09d}")).unlink()
+        if views is None:
+            path.unlink()
+        else:
+            path.parent.mkdir(parents=True, exist_ok=True)
+            path.write_text(f"{views:.3f}")
 
 
 def read_progress(folder: DatasetFolder) -> Progress:

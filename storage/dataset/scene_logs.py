@@ -116,12 +116,6 @@ def _rows_of(paths: Iterator[str]) -> Iterator[SceneLog]:
 
 def _logs(folder: Path | str) -> Iterator[tuple[str, int]]:
     """Yield path and time of each log, of the folder and of its parts."""
-    try:
-        entries = list(os.scandir(folder))
-    except FileNotFoundError:
-        return
-    for entry in entries:
-        if entry.name.endswith(".jsonl"):
-            yield entry.path, entry.stat().st_mtime_ns
-        elif entry.is_dir():
-            yield from _logs(entry.path)
+    for place, _, names in os.walk(folder):
+        for path in (os.path.join(place, name) for name in names if name.endswith(".jsonl")):
+            yield path, os.stat(path).st_mtime_ns

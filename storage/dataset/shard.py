@@ -9,9 +9,7 @@ before the first one that uses it (storage.records.packed_maps). Readers
 return the members of a sample together with those of its maps; writers take the same form.
 """
 
-import contextlib
 import io
-import json
 import os
 import re
 import tarfile
@@ -21,9 +19,10 @@ from pathlib import Path
 from typing import BinaryIO
 
 from storage.atomic import atomic_writer
-from storage.errors import ShardMissing, TrilightError
-from storage.records.packed_maps import MAP_NAME, referenced_maps
+from storage.errors import ShardMissing, TrilightError, prefix_errors
+from storage.records.packed_maps import MAP_NAME, HeldMaps, map_member
 from storage.records.safe_read import open_plain
+from storage.records.sample import Sample, StoredSample, decode_sample, stored_sample
 
 
 def write_shard(path: Path, samples: Iterable[tuple[str, Mapping[str, bytes]]]) -> None:
@@ -152,12 +151,13 @@ def scan_samples(
 class ShardReader:
     """An open shard, which gives any of its samples, in any order and to several threads."""
 
-    def __init__(self, stream: BinaryIO, name: str) -> None:
+    def __init__(self, stream: BinaryIO, name: str, held: HeldMaps | None = None) -> None:
         """Read the headers; raises TrilightError as `scan_samples`, and closes the file then.
 
         Args:
             stream: the shard, a file of this machine.
             name: of the shard, for messages.
+            held: maps of other shards that were unpacked already.
         """
         self.name = name
         self.maps: dict[str, Member] = {}
@@ -170,6 +170,29 @@ class ShardReader:
             raise
         self.samples: Mapping[str, Mapping[str, Member]] = samples
         """Members by suffix of each sample by key, in the order of the file."""
+        self.keys = list(samples)
+        """The keys of its samples, in the order of the file."""
+        self._held = HeldMaps() if held is None else held
+
+    def sample(self, row: int) -> Sample:
+        """Return a sample that passes `Sample.check`.
+
+        Raises:
+            TrilightError: it is not whole, not readable or breaks a law; names shard and sample.
+        """
+        with prefix_errors(self.name):
+            sample = decode_sample(self.keys[row], self.members(self.keys[row]), self._held)
+            sample.check()
+            return sample
+
+    def stored_sample(self, row: int) -> StoredSample:
+        """Return a sample whose pictures are unpacked when they are asked for.
+
+        Raises:
+            TrilightError: its scene is not readable or breaks a law; names shard and sample.
+        """
+        with prefix_errors(self.name):
+            return stored_sample(self.keys[row], self.members(self.keys[row]), self._held)
 
     def members(
         self, key: str, accepts: Callable[[str], bool] = lambda suffix: True
@@ -186,19 +209,15 @@ class ShardReader:
             TrilightError: there is no such sample, or the shard has become shorter.
         """
         if key not in self.samples:
-            keys = list(self.samples)
-            held = f"{keys[0]} to {keys[-1]}" if keys else "none"
+            held = f"{self.keys[0]} to {self.keys[-1]}" if self.keys else "none"
             raise TrilightError(
-                f"{self.name}: no sample {key}; expected one of its {len(keys)}: {held}."
+                f"{self.name}: no sample {key}; expected one of its {len(self.keys)}: {held}."
             )
         selected = {name: member for name, member in self.samples[key].items() if accepts(name)}
         members = {name: self.read(member) for name, member in selected.items()}
-        names: Iterable[str] = ()
-        if self.maps and "json" in members:
-            with contextlib.suppress(ValueError, RecursionError):  # its decoder says what is wrong
-                names = referenced_maps(json.loads(members["json"]))
+        digests = re.findall("[0-9a-f]{64}", members.get("json", b"").decode(errors="replace"))
+        maps = {name: self.maps[name] for name in map(map_member, digests) if name in self.maps}
         start = min(member.offset for member in self.samples[key].values())
-        maps = {name: self.maps[name] for name in names if name in self.maps}
         before = {name: map_ for name, map_ in maps.items() if map_.offset < start}
         return members | {name: self.read(map_) for name, map_ in before.items()}
 

@@ -10,6 +10,7 @@ from collections.abc import Callable, Iterable, Iterator
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Annotated
 
 from storage.atomic import write_atomically
 from storage.dataset.dataset import Dataset
@@ -27,7 +28,7 @@ from storage.digests import canonical_json
 from storage.errors import TrilightError
 from storage.records.objects import Failure, decode_failures, encode_failures, read_failures
 from storage.records.safe_read import read_plain
-from storage.typed_json import read_json
+from storage.typed_json import Converted, read_json
 
 _SUFFIX = ".json"
 _AT_ONCE = 32
@@ -39,18 +40,12 @@ class ShardNote:
     """Contents of the note on a finished shard."""
 
     shard: ShardEntry
-    failures: tuple[Failure, ...]
-    """Scenes that were given up, and rejected attempts."""
+    failures: Annotated[
+        tuple[Failure, ...], Converted(lambda text: tuple(decode_failures(str(text).encode())))
+    ]
+    """Scenes that were given up, and rejected attempts; in the file, lines as in failures.jsonl."""
     scenes: Scenes | None = None
     """Scenes so far of a shard in a bucket that still grows; None for a full shard."""
-
-
-@dataclass(frozen=True, kw_only=True)
-class _Note(ShardNote):
-    """File of a note."""
-
-    failures: str = ""  # type: ignore[assignment]
-    """Lines as in failures.jsonl."""
 
 
 def rejections_of_shard(folder: DatasetFolder, name: str) -> Path:
@@ -81,13 +76,6 @@ def encode_note(note: ShardNote) -> bytes:
     return canonical_json({"shard": shard_row(note.shard), "failures": failures, **cut})
 
 
-def decode_note(data: bytes, source: str) -> ShardNote:
-    """Return the note of a file; raises TrilightError, naming `source`, where it is none."""
-    note = read_json(data, _Note, source)
-    failures = tuple(decode_failures(note.failures.encode()))
-    return ShardNote(shard=note.shard, failures=failures, scenes=note.scenes)
-
-
 def noted_shard(folder: DatasetFolder, name: str) -> ShardNote:
     """Return what is known of a shard that is there: its note, or else by reading the shard.
 
@@ -101,7 +89,7 @@ def noted_shard(folder: DatasetFolder, name: str) -> ShardNote:
     shard = folder.shard(name)
     # a kill before the note leaves none; then, and where it is no note, the shard itself is read
     with contextlib.suppress(OSError, TrilightError):
-        note = decode_note(read_plain(path), str(path))
+        note = read_json(read_plain(path), ShardNote, str(path))
         if folder.is_sent(name):
             return note
         facts = shard.stat()
@@ -129,7 +117,7 @@ def fetch_notes(
 
     def fetch_note(name: str) -> ShardNote:
         try:
-            note = decode_note(read(name) or b"", name)
+            note = read_json(read(name) or b"", ShardNote, name)
             if not name.endswith(f"/{note.shard.name}{_SUFFIX}"):
                 raise TrilightError(note.shard.name)
         except TrilightError as error:

@@ -5,13 +5,12 @@ samples, in any order and from several threads at once; nothing of it stays in m
 of its members, and of a whole set as many unpacked maps as storage.records.packed_maps allows.
 """
 
-import contextlib
 import itertools
 import math
 import os
 import re
 import threading
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import BinaryIO
@@ -25,7 +24,6 @@ from storage.digests import sha256_hex
 from storage.errors import TrilightError
 from storage.records.packed_maps import HeldMaps
 from storage.records.safe_read import open_plain
-from storage.records.sample import Sample, StoredSample, decode_sample, stored_sample
 from storage.remote.safe_url import printable, safe_text
 from storage.remote.shard_cache import shard_cache
 from storage.remote.url import RemoteUrl, parse_local_path, parse_url
@@ -141,50 +139,6 @@ def _alternatives(group: str, named: str) -> Sequence[str]:
     return [f"{number:0{width}d}" for number in range(first, last + 1)]
 
 
-class OpenShard(ShardReader):
-    """A shard that is being read, whose samples have numbers."""
-
-    def __init__(self, name: str, stream: BinaryIO, held: HeldMaps) -> None:
-        """Look at the headers; raises TrilightError as `storage.dataset.shard`.
-
-        Args:
-            name: for messages.
-            stream: the file.
-            held: maps of this shard and others that were unpacked already.
-        """
-        super().__init__(stream, name)
-        self._held = held
-        self.keys = list(self.samples)
-        """The keys of its samples, in the order of the file."""
-
-    def sample(self, row: int) -> Sample:
-        """Return a sample that passes `Sample.check`.
-
-        Raises:
-            TrilightError: it is not whole, not readable or breaks a law; names shard and sample.
-        """
-        with self._name_errors():
-            sample = decode_sample(self.keys[row], self.members(self.keys[row]), self._held)
-            sample.check()
-            return sample
-
-    def stored_sample(self, row: int) -> StoredSample:
-        """Return a sample whose pictures are unpacked when they are asked for.
-
-        Raises:
-            TrilightError: its scene is not readable or breaks a law; names shard and sample.
-        """
-        with self._name_errors():
-            return stored_sample(self.keys[row], self.members(self.keys[row]), self._held)
-
-    @contextlib.contextmanager
-    def _name_errors(self) -> Iterator[None]:
-        try:
-            yield
-        except TrilightError as error:
-            raise TrilightError(f"{self.name}: {error}") from error
-
-
 class KeysSeen:
     """The keys of all shards that were opened so far, as 8 bytes each."""
 
@@ -240,14 +194,14 @@ class ShardSet:
             self.open(number).close()
         return self._counts[number]
 
-    def open(self, number: int) -> OpenShard:
+    def open(self, number: int) -> ShardReader:
         """Open a shard, fetched, and checked as far as a manifest describes it.
 
         Raises:
             TrilightError: it cannot be read, or is not what it should be; the message names it.
         """
         shard = self._shards[number]
-        opened = OpenShard(shard.name, shard.open(), self._held)
+        opened = ShardReader(shard.open(), shard.name, self._held)
         count = len(opened.keys)
         try:
             if shard.num_samples is None:

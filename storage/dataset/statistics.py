@@ -1,9 +1,8 @@
 """Statistics of a dataset, read without its pictures."""
 
-import json
 from array import array
 from collections import Counter
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Any
 
@@ -17,7 +16,8 @@ from storage.dataset.shard import ShardReader
 from storage.digests import sha256_hex
 from storage.errors import TrilightError
 from storage.records.profiles import PACKED, PLAIN, unpack_arrays
-from storage.records.scene_file import scene_provenance
+from storage.records.sample import SampleJson
+from storage.records.scene_file import read_scene_record
 
 MOST_SCENES = 20_000
 """Scenes that are read to describe a dataset: of a percentile over as many, chance moves less than
@@ -115,34 +115,44 @@ def dataset_statistics(dataset: Dataset) -> Statistics:
     Raises:
         TrilightError: a shard is missing or damaged.
     """
-    tally = _Tally()
+    read = described_shards(dataset)
+    is_complete = len(read) == len(dataset.manifest.shards)
     by_split = Counter[str]()
     for shard in dataset.manifest.shards:
         by_split[shard.split] += shard.num_samples
-    for shard in (read := described_shards(dataset)):
-        with (
-            dataset.open_stream(shard, checked=False) as stream,
-            reading(dataset.display_name, shard.name),
-        ):
-            num_bytes = dataset.store.num_bytes(shard.name)
-            if num_bytes not in (None, shard.num_bytes):
-                raise TrilightError(f"{num_bytes} bytes; expected {shard.num_bytes}")
-            _count_shard(ShardReader(stream, shard.name), tally)
-    is_complete = len(read) == len(dataset.manifest.shards)
-    views = len(tally.views["spp"])
-    has_parts = all(len(column) == views for column in tally.parts.values())
+    templates = Counter[str]()
+    excursions = Counter[str]()
+    digests: dict[str, str] = {}
+    # of each view eight bytes a column, however many there are
+    views = {name: array("d") for name in _OF_VIEWS}
+    expected = array("d")
+    parts: dict[str, array[float]] = {}
+    for key, sha256, record in _read_scenes(dataset, read):
+        digests[f"{key}.{PLAIN}"] = sha256
+        templates[record.provenance.get("template", "unknown")] += 1
+        if excursion := record.provenance.get("excursion"):
+            excursions[excursion["axis"]] += 1
+        for view in record.views:
+            for name, column in views.items():
+                column.append(getattr(view, name))
+            if view.expected is not None:
+                expected.append(view.expected.noise_floor_db)
+            for name, part in (view.parts or {}).items():
+                parts.setdefault(name, array("d")).append(part.noise_floor_db)
+    num_views = len(views["spp"])
+    has_parts = all(len(column) == num_views for column in parts.values())
     return Statistics(
         num_scenes=dataset.manifest.num_samples,
         scenes_by_split=+by_split,
         num_scenes_read=sum(shard.num_samples for shard in read),
-        scenes_by_template=tally.templates,
-        scenes_by_excursion=tally.excursions,
-        scene_digest=digest_of_scenes(tally.scene_members) if is_complete else "",
+        scenes_by_template=templates,
+        scenes_by_excursion=excursions,
+        scene_digest=digest_of_scenes(digests) if is_complete else "",
         num_bytes=dataset.manifest.num_bytes,
-        **{name: np.asarray(tally.views[name], kind) for name, kind in _OF_VIEWS.items()},
-        expected_error_db=np.asarray(tally.expected) if 0 < len(tally.expected) == views else None,
+        **{name: np.asarray(views[name], kind) for name, kind in _OF_VIEWS.items()},
+        expected_error_db=np.asarray(expected) if 0 < len(expected) == num_views else None,
         part_noise_floor_db={
-            name: np.asarray(column) for name, column in sorted(tally.parts.items()) if has_parts
+            name: np.asarray(column) for name, column in sorted(parts.items()) if has_parts
         },
     )
 
@@ -156,40 +166,26 @@ _OF_VIEWS: Mapping[str, Any] = {
 }
 
 
-@dataclass(kw_only=True, eq=False)
-class _Tally:
-    """Running counts: of each view eight bytes a column, however many there are."""
-
-    templates: Counter[str] = field(default_factory=Counter)
-    excursions: Counter[str] = field(default_factory=Counter)
-    views: Mapping[str, "array[float]"] = field(
-        default_factory=lambda: {name: array("d") for name in _OF_VIEWS}
-    )
-    expected: "array[float]" = field(default_factory=lambda: array("d"))
-    parts: dict[str, "array[float]"] = field(default_factory=dict)
-    scene_members: dict[str, str] = field(default_factory=dict)
-
-    def add_views(self, views: Sequence[Mapping[str, Any]]) -> None:
-        """Count the views of a scene."""
-        for view in views:
-            for name, column in self.views.items():
-                column.append(view[name])
-            if "expected" in view:
-                self.expected.append(view["expected"]["noise_floor_db"])
-            for name, part in view.get("parts", {}).items():
-                self.parts.setdefault(name, array("d")).append(part["noise_floor_db"])
-
-
-def _count_shard(opened: ShardReader, tally: _Tally) -> None:
-    for key, members in opened.samples.items():
-        arrays = {name: opened.read(members[name]) for name in (PLAIN, PACKED) if name in members}
-        tally.scene_members[f"{key}.{PLAIN}"] = sha256_hex(unpack_arrays(arrays))
-        record = json.loads(opened.read(members["json"]))
-        provenance = scene_provenance(record["provenance"])
-        tally.templates[provenance.get("template", "unknown")] += 1
-        if excursion := provenance.get("excursion"):
-            tally.excursions[excursion["axis"]] += 1
-        tally.add_views(record["views"])
+def _read_scenes(
+    dataset: Dataset, shards: Sequence[ShardEntry]
+) -> Iterator[tuple[str, str, SampleJson]]:
+    """Yield key, sha256 of the unpacked arrays and record of each scene of some shards."""
+    for shard in shards:
+        with (
+            dataset.open_stream(shard, checked=False) as stream,
+            reading(dataset.display_name, shard.name),
+        ):
+            num_bytes = dataset.store.num_bytes(shard.name)
+            if num_bytes not in (None, shard.num_bytes):
+                raise TrilightError(f"{num_bytes} bytes; expected {shard.num_bytes}")
+            opened = ShardReader(stream, shard.name)
+            for key, members in opened.samples.items():
+                packed = {
+                    name: opened.read(members[name]) for name in {PLAIN, PACKED} & members.keys()
+                }
+                text = opened.read(members["json"])
+                record = read_scene_record(text, SampleJson, f"member {key}.json")
+                yield key, sha256_hex(unpack_arrays(packed)), record
 
 
 def digest_of_scenes(members: Mapping[str, str]) -> str:

@@ -11,7 +11,6 @@ from functools import partial
 
 from storage.conventions import SPLITS
 from storage.dataset.dataset import Dataset, open_dataset
-from storage.dataset.manifest import Manifest
 from storage.dataset.shard_set import KeysSeen, SetShard, ShardSet, listed_shards
 from storage.digests import canonical_json, sha256_hex
 from storage.errors import TrilightError
@@ -138,7 +137,7 @@ def _of_datasets(datasets: Sequence[Dataset]) -> TrainingData:
             name=dataset.manifest.build,
             digest=dataset.digest,
             num_views=dataset.manifest.num_views,
-            max_triangles=_max_triangles(dataset.manifest),
+            max_triangles=dataset.manifest.setting("scenes", "max_triangles", int),
         )
         for dataset in datasets
     )
@@ -172,12 +171,6 @@ def _shards(dataset: Dataset, split: str, prefix: str) -> list[SetShard]:
         for entry in dataset.shards_of(split)
         if entry.num_samples
     ]
-
-
-def _max_triangles(manifest: Manifest) -> int | None:
-    scenes = manifest.settings.get("scenes")
-    limit = scenes.get("max_triangles") if isinstance(scenes, Mapping) else None
-    return limit if isinstance(limit, int) else None
 
 
 def _of_list(patterns: Sequence[str]) -> TrainingData:

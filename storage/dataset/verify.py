@@ -4,6 +4,7 @@ from collections import Counter, deque
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
 from dataclasses import dataclass, field
+from functools import partial
 from pathlib import Path
 from tempfile import TemporaryFile
 from typing import BinaryIO
@@ -12,10 +13,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from storage.dataset.dataset import Dataset, open_dataset, published_manifest
-from storage.dataset.manifest import Manifest, ShardEntry, Totals, decode_manifest, index_stream
+from storage.dataset.layout import shard_names_in
+from storage.dataset.manifest import Manifest, ShardEntry, Totals, decode_manifest
 from storage.dataset.planned import is_whole
 from storage.dataset.shard import ShardReader
-from storage.digests import seal_of, sha256_hex
+from storage.digests import seal_of, sha256_hex, sha256_of_stream
 from storage.errors import EnvironmentFailure, ShardMissing, TrilightError, Unreadable
 from storage.licences import mixed_share_alike
 from storage.machine import available_cores
@@ -86,7 +88,9 @@ def verify_dataset(
     rows = [] if problems else decode_objects_lock(lock or b"", "objects.lock.jsonl")
     locked = None if problems else {row.uid: row for row in rows}
     problems += _check_manifest(dataset)
-    problems += [f"{name}: not in the manifest" for name in _list_unlisted(dataset)]
+    names = sorted(shard_names_in(dataset.local.root)) if dataset.local else []
+    listed = {shard.name for shard in manifest.shards}
+    problems += [f"{name}: not in the manifest" for name in names if name not in listed]
     where: dict[str, str] = {}
     bad: list[str] = []
     threads = available_cores() if dataset.local else REMOTE_THREADS
@@ -136,14 +140,6 @@ def _ahead(
         yield shard, running.popleft().result()
         if row + _AHEAD < len(shards):
             running.append(pool.submit(check, shards[row + _AHEAD]))
-
-
-def _list_unlisted(dataset: Dataset) -> list[str]:
-    """Return shard files that the manifest does not list; of a remote dataset, none."""
-    listed = {shard.name for shard in dataset.manifest.shards}
-    folder = dataset.local
-    names = map(folder.name_of, folder.shard_files()) if folder else ()
-    return [name for name in names if name not in listed]
 
 
 def _check_lock(lock: bytes | None, dataset: Dataset) -> Iterator[str]:
@@ -197,14 +193,15 @@ def _check_shard(
             findings.unread += ["its server states no size"] * (num_bytes is None)
             return findings
         with _open_shard(dataset, shard) as stream:
-            if fast:
-                findings.keys += ShardReader(stream, shard.name).samples
-                if len(findings.keys) != shard.num_samples:
-                    findings.faults.append(
-                        f"{len(findings.keys)} samples; expected {shard.num_samples}"
-                    )
-            else:
-                _check_content(stream, shard, dataset.manifest, locked, findings)
+            opened = ShardReader(stream, shard.name)
+            findings.keys = opened.keys
+            if (count := len(opened.keys)) != shard.num_samples:
+                findings.faults.append(f"{count} samples; expected {shard.num_samples}")
+            if not fast:
+                stream.seek(0)
+                if sha256_of_stream(stream) != shard.sha256:
+                    findings.faults.append("sha256 differs from the manifest")
+                findings.faults += _check_content(opened, shard, dataset.manifest, locked)
     except EnvironmentFailure:
         raise
     except ShardMissing:
@@ -232,27 +229,22 @@ def _open_shard(dataset: Dataset, shard: ShardEntry) -> BinaryIO:
 
 
 def _check_content(
-    stream: BinaryIO,
+    opened: ShardReader,
     shard: ShardEntry,
     manifest: Manifest,
     locked: Mapping[str, LockedObject] | None,
-    findings: _ShardFindings,
-) -> None:
-    if index_stream(stream, shard.name) != shard:
-        findings.faults.append("sha256 or number of samples differs from the manifest")
-    opened = ShardReader(stream, shard.name)
+) -> Iterator[str]:
     unused = set(opened.maps)
     held = HeldMaps()
     for key, members in opened:
-        findings.keys.append(key)
         unused -= members.keys()
         try:
             sample = decode_sample(key, members, held)
         except TrilightError as error:
-            findings.faults.append(str(error))
-            continue
-        findings.faults += check_sample(sample, shard.split, manifest, locked)
-    findings.faults += [f"map {name} is used by no sample" for name in sorted(unused)]
+            yield str(error)
+        else:
+            yield from check_sample(sample, shard.split, manifest, locked)
+    yield from (f"map {name} is used by no sample" for name in sorted(unused))
 
 
 def check_sample(
@@ -268,16 +260,15 @@ def _check_pictures(sample: Sample, manifest: Manifest) -> Iterator[str]:
         sample.scene.check()
     except TrilightError as error:
         yield str(error)
-    renders = manifest.settings.get("renders")
-    renders = renders if isinstance(renders, Mapping) else {}
-    resolution = renders.get("resolution")
+    renders = partial(manifest.setting, "renders", kind=int)
+    resolution = renders("resolution")
     expected = (manifest.num_views, resolution, resolution, 3)
     if sample.radiance_rgb.shape != expected or sample.scene.num_views != manifest.num_views:
         yield f"pictures {sample.radiance_rgb.shape}; expected {expected}"
     if not (np.isfinite(sample.radiance_rgb).all() and (sample.radiance_rgb >= 0).all()):
         yield "a picture holds a value that is not finite or negative"
-    yield from _check_lights(sample, per_light=bool(renders.get("per_light")))
-    bounces, lobes = (bool(renders.get(name)) for name in ("split", "split_lobes"))
+    yield from _check_lights(sample, per_light=bool(renders("per_light")))
+    bounces, lobes = (bool(renders(name)) for name in ("split", "split_lobes"))
     yield from _check_parts(sample, part_names(bounces=bounces, lobes=lobes))
     yield from _check_passes(sample, manifest.passes)
 

@@ -101,29 +101,6 @@ class LevelSkin:
         return self.uv.nbytes + sum(map(len, (*self.packed, self.packed_normal or b""))) + glow
 
 
-def _skin_arrays(skin: LevelSkin, name: str) -> dict[str, NDArray]:
-    arrays = {f"uv_{name}": np.ascontiguousarray(skin.uv)}
-    packed = (*skin.packed, skin.packed_normal)
-    for column, data in zip((*TEXTURED, NORMAL), packed, strict=True):
-        if data is not None:
-            arrays[f"{column}_{name}"] = np.frombuffer(data, np.uint8)
-    if skin.emission is not None:
-        arrays[f"emission_{name}"] = np.ascontiguousarray(skin.emission)
-    return arrays
-
-
-def _read_skin(arrays: Mapping[str, NDArray], quality: SkinQuality, name: str) -> LevelSkin:
-    first, second, third = (arrays[f"{column}_{name}"].tobytes() for column in TEXTURED)
-    normal = arrays.get(f"{NORMAL}_{name}")
-    return LevelSkin(
-        uv=arrays[f"uv_{name}"],
-        packed=(first, second, third),
-        packed_normal=None if normal is None else normal.tobytes(),
-        quality=quality,
-        emission=arrays.get(f"emission_{name}"),
-    )
-
-
 @dataclass(frozen=True, kw_only=True)
 class SourceFacts:
     """Measures of the source file, and the effects of cleaning."""
@@ -238,11 +215,16 @@ def encode_asset(asset: Asset) -> bytes:
     """Return the file of an asset; equal assets give equal bytes."""
     arrays: dict[str, NDArray] = {}
     for level in asset.levels:
-        name = str(level.record.budget)
-        arrays[f"positions_{name}"] = np.ascontiguousarray(level.positions)
-        arrays[f"faces_{name}"] = np.ascontiguousarray(level.faces)
-        if level.skin is not None:
-            arrays |= _skin_arrays(level.skin, name)
+        of_level: dict[str, NDArray | None] = {"positions": level.positions, "faces": level.faces}
+        if (skin := level.skin) is not None:
+            packed = zip((*TEXTURED, NORMAL), (*skin.packed, skin.packed_normal), strict=True)
+            of_level |= {
+                name: np.frombuffer(data, np.uint8) for name, data in packed if data is not None
+            }
+            of_level |= {"uv": skin.uv, "emission": skin.emission}
+        for name, array in of_level.items():
+            if array is not None:
+                arrays[f"{name}_{level.record.budget}"] = np.ascontiguousarray(array)
     skins = {str(each.record.budget): each.skin.quality for each in asset.levels if each.skin}
     facts = {field.name: getattr(asset, field.name) for field in dataclasses.fields(_Facts)}
     levels = tuple(level.record for level in asset.levels)
@@ -274,13 +256,19 @@ def decode_asset(data: bytes) -> Asset:
 def _level(
     record: LevelRecord, skins: Mapping[str, SkinQuality], arrays: Mapping[str, NDArray]
 ) -> Level:
-    name = str(record.budget)
-    return Level(
-        record=record,
-        positions=arrays[f"positions_{name}"],
-        faces=arrays[f"faces_{name}"],
-        skin=_read_skin(arrays, skins[name], name) if name in skins else None,
-    )
+    end = f"_{record.budget}"
+    of_level = {name.removesuffix(end): each for name, each in arrays.items() if name.endswith(end)}
+    skin = None
+    if (quality := skins.get(str(record.budget))) is not None:
+        first, second, third = (of_level[column].tobytes() for column in TEXTURED)
+        skin = LevelSkin(
+            uv=of_level["uv"],
+            packed=(first, second, third),
+            packed_normal=of_level[NORMAL].tobytes() if NORMAL in of_level else None,
+            quality=quality,
+            emission=of_level.get("emission"),
+        )
+    return Level(record=record, positions=of_level["positions"], faces=of_level["faces"], skin=skin)
 
 
 @dataclass(frozen=True, kw_only=True)

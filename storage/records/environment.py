@@ -10,14 +10,11 @@ from functools import cached_property
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from storage.records.scene_laws import broken_law, require_array, require_law
+from storage.records.scene_laws import broken_law, require_array, require_law, require_rotations
 from storage.records.texture import MAX_SIDE, MapSource, content_digest
 
 MAX_RADIANCE = 1e9
 """Greatest radiance of a map. A sun of 1e6 is usual; sums over the largest map stay finite."""
-
-ROTATION_TOLERANCE = 1e-4
-"""How far a float32 rotation may be from orthonormal, as that of a camera."""
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -42,10 +39,10 @@ class Environment:
         turned: NDArray[np.float64] = np.positive(directions, dtype=np.float64) @ self.rotation
         return turned
 
-    def check(self) -> None:
-        """Raise TrilightError at the first broken law."""
+    def check(self, called: str = "environment") -> None:
+        """Raise TrilightError at the first broken law; `called` stands for the map."""
         radiance = self.radiance_rgb
-        name = "environment.radiance_rgb"
+        name = f"{called}.radiance_rgb"
         require_array(radiance, name, np.float32, (None, None, 3))
         if radiance.shape[1] != 2 * radiance.shape[0]:
             broken_law(f"{name} has shape {radiance.shape}", "(height, twice the height, 3)")
@@ -56,13 +53,7 @@ class Environment:
             require_law(lawful, name, radiance, f"finite values from 0 to {MAX_RADIANCE:g}")
         rotation = self.rotation
         require_array(rotation, "environment.rotation", np.float32, (3, 3))
-        rotation64 = rotation.astype(np.float64)
-        deviation = abs(rotation64 @ rotation64.T - np.eye(3)).max()
-        if not (deviation <= ROTATION_TOLERANCE and np.linalg.det(rotation64) > 0):
-            broken_law(
-                f"environment.rotation is {rotation.tolist()}",
-                "an orthonormal rotation without mirroring",
-            )
+        require_rotations(rotation.T[None], "environment.rotation", rotation[None])
 
 
 def row_solid_angles(height: int) -> NDArray[np.float64]:

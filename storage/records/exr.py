@@ -8,7 +8,6 @@ import contextlib
 import io
 import math
 from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence
-from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
@@ -27,23 +26,9 @@ _MAX_BYTES = 3 << 30
 at 4 bytes a value."""
 
 
-@dataclass(frozen=True, kw_only=True)
-class ExrCodec:
-    """Compression and number type of an OpenEXR file."""
-
-    compression: str
-    """OpenEXR's name, such as ZIP or DWAB; of what the library offers, this is all that can be
-    chosen but for DWA's level: deflate, zstd and lossy JPEG 2000 have their default levels."""
-    dwa_level: float | None = None
-    """Level of DWAA and DWAB: greater is coarser; None is the library's 45."""
-
-
 INT32 = Within(-(2**31), 2**31 - 1)
 FLOAT32 = Within(-FLOAT32_MAX, FLOAT32_MAX)
 """Ranges of the numbers in a header."""
-
-ZIP = ExrCodec(compression="ZIP")
-"""Exact on half floats, and known to every reader of OpenEXR."""
 
 _LOSSY = frozenset(
     getattr(OpenEXR, f"{name}_COMPRESSION") for name in ("B44", "B44A", "DWAA", "DWAB", "LJ2K")
@@ -78,18 +63,18 @@ Header = Mapping[str, Any]
 """The header of a file as the library gives it."""
 
 
-def encode_exr(radiance_rgb: NDArray[np.float32], codec: ExrCodec = ZIP) -> bytes:
+def encode_exr(radiance_rgb: NDArray[np.float32], dwa_level: float | None = None) -> bytes:
     """Return the OpenEXR file of a picture, rounded to half floats; one thread.
 
     Args:
         radiance_rgb: [R, R, 3] linear radiance, finite, in [0, 65504].
-        codec: how to pack it. A lossy one may leave values below 0, or infinite ones where the
-            brightest rounds up: callers look at what comes back.
+        dwa_level: as `encode_channels`. A lossy file may hold values below 0, or infinite ones
+            where the brightest rounds up: callers look at what comes back.
 
     Raises:
         TrilightError: a value is not finite, negative, or too large for a half float.
     """
-    return encode_channels({"RGB": to_half(radiance_rgb)}, codec)
+    return encode_channels({"RGB": to_half(radiance_rgb)}, dwa_level=dwa_level)
 
 
 def to_half(radiance_rgb: NDArray[np.float32]) -> NDArray[np.float16]:
@@ -106,11 +91,17 @@ def to_half(radiance_rgb: NDArray[np.float32]) -> NDArray[np.float16]:
 
 def encode_channels(
     channels: Mapping[str, NDArray[np.float16] | NDArray[np.float32]],
-    codec: ExrCodec = ZIP,
     *,
     attributes: Attributes | None = None,
+    dwa_level: float | None = None,
 ) -> bytes:
     """Return the OpenEXR file of named channels, [H, W] each or [H, W, 3] under the name RGB.
+
+    Args:
+        channels: the channels by name.
+        attributes: entries of the header beyond what every file has.
+        dwa_level: level of the lossy DWAB, greater is coarser; None for ZIP, which is exact on half
+            floats and known to every reader.
 
     Raises:
         TrilightError: a number among the attributes that a header cannot hold: integers end at
@@ -122,12 +113,12 @@ def encode_channels(
             raise TrilightError(  # OpenEXR would wrap it around, or make it infinite
                 f"picture: attribute {name} is {value!r}; expected a number {within}, or text."
             )
-    header: dict[str, object] = {
-        "compression": getattr(OpenEXR, f"{codec.compression}_COMPRESSION"),
-        "type": OpenEXR.scanlineimage,
-    }
-    if codec.dwa_level is not None:
-        header["dwaCompressionLevel"] = float(codec.dwa_level)  # an int would be another type
+    header: dict[str, object] = {"type": OpenEXR.scanlineimage}
+    if dwa_level is None:
+        header["compression"] = OpenEXR.ZIP_COMPRESSION
+    else:
+        header["compression"] = OpenEXR.DWAB_COMPRESSION
+        header["dwaCompressionLevel"] = float(dwa_level)  # an int would be another type
     stream = io.BytesIO()
     OpenEXR.File({**header, **(attributes or {})}, dict(channels), num_threads=0).write(stream)
     return stream.getvalue()

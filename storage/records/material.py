@@ -21,6 +21,7 @@ from numpy.typing import NDArray
 from storage.errors import TrilightError
 from storage.registry import Registry
 from storage.settings.ranges import FLOAT32_MAX, Within
+from storage.typed_json import read_json
 
 MAX_WIDTH = 64
 """Maximum width of a column."""
@@ -208,12 +209,7 @@ def completed_rows(stored: NDArray[np.float32], stated: str | None) -> NDArray[n
 
 
 def _names_of(stated: str) -> tuple[str, ...]:
-    try:
-        pairs = [(str(name), int(width)) for name, width in json.loads(stated)]
-    except (ValueError, TypeError, RecursionError) as error:
-        raise TrilightError(
-            f"scene: its material columns are {stated!r:.80}; expected names and widths."
-        ) from error
+    pairs = read_json(stated, tuple[tuple[str, int], ...], "scene: its material columns")
     for name, width in pairs:
         if (declared_width := declared_column(name).width) != width:
             _wrong(

@@ -30,9 +30,7 @@ from storage.records.safe_read import MAX_HEADER_BYTES, open_plain, safetensors_
 from storage.typed_json import read_json
 
 _FORMAT = 1
-_TYPES: Mapping[str, np.dtype[Any]] = {
-    "U8": np.dtype("<u1"), "U16": np.dtype("<u2"), "U32": np.dtype("<u4"), "U64": np.dtype("<u8"),
-}  # fmt: skip
+_TYPES = {"U8": "<u1", "U16": "<u2", "U32": "<u4", "U64": "<u8"}
 _NAME_BYTES = 16
 
 
@@ -80,11 +78,11 @@ class IndexFacts:
     """Digest of the query to the source; a change of it lists the source again."""
     num_found: int
     """Objects in the source, refused ones included."""
-    num_maps: int
+    num_maps: int = 0
     """Rows of the lock that are textures and skies; they are not in the index."""
-    camps: tuple[str, ...]
+    camps: tuple[str, ...] = ()
     """Camps by their number in the column."""
-    splits: Mapping[str, SplitRows]
+    splits: Mapping[str, SplitRows] = dataclasses.field(default_factory=dict)
     format: int = _FORMAT
 
     @property
@@ -94,16 +92,9 @@ class IndexFacts:
 
 
 def write_object_index(
-    path: Path,
-    objects: Iterable[IndexedObject],
-    *,
-    lock_sha256: str,
-    lock_bytes: int,
-    request_digest: str,
-    num_found: int,
-    num_maps: int = 0,
+    path: Path, objects: Iterable[IndexedObject], facts: IndexFacts
 ) -> IndexFacts:
-    """Write the index of a lock atomically; arguments as the fields of `IndexFacts`.
+    """Write the index of a lock atomically, and return the facts with camps and splits.
 
     Raises:
         TrilightError: the file cannot be written.
@@ -127,15 +118,7 @@ def write_object_index(
         sizes = camp_sizes(least[start:stop], camp[start:stop], camps)
         splits[split] = SplitRows(start=start, stop=stop, camps=sizes)
         start = stop
-    facts = IndexFacts(
-        lock_sha256=lock_sha256,
-        lock_bytes=lock_bytes,
-        asked=request_digest,
-        num_found=num_found,
-        num_maps=num_maps,
-        camps=tuple(camps),
-        splits=splits,
-    )
+    facts = dataclasses.replace(facts, camps=tuple(camps), splits=splits)
     header = json.dumps(dataclasses.asdict(facts), sort_keys=True)
     write_atomically(path, save(arrays, metadata={"objects": header}))
     return facts

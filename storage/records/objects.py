@@ -15,8 +15,7 @@ from typing import Any
 
 from storage.atomic import write_atomically
 from storage.digests import canonical_json
-from storage.errors import TrilightError
-from storage.records.safe_read import open_plain, read_plain
+from storage.records.safe_read import name_unreadable, open_plain, read_plain
 from storage.typed_json import read_json, read_json_lines
 
 
@@ -123,11 +122,8 @@ def read_objects_lock(path: Path) -> list[LockedObject]:
     Raises:
         TrilightError: missing, or a line that is not a locked object.
     """
-    try:
-        data = read_plain(path)
-    except OSError as error:
-        raise TrilightError(f"{path}: cannot be read ({error.strerror}).") from error
-    return decode_objects_lock(data, str(path))
+    with name_unreadable(path):
+        return decode_objects_lock(read_plain(path), str(path))
 
 
 def decode_objects_lock(data: bytes, place: str) -> list[LockedObject]:
@@ -172,14 +168,19 @@ def _lines(rows: Iterable[LockedObject | Failure]) -> bytes:
 
 
 def _record(row: LockedObject | Failure) -> dict[str, Any]:
-    """Return a row as JSON values; locks of objects alone know no kinds, as before.
+    """Return a row as JSON values; locks of objects alone know no kinds, as before."""
+    record = text_record(row)
+    return {name: value for name, value in record.items() if (name, value) != ("kind", OBJECT)}
+
+
+def text_record(row: Any) -> dict[str, Any]:
+    """Return a row of texts and numbers as JSON values.
 
     Lone surrogates, which texts from outside may hold and UTF-8 does not, become `?`.
     """
     return {
         name: value.encode(errors="replace").decode() if isinstance(value, str) else value
         for name, value in dataclasses.asdict(row).items()
-        if (name, value) != ("kind", OBJECT)
     }
 
 
@@ -194,12 +195,9 @@ class LockRows:
         """
         self._path = path
         self._lines: mmap.mmap | bytes = b""
-        try:
-            with open_plain(path) as stream:
-                if os.fstat(stream.fileno()).st_size:  # nothing cannot be mapped
-                    self._lines = mmap.mmap(stream.fileno(), 0, access=mmap.ACCESS_READ)
-        except OSError as error:
-            raise TrilightError(f"{path}: cannot be read ({error.strerror}).") from error
+        with name_unreadable(path), open_plain(path) as stream:
+            if os.fstat(stream.fileno()).st_size:  # nothing cannot be mapped
+                self._lines = mmap.mmap(stream.fileno(), 0, access=mmap.ACCESS_READ)
 
     @property
     def num_bytes(self) -> int:

@@ -14,7 +14,8 @@ import re
 import threading
 from collections import OrderedDict
 from collections.abc import Callable, Mapping, Sequence
-from typing import Any, TypeVar
+from dataclasses import dataclass
+from typing import Annotated, Any, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -29,9 +30,11 @@ from storage.records.safe_read import (
     safetensors_header,
     unpack_gzip,
 )
-from storage.records.scene import MAX_TEXTURES, Scene
-from storage.records.scene_laws import require_fields, wrong_value
+from storage.records.scene import Scene
+from storage.records.scene_laws import wrong_value
 from storage.records.texture import MAX_MAPS_BYTES, MapSource, Texture
+from storage.settings.ranges import Within
+from storage.typed_json import Sha256
 
 HELD_BYTES = 1 << 26
 """Most bytes that the maps of all open shards of a set take: 40 skies of 512 x 256 texels in
@@ -42,10 +45,6 @@ MAP_NAME = re.compile(r"__map-([0-9a-f]{64})__")
 
 Map = TypeVar("Map", Texture, Environment)
 
-Entry = Mapping[str, Any]
-"""What a record says of one map."""
-
-_SOURCE_FIELDS = tuple(field.name for field in dataclasses.fields(MapSource))
 _ARRAY = "values"
 _FORM = "form"
 _FORMS: Mapping[type, Sequence[str]] = {Texture: ("srgb", "linear"), Environment: ("environment",)}
@@ -117,111 +116,114 @@ def map_member(sha256: str) -> str:
     return f"__map-{sha256}__"
 
 
-def maps_record(scene: Scene) -> dict[str, Any] | None:
-    """Return what a scene's record says of its maps, as JSON values; None where it has none."""
-    record: dict[str, Any] = {}
-    if scene.textures:
-        record["textures"] = [
-            {"sha256": texture.sha256, **dataclasses.asdict(texture.source)}
-            for texture in scene.textures
-        ]
-    if (sky := scene.environment) is not None:
-        record["environment"] = {
-            "sha256": sky.sha256,
-            "rotation": sky.rotation.tolist(),
-            "is_seen": sky.is_seen,
-            **dataclasses.asdict(sky.source),
+@dataclass(frozen=True, kw_only=True)
+class MapEntry:
+    """Entry of a texture in the record of a scene: content, name and rights, all of them stated."""
+
+    sha256: Sha256
+    name: str
+    licence: str
+    attribution: str
+    source_url: str
+
+
+_Component = Annotated[float, Within(-2, 2)]
+_Axis = tuple[_Component, _Component, _Component]
+
+
+@dataclass(frozen=True, kw_only=True)
+class SkyEntry(MapEntry):
+    """Entry of the environment map, which may be turned."""
+
+    rotation: tuple[_Axis, _Axis, _Axis]
+    is_seen: bool
+
+
+@dataclass(frozen=True, kw_only=True)
+class Maps:
+    """Entry `maps` in the record of a scene."""
+
+    textures: tuple[MapEntry, ...] = ()
+    environment: SkyEntry | None = None
+
+    @property
+    def entries(self) -> tuple[MapEntry, ...]:
+        """Entries of the textures, and of the environment, if there is one."""
+        return self.textures if self.environment is None else (*self.textures, self.environment)
+
+    @property
+    def json(self) -> dict[str, Any]:
+        """The entry as JSON values, without what there is none of."""
+        return {name: each for name, each in dataclasses.asdict(self).items() if each}
+
+    @property
+    def digest(self) -> NDArray[np.uint8]:
+        """[32] the sha256 of the entry without names and rights.
+
+        It stands among the arrays of the scene, whose digest so covers what its surfaces look like.
+        """
+        sky = vars(self.environment or MapSource())
+        identity = {
+            "textures": [entry.sha256 for entry in self.textures],
+            "environment": {name: sky[name] for name in sky if name not in vars(MapSource())},
         }
-    return record or None
+        return np.frombuffer(bytes.fromhex(sha256_hex(canonical_json(identity))), np.uint8)
+
+    def load(self, load: Callable[[Any, MapEntry, int], Any]) -> dict[str, Any]:
+        """Return the fields `textures` and `environment` of a scene, where it has any.
+
+        Args:
+            load: returns the map of an entry, the n-th of its kind, with any name and turn.
+
+        Raises:
+            TrilightError: as `load`, or the turn is no rotation.
+        """
+        fields: dict[str, Any] = {}
+        if (entry := self.environment) is not None:
+            rotation = np.array(entry.rotation, np.float64).astype(np.float32)
+            turned = {"rotation": rotation, "is_seen": entry.is_seen, "source": _source_of(entry)}
+            fields["environment"] = with_same_content(load(Environment, entry, 0), **turned)
+            fields["environment"].check()
+        if self.textures:
+            fields["textures"] = tuple(
+                with_same_content(load(Texture, each, row), source=_source_of(each))
+                for row, each in enumerate(self.textures)
+            )
+        return fields
 
 
-def maps_digest(record: Mapping[str, Any]) -> NDArray[np.uint8]:
-    """Return [32] the sha256 of what `maps_record` says, without names and rights.
-
-    It stands among the arrays of the scene, whose digest so covers what its surfaces look like.
-    """
-    sky = record.get("environment", {})
-    identity = {
-        "textures": [entry["sha256"] for entry in record.get("textures", ())],
-        "environment": {name: sky[name] for name in sky if name not in _SOURCE_FIELDS},
-    }
-    return np.frombuffer(bytes.fromhex(sha256_hex(canonical_json(identity))), np.uint8)
+def _source_of(entry: MapEntry) -> MapSource:
+    return MapSource(**{name: getattr(entry, name) for name in vars(MapSource())})
 
 
-def referenced_maps(record: Any) -> list[str]:
-    """Return the member names of the maps that a scene's record names, each once.
-
-    Raises:
-        TrilightError: the record's entry `maps` is not of the form of `maps_record`.
-    """
-    if not isinstance(record, Mapping) or "maps" not in record:
-        return []
-    textures, skies = map_entries(record["maps"])
-    return list(dict.fromkeys(map_member(entry["sha256"]) for entry in (*textures, *skies)))
-
-
-def map_entries(maps: Any) -> tuple[Sequence[Entry], Sequence[Entry]]:
-    """Return what a record says of its textures, and of its environment, if there is one.
-
-    Raises:
-        TrilightError: as `referenced_maps`.
-    """
-    if not isinstance(maps, Mapping) or not set(maps) <= {"textures", "environment"}:
-        wrong_value("maps", maps, "textures, environment, or both")
-    entries = maps.get("textures", [])
-    if not isinstance(entries, list) or len(entries) > MAX_TEXTURES:
-        wrong_value("maps.textures", entries, f"a list of at most {MAX_TEXTURES}")
-    for row, entry in enumerate(entries):
-        _check_entry(entry, f"maps.textures[{row}]", {})
-    if "environment" not in maps:
-        return entries, ()
-    sky = maps["environment"]
-    _check_entry(sky, "maps.environment", {"rotation": list, "is_seen": bool})
-    rows = [row if isinstance(row, list) else [] for row in sky["rotation"]]
-    if [len(row) for row in rows] != [3, 3, 3] or not all(
-        type(number) in (int, float) and abs(number) < 2 for row in rows for number in row
-    ):
-        wrong_value("maps.environment.rotation", sky["rotation"], "three rows of three numbers")
-    return entries, (sky,)
+def maps_of(scene: Scene) -> Maps | None:
+    """Return what a scene's record says of its maps; None where it has none."""
+    sky = scene.environment
+    if sky is None and not scene.textures:
+        return None
+    environment = None
+    if sky is not None:
+        x, y, z = sky.rotation.tolist()
+        environment = SkyEntry(
+            sha256=sky.sha256, rotation=(x, y, z), is_seen=sky.is_seen, **vars(sky.source)
+        )
+    textures = (MapEntry(sha256=one.sha256, **vars(one.source)) for one in scene.textures)
+    return Maps(textures=tuple(textures), environment=environment)
 
 
-def _check_entry(entry: Any, name: str, more: Mapping[str, type]) -> None:
-    require_fields(entry, name, {"sha256": str, **dict.fromkeys(_SOURCE_FIELDS, str), **more})
-    if not MAP_NAME.fullmatch(map_member(entry["sha256"])):
-        wrong_value(f"{name}.sha256", entry["sha256"], "64 hexadecimal digits")
-
-
-def checked_map(kind: type[Map], entry: Entry, values: NDArray, *, is_srgb: bool = False) -> Map:
+def checked_map(kind: Any, entry: MapEntry, values: NDArray, *, is_srgb: bool = False) -> Any:
     """Return the unturned map of some values; raises where it is not what an entry names."""
-    made: Any
-    if kind is Texture:
-        made = Texture(texels=values, is_srgb=is_srgb)
-        made.check(f"texture {entry['sha256']}")
-    else:
-        made = Environment(radiance_rgb=values)
-        made.check()
-    if made.sha256 != entry["sha256"]:
+    is_texture = kind is Texture
+    made: Texture | Environment = (
+        Texture(texels=values, is_srgb=is_srgb) if is_texture else Environment(radiance_rgb=values)
+    )
+    made.check(f"map {entry.sha256}")
+    if made.sha256 != entry.sha256:
         raise TrilightError(
-            f"scene: map {entry['sha256']} has the content {made.sha256}; expected that of its "
+            f"scene: map {entry.sha256} has the content {made.sha256}; expected that of its "
             "name. Run `trilight verify`."
         )
-    result: Map = made
-    return result
-
-
-def described_map(entry: Entry, one: Map) -> Map:
-    """Return a map with the name, rights and turn that an entry of `maps_record` says.
-
-    Raises:
-        TrilightError: the turn is no rotation.
-    """
-    source = MapSource(**{name: entry[name] for name in _SOURCE_FIELDS})
-    if isinstance(one, Texture):
-        return with_same_content(one, source=source)
-    rotation = np.array(entry["rotation"], np.float64).astype(np.float32)
-    sky = with_same_content(one, rotation=rotation, is_seen=entry["is_seen"], source=source)
-    sky.check()
-    return sky
+    return made
 
 
 def packed_maps(scene: Scene) -> dict[str, bytes]:
@@ -267,51 +269,44 @@ def held_values(stored: NDArray) -> NDArray:
 
 
 def unpacked_maps(
-    maps: Any, members: Mapping[str, bytes], held: HeldMaps | None = None
+    maps: Maps, members: Mapping[str, bytes], held: HeldMaps | None = None
 ) -> dict[str, Any]:
     """Return the fields `textures` and `environment` of a scene, whose arrays are read-only.
 
     Args:
-        maps: what `maps_record` gave, from outside.
+        maps: what the record says of them, from outside.
         members: bytes of the maps by the names of their members; others are ignored.
         held: those of other samples, which are not unpacked again; None where there is no other.
 
     Raises:
-        TrilightError: not of that form, a map is missing or damaged, all of them take more than
-            MAX_MAPS_BYTES, or one has another content than its name says.
+        TrilightError: a map is missing or damaged, all of them take more than MAX_MAPS_BYTES, or
+            one has another content than its name says.
     """
-    textures, skies = map_entries(maps)
-    packed: dict[str, bytes] = {}
-    for entry in (*textures, *skies):
-        if (name := map_member(entry["sha256"])) not in members:
+    packed: dict[str, _PackedMap] = {}
+    for entry in maps.entries:
+        if (name := map_member(entry.sha256)) not in members:
             raise TrilightError(
-                f"scene: map {entry['sha256']} is missing; expected a member {name} before the "
+                f"scene: map {entry.sha256} is missing; expected a member {name} before the "
                 "sample. Run `trilight verify`."
             )
-        packed[name] = members[name]
-    total = sum(_PackedMap(data, name).num_bytes_held for name, data in packed.items())
-    if total > MAX_MAPS_BYTES:
+        packed[name] = _PackedMap(members[name], f"map {entry.sha256}")
+    if (total := sum(each.num_bytes_held for each in packed.values())) > MAX_MAPS_BYTES:
         wrong_value("maps", f"{total} bytes", f"at most {MAX_MAPS_BYTES}")
-    held = HeldMaps() if held is None else held
-    fields: dict[str, Any] = {}
-    for entry in skies:
-        fields["environment"] = _load_map(Environment, entry, packed, held)
-    if textures:
-        fields["textures"] = tuple(_load_map(Texture, each, packed, held) for each in textures)
-    return fields
+    known = HeldMaps() if held is None else held
 
+    def load(kind: Any, entry: MapEntry, _: int) -> Any:
+        name = map_member(entry.sha256)
+        one = packed[name]
 
-def _load_map(kind: type[Map], entry: Entry, packed: Mapping[str, bytes], held: HeldMaps) -> Map:
-    data = packed[map_member(entry["sha256"])]
+        def unpack() -> Any:
+            if one.form not in _FORMS[kind]:
+                expected = "a texture" if kind is Texture else "an environment map"
+                wrong_value(one.name, one.form, expected)
+            return checked_map(kind, entry, one.values(), is_srgb=one.form == "srgb")
 
-    def unpack() -> Map:
-        packed_map = _PackedMap(data, f"map {entry['sha256']}")
-        if packed_map.form not in _FORMS[kind]:
-            expected = "a texture" if kind is Texture else "an environment map"
-            wrong_value(packed_map.name, packed_map.form, expected)
-        return checked_map(kind, entry, packed_map.values(), is_srgb=packed_map.form == "srgb")
+        return known.get_or_unpack(kind, entry.sha256, members[name], unpack)
 
-    return described_map(entry, held.get_or_unpack(kind, entry["sha256"], data, unpack))
+    return maps.load(load)
 
 
 class _PackedMap:

@@ -21,7 +21,7 @@ from numpy.typing import NDArray
 
 from storage.errors import TrilightError
 from storage.metrics import psnr_log_db
-from storage.records.exr import ZIP, ExrCodec, decode_exr, encode_exr
+from storage.records.exr import decode_exr, encode_exr
 from storage.records.safe_read import pack_gzip, unpack_gzip
 
 Profile = Literal["lossless", "compact"]
@@ -55,11 +55,11 @@ def pack_picture(
     Raises:
         TrilightError: a value that half floats cannot hold.
     """
-    exact = encode_exr(radiance_rgb, ZIP)
+    exact = encode_exr(radiance_rgb)
     if profile == "lossless":
         return exact
     for level in DWA_LEVELS:
-        data = encode_exr(radiance_rgb, ExrCodec(compression="DWAB", dwa_level=level))
+        data = encode_exr(radiance_rgb, level)
         if len(data) >= len(exact):
             break  # finer levels only grow
         if keeps_law(radiance_rgb, decode_exr(data), noise_floor_db):

@@ -1,10 +1,12 @@
 """Reading from outside: only plain files, and nothing in them decides how much memory is taken."""
 
+import contextlib
 import errno
 import json
 import os
 import stat
 import zlib
+from collections.abc import Iterator
 from pathlib import Path
 from typing import Any, BinaryIO
 
@@ -35,14 +37,20 @@ def open_plain(path: Path) -> BinaryIO:
     return os.fdopen(descriptor, "rb")
 
 
+@contextlib.contextmanager
+def name_unreadable(name: object) -> Iterator[None]:
+    """Raise TrilightError, which names the file, for what the system says of it in the block."""
+    try:
+        yield
+    except OSError as error:
+        raise TrilightError(f"{name}: cannot be read ({error.strerror}).") from error
+
+
 def open_if_there(path: Path) -> BinaryIO | None:
     """Open as `open_plain`; None for no file, and TrilightError for one that cannot be read."""
-    try:
+    with name_unreadable(path), contextlib.suppress(FileNotFoundError, NotADirectoryError):
         return open_plain(path)
-    except (FileNotFoundError, NotADirectoryError):
-        return None
-    except OSError as error:
-        raise TrilightError(f"{path}: cannot be read ({error.strerror}).") from error
+    return None
 
 
 def read_plain(path: Path) -> bytes:

@@ -15,7 +15,6 @@ WebDataset reads names.
 
 import contextlib
 import dataclasses
-import json
 import math
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
@@ -42,14 +41,13 @@ from storage.records.profiles import Profile, pack_arrays, pack_picture, unpack_
 from storage.records.retextured import without_constant_textures
 from storage.records.scene import Scene
 from storage.records.scene_file import (
+    SceneJson,
     decode_arrays,
     encode_arrays,
     read_scene_record,
-    scene_of_record,
     scene_record,
 )
-from storage.settings.ranges import Within
-from storage.typed_json import read_json
+from storage.settings.ranges import Law, Within
 
 Plausible = Annotated[float, Within(-1000, 1000, low_open=True, high_open=True)]
 """Number within bounds beyond any stated error in dB and any share."""
@@ -65,6 +63,18 @@ class PartFloor:
     """The same error as psnr_linear_db."""
     object_noise_floor_db: Plausible
     """The same error as object_psnr_log_db: over pixels that show geometry."""
+
+
+@dataclass(frozen=True)
+class KnownParts(Law):
+    """Law of the floors of parts: one of the sets that there are, in the order of their sum."""
+
+    expected: str = f"floors of {'; '.join(', '.join(names) for names in KNOWN_PARTS)}"
+
+    def require(self, value: Any) -> Any:
+        if tuple(sorted(value)) not in KNOWN_PARTS:
+            raise ValueError(self.expected)
+        return dict(sorted(value.items()))
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -87,7 +97,7 @@ class ViewRecord(PartFloor):
     expected: PartFloor | None = None
     """Errors that are as often better as worse, where the stated errors are calibrated bounds; a
     record whose floors are bounds by estimate and allowances is written without this field."""
-    parts: Mapping[str, PartFloor] | None = None
+    parts: Annotated[Mapping[str, PartFloor], KnownParts()] | None = None
     """Floors of the parts that are stored, by name (storage.records.lights); a record that has none
     is written without this field."""
     lights: tuple[PartFloor, ...] | None = None
@@ -99,6 +109,13 @@ def error_text(view: ViewRecord) -> str:
     """Return the stated error of a view and the expected one, as `38.2 dB, probably 40.5`."""
     probably = "" if view.expected is None else f", probably {view.expected.noise_floor_db:.1f}"
     return f"{view.noise_floor_db:.1f} dB{probably}"
+
+
+@dataclass(frozen=True, kw_only=True)
+class SampleJson(SceneJson):
+    """Record of a sample: what is no array and no picture of it, as JSON."""
+
+    views: tuple[ViewRecord, ...]
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -223,14 +240,14 @@ def decode_sample(key: str, members: Mapping[str, bytes], held: HeldMaps | None 
         every = range(len(record.views))
         radiance_rgb = np.stack([decode_exr(members[f"{view}.exr"]) for view in every])
         size = radiance_rgb.shape[1:3]
-        lights_rgb = _decode_lights(record.scene, every, size, members)
-        lit = None if lights_rgb is None else record.scene
+        lights = _decode_parts("lights", (ALL_LIGHT,), every, size, record.scene, members)
         names = tuple(record.views[0].parts or ())
+        lit = record.scene if lights else None
         return Sample(
             **vars(record),
             radiance_rgb=radiance_rgb,
-            lights_rgb=lights_rgb,
-            parts_rgb=_decode_parts("parts", names, every, size, lit, members),
+            lights_rgb=lights.get(ALL_LIGHT),
+            parts_rgb=_decode_parts("parts", names, every, size, lit, members) or None,
             passes_exr=_of_views("passes", every, members),
         )
 
@@ -244,14 +261,6 @@ def _of_views(
     return tuple(members[f"{view}.{what}.exr"] for view in views)
 
 
-def _decode_lights(
-    scene: Scene, views: Sequence[int], size: tuple[int, ...], members: Mapping[str, bytes]
-) -> NDArray[np.float32] | None:
-    """Return the lights [V, L, R, R, 3] of some views; None where they are together."""
-    parts = _decode_parts("lights", (ALL_LIGHT,), views, size, scene, members)
-    return None if parts is None else parts[ALL_LIGHT]
-
-
 def _decode_parts(
     what: str,
     names: Sequence[str],
@@ -259,15 +268,15 @@ def _decode_parts(
     size: tuple[int, ...],
     scene: Scene | None,
     members: Mapping[str, bytes],
-) -> dict[str, NDArray[np.float32]] | None:
-    """Return what the members `<view>.<what>.exr` hold of some views; None where there are none.
+) -> dict[str, NDArray[np.float32]]:
+    """Return what the members `<view>.<what>.exr` hold of some views; nothing where there are none.
 
     `scene` is None where lights are together. It raises KeyError for a member that is missing, and
     as `decode_parts_exr`.
     """
     packed = _of_views(what, views, members)
     if packed is None:
-        return None
+        return {}
     height, width = size
     num_lights = None if scene is None else num_light_pictures(scene)
     by_view = [decode_parts_exr(data, names, (height, width), num_lights) for data in packed]
@@ -288,29 +297,11 @@ def decode_scene(
     if "json" not in members:
         raise TrilightError(f"sample {key}: member {key}.json is missing.")
     with name_errors(key):
-        record = read_scene_record(members["json"], f"member {key}.json")
-        views = _views(record["views"])
-        maps = record.get("maps")
+        record = read_scene_record(members["json"], SampleJson, f"member {key}.json")
+        maps = record.maps
         fields = {} if maps is None else unpacked_maps(maps, members, held)
         fields |= decode_arrays(unpack_arrays(members), maps)
-        scene = scene_of_record(record, **fields)
-    return SceneRecord(key=key, scene=scene, views=views)
-
-
-@dataclass(frozen=True, kw_only=True)
-class _Views:
-    views: tuple[ViewRecord, ...]
-
-
-def _views(value: Any) -> tuple[ViewRecord, ...]:
-    """Return the records of views; sorted, since parts are summed in the order of their names."""
-    views = read_json(json.dumps({"views": value}, sort_keys=True), _Views, "record").views
-    for row, view in enumerate(views):
-        if view.parts is not None and tuple(view.parts) not in KNOWN_PARTS:
-            known = "; ".join(", ".join(names) for names in KNOWN_PARTS)
-            named = ", ".join(view.parts) or "none"
-            raise TrilightError(f"views.{row}.parts are {named:.60}; expected floors of {known}.")
-    return views
+        return SceneRecord(key=key, scene=record.scene(**fields), views=record.views)
 
 
 @contextlib.contextmanager
@@ -410,11 +401,10 @@ class StoredSample(SceneRecord):
         """
         with name_errors(self.key):
             size = (resolution, resolution)
-            lights_rgb = _decode_lights(self.scene, views, size, self.members)
-        if lights_rgb is not None:
-            for view, lights in zip(views, lights_rgb, strict=True):
-                check_radiance(self.key, "", lights[None], first_view=view)
-        return lights_rgb
+            lights = _decode_parts("lights", (ALL_LIGHT,), views, size, self.scene, self.members)
+        for view, of_view in zip(views, lights.get(ALL_LIGHT, ()), strict=bool(lights)):
+            check_radiance(self.key, "", of_view[None], first_view=view)
+        return lights.get(ALL_LIGHT)
 
 
 def stored_sample(

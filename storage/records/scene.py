@@ -27,7 +27,7 @@ from storage.records.material import (
     material_columns,
     material_width,
 )
-from storage.records.scene_laws import broken_law, require_array, require_law
+from storage.records.scene_laws import broken_law, require_array, require_law, require_rotations
 from storage.records.texture import CONSTANT, MAX_MAPS_BYTES, TEXTURED, Texture
 from storage.settings.fields import describe_fields
 from storage.settings.ranges import FLOAT32_MAX, Within
@@ -40,9 +40,6 @@ ALBEDO_SUM_TOLERANCE = 1e-5
 
 UNIT_NORMAL_TOLERANCE = 1e-4
 """A float32 unit vector is exact to 1e-7; 1e-4 admits normals that passed through half floats."""
-
-POSE_TOLERANCE = 1e-4
-"""How far the rotation of a float32 pose may be from orthonormal."""
 
 FINITE = Within(-FLOAT32_MAX, FLOAT32_MAX)
 """Any float32 but NaN and infinity."""
@@ -201,6 +198,13 @@ _EQUALLY_LONG = (
 )
 
 
+_ROWS_OF = (
+    ("faces", "vertex_positions"),
+    ("material_index", "materials"),
+    ("object_index", "objects"),
+)
+
+
 def _check_arrays(scene: Scene) -> None:
     for name, (dtype, shape) in ARRAY_FIELDS.items():
         array = getattr(scene, name)
@@ -220,6 +224,10 @@ def _check_arrays(scene: Scene) -> None:
         expected = len(getattr(scene, other))
         if got != expected:
             broken_law(f"{name} has {got} rows", f"{expected}, as {other} has")
+    for name, rows in _ROWS_OF:
+        array = getattr(scene, name)
+        count = len(getattr(scene, rows))
+        require_law(array < count, name, array, f"rows below {count}")
 
 
 def _check_columns(scene: Scene) -> None:
@@ -241,17 +249,11 @@ def _check_columns(scene: Scene) -> None:
 def _check_geometry(scene: Scene) -> None:
     if scene.num_triangles == 0:
         broken_law("faces is empty", "at least one triangle")
-    count = len(scene.vertex_positions)
-    require_law(scene.faces < count, "faces", scene.faces, f"vertex rows below {count}")
     length = np.linalg.norm(scene.vertex_normals, axis=1)
     require_law(abs(length - 1) <= UNIT_NORMAL_TOLERANCE, "vertex_normals", length, "unit length")
 
 
 def _check_materials(scene: Scene) -> None:
-    rows = len(scene.materials)
-    require_law(
-        scene.material_index < rows, "material_index", scene.material_index, f"rows below {rows}"
-    )
     total = scene.materials[:, DIFFUSE] + scene.materials[:, SPECULAR]
     bound = 1 + ALBEDO_SUM_TOLERANCE
     require_law(total <= bound, "materials", total, "diffuse + specular at most 1")
@@ -261,8 +263,6 @@ def _check_materials(scene: Scene) -> None:
 
 
 def _check_objects(scene: Scene) -> None:
-    rows = len(scene.objects)
-    require_law(scene.object_index < rows, "object_index", scene.object_index, f"rows below {rows}")
     names = set[str]()
     for entry in scene.objects:  # a set: a scene may hold 65536 of them
         if entry.name in names:
@@ -278,11 +278,7 @@ def _check_objects(scene: Scene) -> None:
 def _check_cameras(scene: Scene) -> None:
     if scene.num_views == 0:
         broken_law("c2w is empty", "at least one camera")
-    rotation = scene.c2w[:, :3, :3].astype(np.float64)
-    gram = rotation.transpose(0, 2, 1) @ rotation
-    orthonormal = abs(gram - np.eye(3)).max(axis=(1, 2)) <= POSE_TOLERANCE
-    require_law(orthonormal, "c2w", scene.c2w, "an orthonormal rotation")
-    require_law(np.linalg.det(rotation) > 0, "c2w", scene.c2w, "a rotation without mirroring")
+    require_rotations(scene.c2w[:, :3, :3], "c2w", scene.c2w)
     bottom = (scene.c2w[:, 3] == np.array([0, 0, 0, 1])).all(axis=1)
     require_law(bottom, "c2w", scene.c2w, "a last row of 0 0 0 1")
 

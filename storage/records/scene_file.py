@@ -10,12 +10,11 @@ which none takes more than its part of the file; names must be exactly those of 
 laws of `Scene.check`, types and shapes among them, hold for every scene that is returned.
 """
 
-import dataclasses
-import json
-import stat
+import os
 from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Annotated, Any, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -25,35 +24,33 @@ from storage.conventions import (
     MAPS_VERSION,
     READABLE_VERSIONS,
     SCHEMA_VERSION,
-    require_readable,
 )
 from storage.digests import canonical_json, sha256_hex
-from storage.errors import TrilightError
-from storage.records.environment import Environment
+from storage.errors import TrilightError, prefix_errors
 from storage.records.material import chosen_columns, completed_rows, stored_columns, stored_names
+from storage.records.objects import text_record
 from storage.records.packed_maps import (
-    Entry,
-    Map,
+    MapEntry,
+    Maps,
     checked_map,
-    described_map,
     held_values,
-    map_entries,
-    maps_digest,
-    maps_record,
+    maps_of,
     stored_values,
 )
 from storage.records.retextured import without_constant_textures
-from storage.records.safe_read import read_safetensors
+from storage.records.safe_read import name_unreadable, open_plain, read_safetensors
 from storage.records.scene import (
     ARRAY_FIELDS,
     MAP_ARRAYS,
     MAX_TEXTURES,
-    OBJECT_KINDS,
+    ObjectKind,
     Scene,
     SceneObject,
 )
-from storage.records.scene_laws import require_fields, wrong_value
+from storage.records.scene_laws import wrong_value
 from storage.records.texture import MAX_MAPS_BYTES, Texture
+from storage.settings.ranges import Law
+from storage.typed_json import FINITE, read_versioned
 
 MAX_FILE_BYTES = (256 << 20) + MAX_MAPS_BYTES
 """A million triangles with three vertices each take 90 MB."""
@@ -66,14 +63,11 @@ CARRIED = frozenset(
 )
 """What the form holds of a scene (pipeline.exchange.formats): all of it, added columns too."""
 
-_VERSIONS = (SCHEMA_VERSION, MAPS_VERSION)
 _METADATA = "trilight_scene"
 _COLUMNS = "material_columns"
-_MAPS = "maps"
 _MAPS_DIGEST = "maps_sha256"
 _TEXTURE = "texture."
 _ENVIRONMENT = "environment"
-_IS_SRGB = "is_srgb"
 
 
 def encode_arrays(scene: Scene) -> bytes:
@@ -85,17 +79,17 @@ def encode_arrays(scene: Scene) -> bytes:
     scene = without_constant_textures(scene)
     stated = stored_names(stored_columns(scene.materials))
     arrays = _arrays(scene)
-    if (maps := maps_record(scene)) is not None:
-        arrays[_MAPS_DIGEST] = maps_digest(maps)
+    if (maps := maps_of(scene)) is not None:
+        arrays[_MAPS_DIGEST] = maps.digest
     return save(arrays, None if stated is None else {_COLUMNS: stated})
 
 
-def decode_arrays(data: bytes, maps: Any = None) -> dict[str, NDArray]:
+def decode_arrays(data: bytes, maps: Maps | None = None) -> dict[str, NDArray]:
     """Return the array fields of a scene from the bytes of `encode_arrays`.
 
     Args:
         data: the bytes.
-        maps: what the record of the scene says of its maps (storage.records.packed_maps).
+        maps: what the record of the scene says of its maps.
 
     Raises:
         TrilightError: damaged, an array is missing, a material column is not declared here, or the
@@ -106,7 +100,7 @@ def decode_arrays(data: bytes, maps: Any = None) -> dict[str, NDArray]:
         raise TrilightError(f"scene: the array {min(missing)} is missing.")
     arrays["materials"] = completed_rows(arrays["materials"], metadata.get(_COLUMNS))
     stored_digest = arrays[_MAPS_DIGEST].tobytes() if _MAPS_DIGEST in arrays else None
-    if stored_digest != (None if maps is None else maps_digest(maps).tobytes()):
+    if stored_digest != (None if maps is None else maps.digest.tobytes()):
         raise TrilightError(
             "scene: its record and its arrays do not speak of the same textures and environment. "
             "Run `trilight verify`."
@@ -132,7 +126,7 @@ def encode_scene(scene: Scene) -> bytes:
         record[_COLUMNS] = stated
     arrays = _arrays(scene)
     if scene.textures:
-        record[_IS_SRGB] = [texture.is_srgb for texture in scene.textures]
+        record["is_srgb"] = [texture.is_srgb for texture in scene.textures]
     for row, texture in enumerate(scene.textures):
         arrays[f"{_TEXTURE}{row}"] = np.ascontiguousarray(stored_values(texture.texels))
     if scene.environment is not None:
@@ -154,16 +148,10 @@ def read_scene_file(path: Path) -> Scene:
     Raises:
         TrilightError: it cannot be read, or as `decode_scene_file`.
     """
-    try:
-        status = path.stat()
-        if not stat.S_ISREG(status.st_mode) or status.st_size > MAX_FILE_BYTES:
-            raise TrilightError(
-                f"{path.name}: expected a regular file of at most {MAX_FILE_BYTES} bytes."
-            )
-        data = path.read_bytes()
-    except OSError as error:
-        raise TrilightError(f"{path.name}: cannot be read ({error.strerror}).") from error
-    return decode_scene_file(data, path.name)
+    with name_unreadable(path.name), open_plain(path) as stream:
+        if os.fstat(stream.fileno()).st_size > MAX_FILE_BYTES:
+            raise TrilightError(f"{path.name}: expected a file of at most {MAX_FILE_BYTES} bytes.")
+        return decode_scene_file(stream.read(), path.name)
 
 
 def decode_scene_file(data: bytes, name: str) -> Scene:
@@ -179,81 +167,92 @@ def decode_scene_file(data: bytes, name: str) -> Scene:
     """
     if len(data) > MAX_FILE_BYTES:
         raise TrilightError(f"{name}: {len(data)} bytes; expected at most {MAX_FILE_BYTES}.")
-    try:
+    with prefix_errors(name):
         arrays, metadata = read_safetensors(data, MAX_HEADER_BYTES)
         _check_names(arrays)
         if _METADATA not in metadata:
             raise TrilightError(f"scene: metadata {_METADATA} are missing.")
-        record = read_scene_record(metadata[_METADATA], "scene: its record", _VERSIONS)
-        arrays["materials"] = completed_rows(arrays["materials"], record.get(_COLUMNS))
+        record = read_scene_record(
+            metadata[_METADATA], SceneJson, "scene: its record", (SCHEMA_VERSION, MAPS_VERSION)
+        )
+        arrays["materials"] = completed_rows(arrays["materials"], record.material_columns)
         fields = _maps(record, arrays)
         fields |= {name: arrays[name] for name in (*ARRAY_FIELDS, *MAP_ARRAYS) if name in arrays}
-        scene = scene_of_record(record, **fields)
+        scene = record.scene(**fields)
         scene.check()
-    except TrilightError as error:
-        raise TrilightError(f"{name}: {error}") from error
-    return scene
+        return scene
+
+
+class LawfulProvenance(Law):
+    """Law of `scene_provenance`."""
+
+    def require(self, value: Any) -> Any:
+        return scene_provenance(value)
+
+
+@dataclass(frozen=True, kw_only=True)
+class StatedObject:
+    """Row of the objects in a scene's record: a `SceneObject`, all of it stated."""
+
+    name: str
+    kind: ObjectKind
+    uid: str
+    licence: str
+    attribution: str
+    source_url: str
+
+
+@dataclass(frozen=True, kw_only=True)
+class SceneJson:
+    """Record of a scene: what is no array of it, as JSON."""
+
+    schema_version: int
+    objects: tuple[StatedObject, ...]
+    provenance: Annotated[Mapping[str, Any], FINITE, LawfulProvenance()]
+    maps: Maps | None = None
+    material_columns: str | None = None
+    """Columns of the materials in a scene file (storage.records.material), if they are others than
+    the published ones."""
+    is_srgb: tuple[bool, ...] = ()
+    """Encoding of each texture in a scene file."""
+
+    def scene(self, **fields: Any) -> Scene:
+        """Return the scene with all other fields, whose laws are not checked."""
+        objects = tuple(SceneObject(**vars(entry)) for entry in self.objects)
+        return Scene(objects=objects, provenance=self.provenance, **fields)
+
+
+Record = TypeVar("Record", bound=SceneJson)
 
 
 def scene_record(scene: Scene) -> dict[str, Any]:
     """Return what is no array of a scene, as JSON values, and the version that this needs."""
-    maps = maps_record(scene)
+    maps = maps_of(scene)
     return {
         "schema_version": SCHEMA_VERSION if maps is None else MAPS_VERSION,
-        "objects": [dataclasses.asdict(entry) for entry in scene.objects],
+        "objects": [text_record(entry) for entry in scene.objects],
         "provenance": dict(scene.provenance),
-        **({} if maps is None else {_MAPS: maps}),
+        **({} if maps is None else {"maps": maps.json}),
     }
 
 
 def read_scene_record(
-    text: bytes | str, what: str, versions: Sequence[int] = READABLE_VERSIONS
-) -> dict[str, Any]:
+    text: bytes | str, kind: type[Record], what: str, versions: Sequence[int] = READABLE_VERSIONS
+) -> Record:
     """Return the record of a scene from its JSON text, called `what` in messages.
 
     Raises:
-        TrilightError: no JSON, another schema version, or none of MAPS_VERSION exactly where the
-            record names maps.
+        TrilightError: no record of this kind, another schema version, or none of MAPS_VERSION
+            exactly where the record names maps.
     """
-    try:
-        record = json.loads(text, parse_constant=_refuse_constant)
-    except (ValueError, RecursionError) as error:
-        raise TrilightError(f"{what} is not JSON ({error}).") from error
-    version = record.get("schema_version") if isinstance(record, dict) else None
-    require_readable(version, what, versions)
-    if (version == MAPS_VERSION) != (_MAPS in record):
-        has = "names" if _MAPS in record else "does not name"
+    record = read_versioned(text, kind, what, versions)
+    if (record.schema_version == MAPS_VERSION) != (record.maps is not None):
+        has = "does not name" if record.maps is None else "names"
         raise TrilightError(
-            f"{what} {has} {_MAPS} and has schema version {version}; expected {MAPS_VERSION} "
-            "exactly where there are any."
+            f"{what} {has} maps and has schema version {record.schema_version}; expected "
+            f"{MAPS_VERSION} exactly where there are any."
         )
-    return dict(record)
-
-
-def _refuse_constant(text: str) -> float:
-    raise TrilightError(f"{text} is no JSON number")
-
-
-def scene_of_record(record: Mapping[str, Any], **fields: Any) -> Scene:
-    """Return the scene of a record and of all other fields; its laws are not checked.
-
-    Raises:
-        TrilightError: the objects are no list, one has a field too many or too few, no text or an
-            unknown kind; or as `scene_provenance`.
-    """
-    objects = record.get("objects")
-    if not isinstance(objects, list):
-        wrong_value("objects", objects, "a list")
-    texts = dict.fromkeys((field.name for field in dataclasses.fields(SceneObject)), str)
-    for row, entry in enumerate(objects):
-        require_fields(entry, f"objects[{row}]", texts)
-        if entry["kind"] not in OBJECT_KINDS:
-            expected = f"one of {', '.join(OBJECT_KINDS)}"
-            wrong_value(f"objects[{row}].kind", entry["kind"], expected)
-    provenance = scene_provenance(record.get("provenance"))
-    return Scene(
-        objects=tuple(SceneObject(**entry) for entry in objects), provenance=provenance, **fields
-    )
+    return record
 
 
 def scene_provenance(value: Any) -> Mapping[str, Any]:
@@ -285,29 +284,22 @@ def _arrays(scene: Scene) -> dict[str, NDArray]:
     return arrays | {"materials": chosen_columns(scene.materials, columns)}
 
 
-def _maps(record: Mapping[str, Any], arrays: Mapping[str, NDArray]) -> dict[str, Any]:
+def _maps(record: SceneJson, arrays: Mapping[str, NDArray]) -> dict[str, Any]:
     """Return the fields `textures` and `environment` of what a file says, where it has any."""
-    if _MAPS not in record:
+    if record.maps is None:
         return {}
-    textures, skies = map_entries(record[_MAPS])
-    is_srgb = record.get(_IS_SRGB, [])
-    if not isinstance(is_srgb, list) or [type(each) for each in is_srgb] != [bool] * len(textures):
-        wrong_value(_IS_SRGB, is_srgb, "true or false for each texture")
+    if len(record.is_srgb) != len(record.maps.textures):
+        wrong_value("is_srgb", list(record.is_srgb), "true or false for each texture")
 
-    def load(kind: type[Map], name: str, entry: Entry, *, is_srgb: bool = False) -> Map:
+    def load(kind: Any, entry: MapEntry, row: int) -> Any:
+        is_texture = kind is Texture
+        name = f"{_TEXTURE}{row}" if is_texture else _ENVIRONMENT
         if name not in arrays:
             raise TrilightError(f"scene: the array {name} is missing.")
-        made = checked_map(kind, entry, held_values(arrays[name]), is_srgb=is_srgb)
-        return described_map(entry, made)
+        is_srgb = is_texture and record.is_srgb[row]
+        return checked_map(kind, entry, held_values(arrays[name]), is_srgb=is_srgb)
 
-    fields: dict[str, Any] = {}
-    for sky in skies:
-        fields[_ENVIRONMENT] = load(Environment, _ENVIRONMENT, sky)
-    fields["textures"] = tuple(
-        load(Texture, f"{_TEXTURE}{row}", entry, is_srgb=is_srgb[row])
-        for row, entry in enumerate(textures)
-    )
-    return fields
+    return record.maps.load(load)
 
 
 def _check_names(arrays: Mapping[str, NDArray]) -> None:

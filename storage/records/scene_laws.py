@@ -1,6 +1,5 @@
 """Errors of unlawful scenes: the field, its value, the expected value, the index."""
 
-from collections.abc import Mapping
 from typing import Any, NoReturn
 
 import numpy as np
@@ -16,6 +15,19 @@ def require_law(law: NDArray[np.bool_], name: str, values: NDArray, expected: st
     index = tuple(int(i) for i in np.argwhere(~law)[0])
     value = " ".join(np.array2string(values[index], threshold=16).split())
     broken_law(f"{name}{list(index)} is {value}", expected)
+
+
+ROTATION_TOLERANCE = 1e-4
+"""How far a float32 rotation may be from orthonormal."""
+
+
+def require_rotations(rotations: NDArray[np.float32], name: str, values: NDArray) -> None:
+    """Raise TrilightError for the first of N matrices [N, 3, 3] that is no rotation."""
+    rotations64 = rotations.astype(np.float64)
+    gram = rotations64.transpose(0, 2, 1) @ rotations64
+    is_orthonormal = abs(gram - np.eye(3)).max(axis=(1, 2)) <= ROTATION_TOLERANCE
+    lawful = np.linalg.det(np.where(is_orthonormal[:, None, None], rotations64, 0)) > 0
+    require_law(lawful, name, values, "an orthonormal rotation without mirroring")
 
 
 def require_array(array: NDArray, name: str, dtype: type, shape: tuple[int | None, ...]) -> None:
@@ -37,15 +49,3 @@ def broken_law(observed: str, expected: str) -> NoReturn:
 def wrong_value(name: str, got: Any, expected: str) -> NoReturn:
     """Raise TrilightError for a value from outside, of which the message shows the beginning."""
     broken_law(f"{name} is {got!r:.80}", expected)
-
-
-_KINDS: Mapping[type, str] = {str: "text", bool: "true or false", list: "a list"}
-
-
-def require_fields(value: Any, name: str, fields: Mapping[str, type]) -> None:
-    """Raise TrilightError unless a JSON value has exactly these fields, of these types."""
-    if not isinstance(value, Mapping) or value.keys() != fields.keys():
-        wrong_value(name, value, f"exactly the fields {', '.join(sorted(fields))}")
-    for field, kind in fields.items():
-        if type(value[field]) is not kind:
-            wrong_value(f"{name}.{field}", value[field], _KINDS[kind])

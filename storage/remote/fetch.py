@@ -5,7 +5,6 @@ when all announced bytes are there.
 """
 
 from collections.abc import Mapping
-from dataclasses import dataclass
 from typing import Any, BinaryIO
 
 from storage.errors import Unreadable
@@ -29,18 +28,8 @@ _VERSION_FIELDS = (
 """Names under which the drivers report the version of a file."""
 
 
-@dataclass(frozen=True, kw_only=True)
-class Facts:
-    """Size and version of a file, as its server states them."""
-
-    num_bytes: int | None
-    """Size; None where it is not said."""
-    version: Mapping[str, str]
-    """Header values that change when the file does; may be empty."""
-
-
-def facts_of(url: RemoteUrl) -> Facts:
-    """Ask about a file.
+def facts_of(url: RemoteUrl) -> Mapping[str, Any]:
+    """Ask about a file, and return what its driver says, such as `size` where that is known.
 
     Raises:
         TransferFailed: there is none, it may not be seen, or the server gives no answer.
@@ -50,7 +39,7 @@ def facts_of(url: RemoteUrl) -> Facts:
     info = with_tries(lambda: _fresh_info(driver, url))
     if info.get("type") == "directory":
         raise TransferFailed("download_failed", "is a folder, not a file")
-    return Facts(num_bytes=info.get("size"), version=version_of(info))
+    return info
 
 
 def _fresh_info(driver: Any, url: RemoteUrl) -> dict[str, Any]:

@@ -16,7 +16,7 @@ from storage.cache import cache_folder
 from storage.digests import canonical_json, sha256_hex, sha256_of_file
 from storage.errors import TrilightError
 from storage.file_locks import hold_lock, take_lock
-from storage.remote.fetch import download, facts_of, unreadable
+from storage.remote.fetch import download, facts_of, unreadable, version_of
 from storage.remote.retries import TransferFailed
 from storage.remote.url import RemoteUrl
 
@@ -148,7 +148,7 @@ def _name(url: RemoteUrl, sha256: str | None) -> str:
     facts = facts_of(url)
     # without a digest, a query may be what tells two files apart
     place = canonical_json([url.display_url, url.query])
-    version = canonical_json([facts.num_bytes, facts.version])
+    version = canonical_json([facts.get("size"), version_of(facts)])
     return f"{sha256_hex(place)[:16]}-{sha256_hex(version)}"
 
 

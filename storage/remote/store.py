@@ -18,7 +18,6 @@ import os
 import shutil
 import time
 import uuid
-from abc import ABC, abstractmethod
 from collections.abc import Callable, Iterable, Iterator
 from pathlib import Path
 from typing import Any, BinaryIO
@@ -47,86 +46,24 @@ _FREE = b"free"
 """Content of a claim in a bucket whose holder is done."""
 
 
-class Store(ABC):
-    """A place for files that several workers read and write at once."""
+class LocalStore:
+    """A folder of this machine, or of one that all machines see at the same place."""
 
-    is_here: bool
+    is_here = True
     """True for a folder: what is written there is published."""
-    display_name: str
-    """The folder or URL without secrets, for messages."""
 
-    @abstractmethod
+    def __init__(self, root: Path) -> None:
+        self.root = root
+        self.display_name = str(root)
+        """The folder or URL without secrets, for messages."""
+        self._checked: dict[str, tuple[int, ...]] = {}
+
     def get(self, name: str, num_bytes: int | None = None) -> bytes | None:
         """Return a file, or its first bytes; None where there is none.
 
         Raises:
             TrilightError: it cannot be read (an EnvironmentFailure where that may pass).
         """
-
-    @abstractmethod
-    def put(self, name: str, content: Path | bytes) -> None:
-        """Write a file, or replace it; one that stands at its place in a folder stays.
-
-        Raises:
-            TrilightError: it cannot be written (an EnvironmentFailure where that may pass).
-        """
-
-    @abstractmethod
-    def create_if_absent(self, name: str, content: Path | bytes) -> bool:
-        """Write a file unless it exists, and return whether it was written; otherwise as `put`.
-
-        A file that stands at its place in a folder counts as written. Where the answer to a
-        successful write is lost, another worker counts as its writer.
-        """
-
-    @abstractmethod
-    def list(self, folder: str = "") -> set[str]:
-        """Return the names of the files in one folder; as `get` raises."""
-
-    @abstractmethod
-    def hold_lock(self, name: str) -> contextlib.AbstractContextManager[bool]:
-        """Hold the claim on a file for the block; yield whether it is ours; as `put` raises."""
-
-    @abstractmethod
-    def require_create(self) -> None:
-        """Raise TrilightError if the store writes a file again that it was to create once."""
-
-    @abstractmethod
-    def num_bytes(self, name: str) -> int | None:
-        """Return the size of a shard, or None where the server does not state it.
-
-        Raises:
-            ShardMissing: there is none.
-            Unreadable: it cannot be looked at, or the server gives no answer.
-        """
-
-    @abstractmethod
-    def open_shard(self, name: str, *, num_bytes: int, sha256: str, checked: bool) -> BinaryIO:
-        """Open a shard for reading.
-
-        Args:
-            name: its name.
-            num_bytes: its size.
-            sha256: its digest.
-            checked: check the digest first, once as long as the file stays unchanged; what comes
-                from a server always is.
-
-        Raises:
-            TrilightError: it is missing, cannot be read, or its bytes are not those of the digest.
-        """
-
-
-class LocalStore(Store):
-    """A folder of this machine, or of one that all machines see at the same place."""
-
-    is_here = True
-
-    def __init__(self, root: Path) -> None:
-        self.root = root
-        self.display_name = str(root)
-        self._checked: dict[str, tuple[int, ...]] = {}
-
-    def get(self, name: str, num_bytes: int | None = None) -> bytes | None:
         from storage.records.safe_read import open_if_there  # slow, and most names need no file
 
         stream = open_if_there(self.root / name)
@@ -136,9 +73,19 @@ class LocalStore(Store):
             return stream.read(-1 if num_bytes is None else num_bytes)
 
     def put(self, name: str, content: Path | bytes) -> None:
+        """Write a file, or replace it; one that stands at its place in a folder stays.
+
+        Raises:
+            TrilightError: it cannot be written (an EnvironmentFailure where that may pass).
+        """
         self._write(name, content, replace=True)
 
     def create_if_absent(self, name: str, content: Path | bytes) -> bool:
+        """Write a file unless it exists, and return whether it was written; otherwise as `put`.
+
+        A file that stands at its place in a folder counts as written. Where the answer to a
+        successful write is lost, another worker counts as its writer.
+        """
         return self._write(name, content, replace=False)
 
     def _write(self, name: str, content: Path | bytes, *, replace: bool) -> bool:
@@ -155,6 +102,7 @@ class LocalStore(Store):
         return os.path.samestat(ours, path.stat())
 
     def list(self, folder: str = "") -> set[str]:
+        """Return the names of the files in one folder; as `get` raises."""
         place = folder.rstrip("/")
         with contextlib.suppress(FileNotFoundError), os.scandir(self.root / place) as entries:
             names = {entry.name for entry in entries if entry.is_file()}
@@ -162,17 +110,39 @@ class LocalStore(Store):
         return set()
 
     def hold_lock(self, name: str) -> contextlib.AbstractContextManager[bool]:
+        """Hold the claim on a file for the block; yield whether it is ours; as `put` raises."""
         return hold_lock(claim_of(self.root / name))
 
     def require_create(self) -> None:
-        """Pass: storage.atomic sees to it."""
+        """Raise TrilightError if the store writes a file again that it was to create once.
+
+        A folder does not: storage.atomic sees to it.
+        """
 
     def num_bytes(self, name: str) -> int | None:
+        """Return the size of a shard, or None where the server does not state it.
+
+        Raises:
+            ShardMissing: there is none.
+            Unreadable: it cannot be looked at, or the server gives no answer.
+        """
         path = self.root / name
         with _name_missing(path):
             return path.stat().st_size
 
     def open_shard(self, name: str, *, num_bytes: int, sha256: str, checked: bool) -> BinaryIO:
+        """Open a shard for reading.
+
+        Args:
+            name: its name.
+            num_bytes: its size.
+            sha256: its digest.
+            checked: check the digest first, once as long as the file stays unchanged; what comes
+                from a server always is.
+
+        Raises:
+            TrilightError: it is missing, cannot be read, or its bytes are not those of the digest.
+        """
         from storage.records.safe_read import open_plain
 
         path = self.root / name
@@ -207,7 +177,7 @@ def _name_missing(path: Path) -> Iterator[None]:
         ) from error
 
 
-class RemoteStore(Store):
+class RemoteStore:
     """A folder in a bucket, by fsspec; one on a plain server can only be read.
 
     Its shards come whole to the cache of this machine.
@@ -339,7 +309,8 @@ class RemoteStore(Store):
     def num_bytes(self, name: str) -> int | None:
         url = self.url.child(name)
         try:
-            return facts_of(url).num_bytes
+            size: int | None = facts_of(url).get("size")
+            return size
         except TransferFailed as error:
             if error.__cause__ is not None and is_missing(error.__cause__):
                 raise ShardMissing(f"{url.display_url}: the shard is missing.") from error
@@ -374,6 +345,10 @@ class RemoteStore(Store):
                 "expected a bucket that exists, and access that lets you list, read and write "
                 "there. What was finished is safe: fix it and run the same command again."
             ) from error
+
+
+Store = LocalStore | RemoteStore
+"""A place for files that several workers read and write at once."""
 
 
 def claim_of(path: Path) -> Path:

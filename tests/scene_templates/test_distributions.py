@@ -1,15 +1,14 @@
 """Every quantity that is drawn is distributed as stated, for our settings and published ones.
 
 2000 layouts per setting with balls for objects. See `statistics` for the line that is drawn. The
-stated numbers are written here once more, from the published recipes and from what the default
-settings promise, and not read from the settings that are under test.
+stated numbers are written here once more, from what the default settings promise, and not read from
+the settings that are under test; those of the published families are pinned (`published`).
 """
 
 import dataclasses
 import math
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
-from typing import Any
 
 import numpy as np
 import pytest
@@ -19,7 +18,6 @@ from scipy import stats
 from pipeline.presets.registry import preset_settings
 from scene_templates.layout import Emitter, SurfaceLook
 from scene_templates.settings import SceneSettings
-from storage.settings.overrides import apply_overrides
 from tests.scene_templates.balls import MANY, Drawn, drawn
 from tests.scene_templates.published import DEFAULT, STAGE_1, STAGE_2, Row
 from tests.scene_templates.statistics import (
@@ -27,7 +25,6 @@ from tests.scene_templates.statistics import (
     alike,
     by_cdf,
     choices,
-    implausible,
     require_plausible,
     share,
     uniform,
@@ -174,9 +171,6 @@ def _euler_normals() -> NDArray[np.float64]:
     return np.column_stack([x, y, z])
 
 
-FEWER = 1200
-"""Scenes in which everything that is wrong below is noticed."""
-
 STATED = {
     "pretrain-256": Stated(rows=DEFAULT, published=False),
     "renderformer-v1-256": Stated(rows=STAGE_1, published=True),
@@ -256,59 +250,3 @@ def test_the_second_training_stage_draws_the_same() -> None:
     )
     assert same == pretrain
     assert (finetune.max_triangles, finetune.enough_error) == (4096, 0.0025)
-
-
-WRONG: list[tuple[str, Mapping[str, Any], set[str]]] = [
-    (
-        "renderformer-v1-256",
-        {
-            "families.weight": 1.0,
-            "lights.count": [1, 7],
-            "lights.scale": [2.0, 2.45],
-            "placement.overlap_share": 0.9,
-            "placement.orientation": "uniform",
-            "materials.albedo_sum": [0.91, 1.0],
-            "materials.roughness_log": [0.1, 1.055],
-            "materials.coloured_share": 0.7,
-            "families.object_scale": [0.8, 1.5],
-            "families.smooth_share": 0.6,
-            "placement.inside": True,
-            "lights.total_emission": [2500, 4700],
-            "materials.specular_ratio": [0.0, 0.9],
-            "materials.roughness_clip": [0.03, 1.0],
-            "materials.coloured_specular_share": 0.01,
-        },
-        {"families", "light counts", "scale x", "scale y", "scale z", "overlaps", "euler y"}
-        | {"object albedo sum", "shell albedo sum", "object coloured", "shell coloured"}
-        | {"object roughness", "shell roughness"}
-        | {"sizes 0.8 to 1.8", "sizes 1.4 to 1.6", "object smooth", "shell smooth special"}
-        | {"centre x", "centre y", "centre z", "radiance"}
-        | {"object specular ratio", "object roughness", "object specular is grey"},
-    ),
-    (
-        "pretrain-256",
-        {
-            "families.num_objects": [1, 2],
-            "lights.coloured_share": 0.01,
-            "placement.overlap_share": 1.0,
-            "lights.orientation": "euler",
-            "placement.orientation": "euler",
-            "materials.triangle_colours_share": 0.0,
-        },
-        {"object counts 1 to 1", "object counts 2 to 3", "white", "normal z", "entry 0 0"}
-        | {"object by triangle", "overlaps"},
-    ),
-]
-"""A preset, what is changed behind its back, and some of what must be noticed."""
-
-
-@pytest.mark.parametrize(("build", "changes", "rows"), WRONG, ids=["ranges", "kinds"])
-def test_a_wrong_distribution_is_noticed(
-    build: str, changes: Mapping[str, Any], rows: set[str]
-) -> None:
-    wrong = apply_overrides(_settings(build), changes)
-    table = _table(drawn(wrong, FEWER), STATED[build])
-    assert rows <= set(implausible(table))
-    # What has not been changed is not blamed.
-    unchanged = {"object red", "object green", "object blue", "shell red", "shell green"}
-    assert not unchanged & set(implausible(table))

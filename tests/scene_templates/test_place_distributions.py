@@ -8,7 +8,6 @@ import itertools
 import math
 
 import numpy as np
-import pytest
 from numpy.typing import NDArray
 
 from scene_templates.layout import CameraPose
@@ -18,13 +17,12 @@ from scene_templates.sample_camera import CameraSettings, Sector, sample_camera
 from scene_templates.sample_lights import LightSettings, sample_lights
 from scene_templates.templates import TEMPLATES
 from tests.for_each import for_each
-from tests.scene_templates.balls import DEFAULTS, MANY, Drawn, drawn, drawn_once, template_settings
+from tests.scene_templates.balls import Drawn, drawn, template_settings
 from tests.scene_templates.published import side_row
 from tests.scene_templates.statistics import (
     Table,
     alike,
     choices,
-    implausible,
     require_plausible,
     share,
     uniform,
@@ -70,28 +68,19 @@ def test_shared_rooms_are_drawn_as_stated() -> None:
         assert len({(one.scale, one.translation) for one in patches}) == 1
 
 
-def test_a_wrong_room_is_noticed() -> None:
-    wrong = SharedRoom(
-        square_share=0.35, scale=(1.0, 1.3), shift=0.03, raise_z=(0.0, 0.2), tilt_deg=1.5
-    )
-    rows = {"square", "floor tilt 0", "wall0 tilt 2", "wall1 tilt 1"}
-    rows |= {f"{quantity} {axis}" for quantity in ("scale", "move") for axis in "xyz"}
-    assert rows <= set(implausible(_shared_room_table(wrong)))
-
-
-def _sides_table(stage: int, drawn_policy: Policy, stated_policy: Policy) -> Table:
+def _sides_table(stage: int, policy: Policy) -> Table:
     """p-values of every quantity of every side, over the families that share its ranges."""
     found: dict[tuple[str, ...], list[float]] = {}
     stated: dict[tuple[str, ...], tuple[float, float]] = {}
     rng = np.random.default_rng(stage)
-    for family in (stage_1_families if stage == 1 else stage_2_families)(drawn_policy):
+    for family in (stage_1_families if stage == 1 else stage_2_families)(policy):
         parts = TEMPLATES[family.template].parts
         for _ in range(100):
             patches = family.shell.sample_room(rng, parts).patches
             for part, at in zip(parts, patches, strict=True):
                 assert at.reach == 1
                 axis = SIDES[part].axis
-                spin, tilt, scale, *moves = side_row(family.name, part, stated_policy, stage)
+                spin, tilt, scale, *moves = side_row(family.name, part, policy, stage)
                 rows = [("spin", at.rotation_deg[axis], (-spin, spin))]
                 others = sorted({0, 1, 2} - {axis})
                 rows += [(f"tilt {k}", at.rotation_deg[k], (-tilt, tilt)) for k in others]
@@ -107,19 +96,7 @@ def _sides_table(stage: int, drawn_policy: Policy, stated_policy: Policy) -> Tab
 
 @for_each(("policy", "stage"), itertools.product(["original", "de-biased"], [1, 2]))
 def test_separate_sides_are_drawn_as_published(policy: Policy, stage: int) -> None:
-    table = _sides_table(stage, policy, policy)
-    require_plausible(table)
-    if policy == "original":
-        return  # that one policy is told from the other is seen once
-    other: Policy = "original" if policy == "de-biased" else "de-biased"
-    mistaken = set(implausible(_sides_table(stage, other, policy)))
-    # The policies differ in every spin, in the tilts of the box, in stage 2 in some floors, and in
-    # nothing else.
-    assert all("spin" in row or "open_box" in row or "move 2" in row for row in mistaken)
-    spins = {row for row in table if "spin" in row and "(-0.0, 0.0)" not in row}
-    assert spins <= mistaken
-    assert any("tilt" in row for row in mistaken)
-    assert any("move 2" in row for row in mistaken) == (stage == 2)
+    require_plausible(_sides_table(stage, policy))
 
 
 ROOM = {
@@ -160,41 +137,6 @@ def _place_table(scenes: list[Drawn]) -> Table:
 
 def test_a_single_object_is_placed_evenly_and_rests_half_the_time() -> None:
     require_plausible(_place_table(drawn(template_settings("plane", ROOM), COUNT)))
-    changes: dict[str, object] = {
-        "placement.resting_share": 0.7,
-        "families.shell.raise_z": [0.5, 0.5],
-        "families.object_scale": [0.8, 1.5],
-    }
-    for name, row in zip(changes, ("rests", "height", "size"), strict=True):
-        wrong = template_settings("plane", {**ROOM, name: changes[name]})
-        assert row in implausible(_place_table(drawn(wrong, 300)))
-
-
-@pytest.mark.slow("statistics")
-def test_how_far_crowding_shifts_sizes_and_shares() -> None:
-    """The price of objects that do not meet, with solid balls: the most crowded there are.
-
-    Sizes are drawn again where none fits, so that smaller ones remain. For one object the greatest
-    distance of the distribution functions stays below 0.1, for two below 0.25, for three below 0.4
-    (measured: 0.03, 0.21, 0.30). Balls claim all of their spheres; for meshes see
-    tests/pipeline/scenes. Resting needs the floor, and is rarer by at most 0.05 (measured: 0.47).
-    """
-    rests: list[bool] = []
-    sizes: dict[int, list[float]] = {1: [], 2: [], 3: []}
-    for one in drawn_once(DEFAULTS, MANY):
-        low, high = one.plan.family.object_scale
-        for row, placement in enumerate(one.layout.objects):
-            size = (4 * placement.pose.radius - low) / (high - low)
-            sizes[one.plan.num_objects].append(size)
-            rests.append(_rests(one, row))
-    for count, most in ((1, 0.1), (2, 0.25), (3, 0.4)):
-        values = np.sort(sizes[count])
-        assert values[0] >= 0
-        assert values[-1] <= 1
-        apart = np.abs(values - np.arange(len(values)) / len(values)).max()
-        assert apart < most
-    # 4000 tosses have a standard deviation of 0.008, nearly four of which are 0.03.
-    assert 0.45 - 0.03 < np.mean(rests) < 0.5 + 0.03
 
 
 def _off_deg(directions: NDArray[np.float64], sector: Sector) -> NDArray[np.float64]:
@@ -231,8 +173,6 @@ def test_lights_hang_evenly_in_their_sector(name: str) -> None:
     for axis, around in enumerate(_light_centres(sector, distance=(1e-3, 1e-3)).T):
         table[f"target {axis}"] = uniform(around, -0.2, 0.2)
     require_plausible(table)
-    other = TEMPLATES["corner" if name != "corner" else "open_box"].lights
-    assert implausible(_sector_table(centres / distance[:, None], other))
 
 
 def _cameras(sector: Sector, **changes: object) -> list[CameraPose]:
@@ -276,16 +216,3 @@ def _roll_twin(sector: Sector) -> list[float]:
 @for_each("name", TEMPLATES)
 def test_cameras_are_drawn_as_stated(name: str) -> None:
     require_plausible(_camera_table(TEMPLATES[name].cameras))
-
-
-def test_wrong_cameras_are_noticed() -> None:
-    wrong = {"fov_deg": (30.0, 54.0), "distance": (1.5, 1.85), "up_jitter": 0.2}
-    table = _camera_table(TEMPLATES["wall"].cameras, **wrong, target_jitter=0.13)
-    assert set(implausible(table)) == {
-        "fov",
-        "distance",
-        "roll",
-        "target 0",
-        "target 1",
-        "target 2",
-    }

@@ -20,7 +20,8 @@ from typing import TYPE_CHECKING, Any, TypeVar
 import numpy as np
 
 from model.scene_tensors import lit_sky, require_known_sky
-from storage.dataset.shard_set import OpenShard, ShardSet
+from storage.dataset.shard import ShardReader
+from storage.dataset.shard_set import ShardSet
 from storage.errors import TrilightError
 from storage.machine import allowed_cores, free_memory
 from storage.records.sample import StoredSample
@@ -112,7 +113,7 @@ class OpenShards:
     def __init__(self, shards: ShardSet) -> None:
         self._shards = shards
         self._opening = ThreadPoolExecutor(OPENED_AT_ONCE, thread_name_prefix="open-shard")
-        self._open: dict[int, Future[OpenShard]] = {}
+        self._open: dict[int, Future[ShardReader]] = {}
         self._planned: Counter[int] = Counter()
         self._lock = threading.Lock()
 
@@ -135,7 +136,7 @@ class OpenShards:
                 if number not in self._open:
                     self._open[number] = self._opening.submit(self._shards.open, number)
 
-    def read(self, number: int) -> OpenShard:
+    def read(self, number: int) -> ShardReader:
         """Return a planned shard after it is open; raises the error of opening it."""
         with self._lock:
             future = self._open[number]
@@ -150,7 +151,7 @@ class OpenShards:
                 self._open.pop(number).add_done_callback(_close)
 
 
-def _close(future: Future[OpenShard]) -> None:
+def _close(future: Future[ShardReader]) -> None:
     if not future.cancel() and future.exception() is None:
         future.result().close()
 
@@ -259,7 +260,7 @@ class _SceneMaker:
         )
 
     def _first_usable(
-        self, shard: OpenShard, visit: Visit
+        self, shard: ShardReader, visit: Visit
     ) -> tuple[TrainingScene, np.random.Generator] | None:
         """Return the first usable scene of a shard, from the visit's row on cyclically, or None."""
         keys = shard.keys

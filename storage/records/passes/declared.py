@@ -79,8 +79,8 @@ class Pass:
     name: str
     """Lower case letters and underscores, with the unit where there is one."""
     means: str
-    of: Callable[[PassRays], NDArray] = field(compare=False, repr=False)
-    """Returns the values at rays, [...] or [..., channels]."""
+    of: str | Callable[[PassRays], NDArray] = field(compare=False, repr=False)
+    """Name of a quantity of `FirstHits`, or a function of rays: [...] or [..., channels]."""
     averaging: Averaging
     channels: tuple[str, ...] = ()
     """Names of its numbers; a single number has none, and its picture no last axis."""
@@ -93,6 +93,11 @@ class Pass:
     """A shorter word for it on the command line and in settings."""
     layer: str = ""
     """Name of its layer in OpenEXR files, where other programs have one; by default its own."""
+
+    def at(self, rays: PassRays) -> NDArray:
+        """Return the values at rays, [...] or [..., channels]."""
+        values: NDArray = getattr(rays.hits, self.of) if isinstance(self.of, str) else self.of(rays)
+        return values.astype(self.dtype)
 
     @property
     def exr_channels(self) -> tuple[str, ...]:
@@ -122,36 +127,39 @@ _over_surfaces = partial(Pass, averaging="surfaces")
 _row = partial(_at_centre, dtype=np.int32, nothing=MISS)
 _depth = partial(_over_surfaces, unit="m", nothing=np.inf)
 _vector = partial(_over_surfaces, channels=_XYZ, frame="world")
-_in_camera = partial(_over_surfaces, channels=_XYZ, frame="camera")
+
+
+def _in_camera(name: str) -> Pass:
+    """Return the pass of a vector in the axes of the camera."""
+    return _over_surfaces(
+        f"{name}_camera",
+        f"The pass `{name}` in the axes of the camera.",
+        lambda rays: getattr(rays.hits, name) @ rays.c2w[:3, :3],
+        channels=_XYZ,
+        frame="camera",
+    )
+
 
 PASSES = (
-    _row(
-        "triangle",
-        "Row of `Scene.faces` of the triangle that is seen.",
-        lambda rays: rays.hits.triangle,
-    ),
-    _row(
-        "object",
-        "Row of `Scene.objects` of the object that is seen.",
-        lambda rays: rays.hits.object,
-    ),
+    _row("triangle", "Row of `Scene.faces` of the triangle that is seen.", "triangle"),
+    _row("object", "Row of `Scene.objects` of the object that is seen.", "object"),
     _at_centre(
         "barycentric",
         "Shares of the triangle's three corners in the point that is seen, adding up to 1.",
-        lambda rays: rays.hits.barycentric,
+        "barycentric",
         channels=("a", "b", "c"),
     ),
     _at_centre(
         "hit",
         "Whether the ray through the pixel's centre meets a surface.",
-        lambda rays: rays.hits.met,
+        "met",
         dtype=np.bool_,
         nothing=False,
     ),
     Pass(
         "coverage",
         "Share of the pixel's rays that meet a surface.",
-        lambda rays: rays.hits.met,
+        "met",
         averaging="pixel",
         layer="A",
         nothing=0,
@@ -164,48 +172,33 @@ PASSES = (
         layer="Z",
     ),
     _depth(
-        "depth_ray_m",
-        "Distance from the camera's centre to the surface, along the ray.",
-        lambda rays: rays.hits.depth_m,
+        "depth_ray_m", "Distance from the camera's centre to the surface, along the ray.", "depth_m"
     ),
     _vector(
-        "position_m",
-        "Point of the surface.",
-        lambda rays: rays.hits.position,
-        short="position",
-        layer="P",
-        unit="m",
+        "position_m", "Point of the surface.", "position", short="position", layer="P", unit="m"
     ),
     _vector(
         "geometric_normal",
         "Unit normal of the triangle, towards the side from which its corners run "
         "counter-clockwise, even where the other side is seen.",
-        lambda rays: rays.hits.geometric_normal,
+        "geometric_normal",
         layer="Ng",
     ),
-    _in_camera(
-        "geometric_normal_camera",
-        "The pass `geometric_normal` in the axes of the camera.",
-        lambda rays: rays.hits.geometric_normal @ rays.c2w[:3, :3],
-    ),
+    _in_camera("geometric_normal"),
     _vector(
         "shading_normal",
         "Unit normal interpolated between the triangle's corners and bent by its normal map, not "
         "turned to the camera.",
-        lambda rays: rays.hits.shading_normal,
+        "shading_normal",
         short="normal",
         layer="N",
     ),
-    _in_camera(
-        "shading_normal_camera",
-        "The pass `shading_normal` in the axes of the camera.",
-        lambda rays: rays.hits.shading_normal @ rays.c2w[:3, :3],
-    ),
+    _in_camera("shading_normal"),
     _at_centre(
         UV,
         "Texture coordinates of the point that is seen, u to the right and v up; undefined where "
         "the scene has none.",
-        lambda rays: rays.hits.uv,
+        "uv",
         channels=("u", "v"),
     ),
     _over_surfaces(

@@ -119,10 +119,9 @@ def _block(
     pixels: dict[str, NDArray] = {}
     for each in passes:
         if each.averaging == "centre ray":
-            pixels[each.name] = each.of(centre).astype(each.dtype)
-            continue
-        values: NDArray = each.of(spread).astype(each.dtype)
-        pixels[each.name] = _means(values, a_side, each.nothing)
+            pixels[each.name] = each.at(centre)
+        else:
+            pixels[each.name] = _means(each.at(spread), a_side, each.nothing)
     return pixels
 
 

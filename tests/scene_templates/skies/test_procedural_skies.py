@@ -36,12 +36,10 @@ def test_parameters_are_distributed_as_stated(family: str) -> None:
     """On two texels, where a family draws the same and makes no picture."""
 
     def made(seed: int, coloured_share: float) -> SkyDraws:
-        draws = SkyDraws(
-            rng_for(seed, "sky", int(coloured_share)),
-            coloured_share=coloured_share,
-            sun_elevation_deg=(10.0, 50.0),
-            sun_to_sky=(1.0, 3.0),
+        settings = SkyMapSettings(
+            coloured_share=coloured_share, sun_elevation_deg=(10.0, 50.0), sun_to_sky=(1.0, 3.0)
         )
+        draws = SkyDraws(rng_for(seed, "sky", int(coloured_share)), settings)
         SKIES[family](draws, SkyTexels(1))
         return draws
 
@@ -145,12 +143,10 @@ def test_the_sun_is_the_brightest_texel_and_where_it_was_drawn() -> None:
 
 
 def _radiance(ratio: float, height: int, elevation: float) -> tuple[np.ndarray, SkyTexels]:
-    draws = SkyDraws(
-        rng_for(5, "sun"),
-        coloured_share=0.0,
-        sun_elevation_deg=(elevation, elevation),
-        sun_to_sky=(ratio, ratio),
+    settings = SkyMapSettings(
+        coloured_share=0.0, sun_elevation_deg=(elevation, elevation), sun_to_sky=(ratio, ratio)
     )
+    draws = SkyDraws(rng_for(5, "sun"), settings)
     texels = SkyTexels(height)
     return SKIES["sun_and_sky"](draws, texels), texels
 

@@ -1,18 +1,15 @@
 """Surfaces: texels, finishes, what is laid and made of them, and which are drawn."""
 
 import dataclasses
-import math
 
 import numpy as np
 import pytest
 
 from scene_templates.surfaces.maps import MOST_ALBEDO, finish
 from scene_templates.surfaces.procedural_textures import (
-    HEXAGONS,
     OUR_SURFACES,
     SURFACES,
     SurfaceMapSettings,
-    _hexagon_of,
     draw_surface,
     exceeded_by,
     lay_rows,
@@ -149,36 +146,6 @@ def test_pieces_tile_the_map() -> None:
     assert (pieces.edge < d).mean() == pytest.approx(expected, abs=0.02)
 
 
-@pytest.mark.parametrize("name", HEXAGONS)
-def test_hexagons_are_equal_and_nearly_regular(name: str) -> None:
-    columns, rows = HEXAGONS[name]
-    assert columns / rows == pytest.approx(math.sqrt(0.75), rel=0.04)
-    index, edge = _hexagon_of(Texels(512), columns, rows)
-    counts = np.bincount(index.ravel(), minlength=columns * rows)
-    # of some 1,500 to 8,700 texels, those on the rim, of about 6 x 30, may fall to either side
-    assert np.abs(counts / (512 * 512 / columns / rows) - 1).max() < 0.06
-    # a hexagon of unit width shrunk by d on all sides keeps (1 - 2 d)^2 of its area
-    assert (edge > 0.1).mean() == pytest.approx(0.8 * 0.8, abs=0.02)
-    assert edge.min() > -0.02
-
-
-def test_grout_has_the_area_of_its_joints() -> None:
-    """Seen in the specular albedo, which tones of tiles leave alone."""
-    settings = SurfaceMapSettings(families=("tiles",), size=256)
-    found = [draw_surface(rng_for(seed, "laid"), settings) for seed in range(16)]
-    plain = [maps for maps in found if maps.parameters["pattern"] == ("plain",)]
-    assert len(plain) >= 3
-    for maps in plain:
-        tile, grout = (
-            maps.parameters[f"{name}: specular share"][0] for name in ("first tile", "grout")
-        )
-        share = (maps.specular_rgb.mean(dtype=float) - tile) / (grout - tile)
-        joint = maps.parameters["joint, in widths of a tile"][0]
-        side = 2 * maps.parameters["pairs of tiles a side"][0]
-        # ramps keep areas but for joints thinner than a texel, which get a quarter too much of it
-        assert share == pytest.approx(1 - (1 - joint) ** 2, abs=0.25 * 2 * side / 256)
-
-
 @for_each("share", [0.0, 0.1, 0.5, 1.0])
 def test_a_level_is_exceeded_by_its_share(share: float) -> None:
     noise = Texels(64).noise(rng_for(0, "noise"), (4, 4), octaves=3)
@@ -252,19 +219,3 @@ def test_a_quarter_turn_turns_the_picture_counter_clockwise() -> None:
     turned = dataclasses.replace(look, quarter_turns=1, tile_m=2.0, shift_uv=(0.0, 0.0))
     # What lay to the right (+x) now lies above (+y): u grows with y, and v against x.
     assert np.allclose(turned.uv(np.array([[0.0, 1.0], [1.0, 0.0]])), [[0.5, 0], [0, -0.5]])
-
-
-def test_as_many_bands_are_crossed_as_are_stated() -> None:
-    """On every straight line through the map, but for those that run along the bands."""
-    seen = set()
-    for seed in range(8):
-        settings = SurfaceMapSettings(families=("stripes",), size=256, natural_share=0.0)
-        maps = draw_surface(rng_for(seed, "laid"), settings)
-        along, bands = maps.parameters["run along"][0], maps.parameters["bands"][0]
-        values = maps.diffuse_rgb.astype(float).sum(axis=2)
-        is_band = values > (values.min() + values.max()) / 2
-        for axis, parallel in ((0, "v"), (1, "u")):
-            starts = (is_band & ~np.roll(is_band, 1, axis=axis)).sum(axis=axis)
-            assert (starts == (0 if along == parallel else bands)).all()
-        seen.add(along)
-    assert len(seen) > 2

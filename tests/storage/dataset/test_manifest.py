@@ -37,7 +37,6 @@ from storage.dataset.progress import (
     announce_downloads,
     announce_objects,
     count_object,
-    forget_views,
     missing_shards,
     read_progress,
     read_status,
@@ -190,13 +189,6 @@ def test_a_manifest_that_lies_is_one_sentence_within_a_second(
     assert field.rpartition(".")[2] in said or "bytes are too many" in said
 
 
-@for_each("text", ["", "[" * 100_000, "[]", "{}", "3", '{"schema_version": 3}', "\\", "{}{}"])
-def test_what_is_no_manifest_is_one_sentence(tmp_path: Path, text: str) -> None:
-    (tmp_path / "manifest.json").write_text(text)
-    with pytest.raises(TrilightError, match=r"^[^\n]*manifest.json: [^\n]*$"):
-        read_manifest(tmp_path / "manifest.json")
-
-
 def test_a_billion_planned_shards_cost_nothing(tmp_path: Path) -> None:
     dataset = five_scenes(tmp_path)
     settings = {"splits": {"scenes_per_shard": 1}}
@@ -337,15 +329,15 @@ def test_scenes_at_work_count_in_part(tmp_path: Path) -> None:
     assert (now.views_done, now.num_views) == (1.75, 2)
     make_tiny_shard(publication, 0)
     assert read_progress(folder).views_done == 4 * 2 + 1.75
-    forget_views(folder, 3)
-    forget_views(folder, 3)  # whoever comes second
+    tell_views(folder, 3, None)
+    tell_views(folder, 3, None)  # whoever comes second
     assert read_progress(folder).views_done == 4 * 2 + 1.5
     (left,) = (folder.staging / "at_work").iterdir()
     os.utime(left, (0, 0))
     assert read_progress(folder).views_done == 4 * 2
     (tmp_path / "full").mkdir()
     (tmp_path / "full" / ".staging").write_text("in the way")
-    for note in (lambda at: tell_views(at, 0, 0.5), lambda at: forget_views(at, 0)):
+    for note in (lambda at: tell_views(at, 0, 0.5), lambda at: tell_views(at, 0, None)):
         note(DatasetFolder(tmp_path / "full"))  # where nothing can be written, nothing is told
 
 

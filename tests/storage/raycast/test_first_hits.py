@@ -1,82 +1,14 @@
-"""What rays and pixels see: against a search through all triangles, and in closed form."""
+"""What rays and pixels see in closed form; test_passes has the same in pictures of Mitsuba."""
 
 import numpy as np
 import pytest
-from numpy.typing import NDArray
 
 from storage.conventions import camera_rays, look_at_c2w
 from storage.errors import TrilightError
 from storage.raycast.caster import MISS, Surfaces
 from storage.raycast.first_hits import FirstHits, SeenFrom, first_hits
-from storage.records.scene import Scene
-from tests.for_each import for_each
 from tests.pipeline.renders.scene_kit import join, light
 from tests.scenes_by_hand import tiny_scene
-
-RESOLUTION = 24
-
-
-def _many_triangles() -> Scene:
-    """Return the tiny scene with 60 more triangles of all sizes in front of its cameras."""
-    scene, rng = tiny_scene(), np.random.default_rng(3)
-    middles = rng.uniform(-0.7, 0.7, (60, 1, 3))
-    corners = (middles + rng.uniform(-0.4, 0.4, (60, 3, 3))).reshape(-1, 3).astype(np.float32)
-    normals = rng.normal(size=corners.shape)
-    normals /= np.linalg.norm(normals, axis=1, keepdims=True)
-    first = len(scene.vertex_positions)
-    more = np.arange(first, first + len(corners), dtype=np.uint32).reshape(-1, 3)
-    return tiny_scene(
-        vertex_positions=np.concatenate([scene.vertex_positions, corners]),
-        vertex_normals=np.concatenate([scene.vertex_normals, normals.astype(np.float32)]),
-        faces=np.concatenate([scene.faces, more]),
-        material_index=np.concatenate([scene.material_index, np.zeros(60, np.uint16)]),
-        object_index=np.concatenate([scene.object_index, np.zeros(60, np.uint16)]),
-    )
-
-
-def _by_search(
-    scene: Scene, view: int
-) -> tuple[NDArray[np.int64], NDArray[np.float64], NDArray[np.bool_]]:
-    """Return triangle and depth of each pixel, and whether its ray keeps clear of all rims.
-
-    Each ray is cut with each triangle's plane, and the point is inside where it is on the inner
-    side of all three edges: another way than barycentrics by Moeller and Trumbore.
-    """
-    origin, rays = camera_rays(scene.c2w[view], float(scene.fov_deg[view]), RESOLUTION)
-    triangle = np.full((RESOLUTION, RESOLUTION), MISS)
-    depth = np.full((RESOLUTION, RESOLUTION), np.inf)
-    clear = np.ones((RESOLUTION, RESOLUTION), np.bool_)
-    for row in np.flatnonzero(~scene.triangle_emits):
-        corners = scene.vertex_positions[scene.faces[row]].astype(np.float64)
-        normal = np.cross(corners[1] - corners[0], corners[2] - corners[0])
-        normal /= np.linalg.norm(normal)
-        t = (corners[0] - origin) @ normal / (rays @ normal)
-        points = origin + t[..., None] * rays
-        edges = np.roll(corners, -1, axis=0) - corners
-        inward = np.cross(normal, edges)
-        inward /= np.linalg.norm(inward, axis=1, keepdims=True)
-        to_edges = np.stack([(points - corners[k]) @ inward[k] for k in range(3)]).min(axis=0)
-        clear &= (abs(to_edges) > 1e-5) | (t < 0)  # metres; float32 rays pass there either way
-        nearer = (to_edges > 0) & (t > 0) & (t < depth)
-        triangle[nearer], depth[nearer] = row, t[nearer]
-    return triangle, depth, clear
-
-
-@for_each("view", [0, 1])
-def test_a_search_through_all_triangles_finds_the_same(view: int) -> None:
-    scene = _many_triangles()
-    hits = first_hits(scene, view=view, resolution=RESOLUTION)
-    triangle, depth, clear = _by_search(scene, view)
-    assert clear.mean() > 0.95
-    assert len(np.unique(triangle)) > 20
-    np.testing.assert_array_equal(hits.triangle[clear], triangle[clear])
-    np.testing.assert_array_equal(hits.met, hits.triangle != MISS)
-    # both in double precision from the same float32 corners; grazing planes cost some digits
-    np.testing.assert_allclose(hits.depth_m[clear], depth[clear], rtol=1e-9)
-    origin, rays = camera_rays(scene.c2w[view], float(scene.fov_deg[view]), RESOLUTION)
-    seen = clear & hits.met
-    along = origin + depth[..., None] * rays
-    np.testing.assert_allclose(hits.position[seen], along[seen], atol=1e-9)
 
 
 def test_the_floor_in_closed_form() -> None:

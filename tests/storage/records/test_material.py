@@ -118,7 +118,7 @@ def test_a_sample_carries_its_columns_and_an_older_one_is_completed() -> None:
 )
 def test_columns_that_a_file_states_badly_are_refused(stated: str) -> None:
     rows = np.zeros((2, 2), np.float32)
-    with declared(COAT), pytest.raises(TrilightError, match="its material columns are"):
+    with declared(COAT), pytest.raises(TrilightError, match="scene: its material columns"):
         completed_rows(rows, stated)
 
 

@@ -16,7 +16,7 @@ from storage.licences import (
     share_alike_camp,
     union_of_duties,
 )
-from storage.records.object_index import IndexedObject, ObjectIndex, write_object_index
+from storage.records.object_index import IndexedObject, IndexFacts, ObjectIndex, write_object_index
 from storage.records.objects import LockedObject, LockRows, write_objects_lock
 from tests.for_each import for_each
 
@@ -77,14 +77,8 @@ def test_columns_say_what_the_rows_say(tmp_path: Path) -> None:
         )
         offset += len(line)
     path, lock = tmp_path / "index", LockRows(tmp_path / "lock")
-    facts = write_object_index(
-        path,
-        reversed(objects),
-        lock_sha256="s",
-        lock_bytes=offset,
-        request_digest="a",
-        num_found=120,
-    )
+    stated = IndexFacts(lock_sha256="s", lock_bytes=offset, asked="a", num_found=120)
+    facts = write_object_index(path, reversed(objects), stated)
     index = ObjectIndex(path)
     assert index.facts == facts
     assert (facts.num_objects, facts.num_found, facts.num_maps) == (100, 120, 0)
@@ -113,7 +107,8 @@ def test_an_index_that_is_cut_off_says_so(tmp_path: Path) -> None:
     (row,) = _rows(1)
     one = IndexedObject(locked=row, offset=0, asset_name="0" * 32, least_triangles=1)
     path = tmp_path / "index"
-    write_object_index(path, [one], lock_sha256="", lock_bytes=1, request_digest="", num_found=1)
+    stated = IndexFacts(lock_sha256="", lock_bytes=1, asked="", num_found=1)
+    write_object_index(path, [one], stated)
     whole = path.read_bytes()
     path.write_bytes(whole[:-24])
     with pytest.raises(TrilightError, match="no index of objects .*delete it"):

@@ -25,7 +25,7 @@ from storage.dataset.shard import write_shard
 from storage.dataset.statistics import dataset_statistics
 from storage.errors import TrilightError
 from storage.metrics import psnr_log_db
-from storage.records.exr import ExrCodec, decode_exr, encode_channels, encode_exr
+from storage.records.exr import decode_exr, encode_channels, encode_exr
 from storage.records.lights import ALL_LIGHT, MAX_LIGHTS, decode_parts_exr, encode_parts_exr
 from storage.records.profiles import (
     DWA_LEVELS,
@@ -132,10 +132,10 @@ def test_the_law_of_the_tenth(floor_db: float, level: float | None) -> None:
     back = decode_exr(data)
     assert psnr_log_db(picture, back) >= floor_db + LAW_DB
     assert (back >= 0).all()
-    assert data == encode_exr(picture, ExrCodec(compression="DWAB", dwa_level=level))
+    assert data == encode_exr(picture, level)
     assert len(data) < len(exact)
     for coarser in [tried for tried in DWA_LEVELS if tried > level]:
-        stored = encode_exr(picture, ExrCodec(compression="DWAB", dwa_level=coarser))
+        stored = encode_exr(picture, coarser)
         assert not keeps_law(picture, decode_exr(stored), floor_db)
 
 

@@ -4,7 +4,6 @@ Scene and asset files come back exactly; what is none is refused before it takes
 """
 
 import dataclasses
-import io
 import json
 import math
 from pathlib import Path
@@ -12,10 +11,8 @@ from typing import Any
 
 import numpy as np
 import pytest
-import trimesh
 from safetensors.numpy import save
 
-from pipeline.objects.generated import encode_ply
 from storage.digests import sha256_hex
 from storage.errors import TrilightError
 from storage.records.asset import Asset, Level, LevelRecord, decode_asset, encode_asset
@@ -388,15 +385,15 @@ def _with_arrays(**changes: Any) -> bytes:
         (_stating(schema_version=99), "schema version 99"),
         (_stating(schema_version=None), "schema version None"),
         (_stating(objects={}), "objects is {}"),
-        (_stating(objects=[1, 2]), r"objects\[0\] is 1"),
-        (_stating(objects=[{"name": "x", "kind": "shell"}]), "exactly the fields attribution"),
-        (_with_object(kind="lamp"), r"objects\[1\].kind is "),
-        (_with_object(name=3), r"objects\[1\].name is "),
-        (_with_object(uid=["x"]), r"objects\[1\].uid is "),
+        (_stating(objects=[1, 2]), r"objects\.0 is 1"),
+        (_stating(objects=[{"name": "x", "kind": "shell"}]), r"objects\.0\.uid is missing"),
+        (_with_object(kind="lamp"), r"objects\.1\.kind is .* expected object, shell or emitter"),
+        (_with_object(name=3), r"objects\.1\.name is "),
+        (_with_object(uid=["x"]), r"objects\.1\.uid is "),
         (_stating(provenance=[]), r"provenance is \[\]"),
         (_stating(provenance={"template": [5]}), r"provenance.template is \[5\]; expected text"),
         (_stating(provenance={"excursion": {"axis": "x"}}), "excursion is .* expected an axis"),
-        (_stating(provenance={"x": float("nan")}), "NaN is no JSON number"),
+        (_stating(provenance={"x": float("nan")}), "provenance is .*nan.*finite numbers"),
     ],
 )
 def test_arrays_and_metadata_are_exactly_those_of_a_scene(data: bytes, message: str) -> None:
@@ -442,7 +439,7 @@ def test_a_large_file_is_refused_before_it_is_read(tmp_path: Path) -> None:
     path = tmp_path / "large.safetensors"
     with path.open("wb") as stream:
         stream.truncate(MAX_FILE_BYTES + 1)  # a hole: it takes no room
-    with pytest.raises(TrilightError, match="large.safetensors: expected a regular file"):
+    with pytest.raises(TrilightError, match="large.safetensors: expected a file of at most"):
         read_scene_file(path)
     with pytest.raises(TrilightError, match="cannot be read"):
         read_scene_file(tmp_path / "absent.safetensors")
@@ -509,17 +506,3 @@ def test_judgements_follow_from_the_facts() -> None:
     assert not dataclasses.replace(SOURCE, nonmanifold_edges=1).watertight
     assert dataclasses.replace(SOURCE, num_faces_turned=1).repaired
     assert dataclasses.replace(SOURCE, num_faces=SOURCE.num_faces_read - 1).repaired
-
-
-@for_each("num_faces", [0, 300])
-def test_ply_reads_back_in_another_program(num_faces: int) -> None:
-    rng = np.random.default_rng(1)
-    positions = rng.random((50, 3)).astype(np.float32)
-    faces = rng.integers(0, 50, (num_faces, 3)).astype(np.uint32)
-    data = encode_ply(positions, faces)
-    header = data[: data.index(b"end_header\n") + 11]
-    assert len(data) == len(header) + 50 * 12 + num_faces * 13
-    if num_faces:
-        mesh = trimesh.load_mesh(io.BytesIO(data), file_type="ply", process=False)
-        assert np.array_equal(np.asarray(mesh.vertices, np.float32), positions)
-        assert np.array_equal(np.asarray(mesh.faces), faces)

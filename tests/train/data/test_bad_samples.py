@@ -12,8 +12,7 @@ from safetensors.numpy import load, save
 
 from storage.dataset.dataset import Dataset
 from storage.dataset.manifest import index_shard, write_manifest
-from storage.dataset.shard import write_shard
-from storage.dataset.shard_set import OpenShard
+from storage.dataset.shard import ShardReader, write_shard
 from storage.dataset.training_data import TrainingData, open_training_data
 from storage.errors import TrilightError
 from storage.records.sample import encode_sample
@@ -164,13 +163,13 @@ def test_a_shard_that_is_all_bad_is_given_up_once(
 ) -> None:
     paths = write_shards(tmp_path, put("vertex_positions", (0, 1), np.nan), bad_samples=3)
     tried: list[str] = []
-    decode = OpenShard.stored_sample
+    decode = ShardReader.stored_sample
 
-    def counted(shard: OpenShard, row: int) -> Any:
+    def counted(shard: ShardReader, row: int) -> Any:
         tried.append(f"{shard.name}: {shard.keys[row]}")
         return decode(shard, row)
 
-    monkeypatch.setattr(OpenShard, "stored_sample", counted)
+    monkeypatch.setattr(ShardReader, "stored_sample", counted)
     unusable = BadSampleCounter(3)
     found = spoilt_keys(paths, unusable, count=10)
     assert found == {"000000003", "000000004"}

@@ -23,8 +23,8 @@ from hypothesis import strategies as st
 
 from model.hits.tracing import with_traced
 from storage.dataset.dataset import Dataset
-from storage.dataset.shard import write_shard
-from storage.dataset.shard_set import OpenShard, ShardSet
+from storage.dataset.shard import ShardReader, write_shard
+from storage.dataset.shard_set import ShardSet
 from storage.errors import TrilightError
 from storage.records.exr import encode_channels
 from storage.records.profiles import PROFILES, Profile
@@ -357,7 +357,7 @@ def test_unequal_shares_and_empty_shards_are_refused() -> None:
         places([0, 0, 0], count=1)
 
 
-class _Shard(OpenShard):
+class _Shard(ShardReader):
     def __init__(self, name: str, closed: list[str]) -> None:
         self.name = name
         self.closed = closed
@@ -376,7 +376,7 @@ class _Shards(ShardSet):
     def num_samples(self, number: int) -> int:
         return 1
 
-    def open(self, number: int) -> OpenShard:
+    def open(self, number: int) -> ShardReader:
         if number == 3:
             raise TrilightError("broken: is broken")
         self.opened.append(self.names[number])

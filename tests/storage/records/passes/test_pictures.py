@@ -19,7 +19,7 @@ from storage.records.exr import channel_names, decode_channels, encode_channels
 from storage.records.lookup import texture_values
 from storage.records.material import default_rows
 from storage.records.passes import pictures
-from storage.records.passes.declared import MOTION, PASSES, Pass, declared_passes, pass_names
+from storage.records.passes.declared import MOTION, PASSES, declared_passes, pass_names
 from storage.records.passes.pictures import (
     decode_passes_exr,
     passes_exr,
@@ -101,77 +101,30 @@ def test_the_axes_of_the_camera() -> None:
     assert seen["depth_axis_m"][0, 0] == pytest.approx(2, abs=1e-12)
 
 
-def test_a_mirrored_scene_has_mirrored_passes() -> None:
-    scene, resolution = room(0), 40
-    before, after = (view_passes(each, resolution=resolution) for each in (scene, _mirrored(scene)))
-    back = {name: picture[:, ::-1] for name, picture in after.items()}
-    # rays along a rim may fall to either triangle
-    same = (before["triangle"] == back["triangle"]) & (before["hit"] == back["hit"])
-    assert same.mean() > 0.99
-    turned = {"position_m": [-1, 1, 1], "shading_normal": [-1, 1, 1], "barycentric": [1, 1, 1]}
-    # corners run the other way round in the mirror, and (a, b, c) became (a, c, b)
-    back["barycentric"] = back["barycentric"][..., [0, 2, 1]]
-    turned |= {"geometric_normal": [-1, 1, 1], "shading_normal_camera": [-1, 1, 1]}
-    for name in ("depth_axis_m", "depth_ray_m", "material_diffuse", "material_roughness"):
-        np.testing.assert_allclose(before[name][same], back[name][same], rtol=1e-6, err_msg=name)
-    for name, signs in turned.items():
-        np.testing.assert_allclose(
-            before[name][same], (back[name] * signs)[same], atol=1e-4, err_msg=name
-        )
-
-
-def _mirrored(scene: Scene) -> Scene:
-    """Return the scene with x negated, its triangles' second and third corners exchanged."""
-    flip = np.array([-1, 1, 1], np.float32)
-    poses = scene.c2w.copy()
-    poses[:, :3] *= flip[:, None]
-    poses[:, :3, 0] *= -1  # a camera stays right-handed: its own x points to the other side
-    return dataclasses.replace(
-        scene,
-        vertex_positions=scene.vertex_positions * flip,
-        vertex_normals=scene.vertex_normals * flip,
-        faces=scene.faces[:, [0, 2, 1]],
-        c2w=poses,
-    )
-
-
 @for_each("a_side", [2, 3])
-def test_averages_are_those_of_a_plain_loop(a_side: int, monkeypatch: pytest.MonkeyPatch) -> None:
-    """A finer picture has the rays of the grid; blocks of rows join to the same picture."""
+def test_blocks_of_rows_join_to_the_same_picture(
+    a_side: int, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Means are those of Mitsuba's samples (tests/pipeline/renders/test_passes.py)."""
     for scene in (room(0), textured_scene()):
         resolution = 12
         monkeypatch.setattr(pictures, "BLOCK_RAYS", 2**14)
         whole = view_passes(scene, resolution=resolution, rays_a_side=a_side)
         monkeypatch.setattr(pictures, "BLOCK_RAYS", 5 * resolution * a_side**2)
         joined = view_passes(scene, resolution=resolution, rays_a_side=a_side)
-        fine = view_passes(scene, resolution=resolution * a_side)
         centre = view_passes(scene, resolution=resolution)
+        hit = view_passes(scene, ["hit"], resolution=resolution * a_side)["hit"]
+        shares = hit.reshape(resolution, a_side, resolution, a_side).mean(axis=(1, 3))
+        np.testing.assert_allclose(whole["coverage"], shares, atol=1e-12)
         assert 0 < ((whole["coverage"] > 0) & (whole["coverage"] < 1)).sum()
         # one needs another camera, the other textures
         absent = {"motion_px"} if scene.textures else {"motion_px", "uv"}
         assert {each.name for each in declared_passes()} - set(whole) == absent
         for each in declared_passes():
-            if each.name in absent:
-                continue
-            np.testing.assert_allclose(joined[each.name], whole[each.name], rtol=1e-12)
-            if each.averaging == "centre ray":
-                np.testing.assert_array_equal(whole[each.name], centre[each.name])
-            else:
-                by_loop = _averaged(fine[each.name], fine["hit"], a_side, each)
-                np.testing.assert_allclose(whole[each.name], by_loop, atol=1e-12, err_msg=each.name)
-
-
-def _averaged(fine: NDArray, hit: NDArray[np.bool_], a_side: int, each: Pass) -> NDArray:
-    size = len(fine) // a_side
-    result = np.full((size, size, *fine.shape[2:]), float(each.nothing))
-    for row, column in np.ndindex(size, size):
-        place = (slice(row * a_side, (row + 1) * a_side), slice(column * a_side, (column + 1) * a_side))  # fmt: skip  # noqa: E501
-        values, counted = fine[place], hit[place]
-        if each.averaging == "pixel":
-            result[row, column] = values.mean()
-        elif counted.any():
-            result[row, column] = values[counted].mean(axis=0)
-    return result
+            if each.name not in absent:
+                np.testing.assert_allclose(joined[each.name], whole[each.name], rtol=1e-12)
+                if each.averaging == "centre ray":
+                    np.testing.assert_array_equal(whole[each.name], centre[each.name])
 
 
 def test_what_is_asked_for_comes_as_it_is_declared() -> None:
@@ -280,16 +233,6 @@ def test_a_camera_and_a_floor_that_step_aside_in_closed_form() -> None:
     later = dataclasses.replace(scene, vertex_positions=moved)
     slid = view_passes(scene, ["motion_px"], resolution=16, then=later)["motion_px"]
     np.testing.assert_allclose(slid, np.broadcast_to([4.0, 0.0], (16, 16, 2)), atol=1e-6)
-
-
-def test_it_is_the_difference_of_projections() -> None:
-    scene = room(1)
-    seen = view_passes(scene, resolution=24, view=0, then_view=1)
-    now, then = (
-        pixel_places(seen["position_m"], scene.c2w[view], float(scene.fov_deg[view]), 24)
-        for view in (0, 1)
-    )
-    np.testing.assert_allclose(seen["motion_px"], then - now, atol=1e-6)
 
 
 def test_what_is_behind_the_other_camera_does_not_move() -> None:
