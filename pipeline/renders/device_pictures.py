@@ -22,12 +22,7 @@ from pipeline.renders.calibrated_error import (
     statement_for,
 )
 from pipeline.renders.device_memory import KernelInputs, record_launches
-from pipeline.renders.noise_floor import (
-    LINEAR_STANDARD_ERRORS,
-    ErrorMeasures,
-    MeasuredFloor,
-    estimate_noise_floor_db,
-)
+from pipeline.renders.noise_floor import ErrorMeasures, Halves, MeasuredFloor, measured_floor
 from pipeline.renders.pixel_arithmetic import (
     TILE,
     channel_mean,
@@ -184,16 +179,10 @@ class DevicePictures:
 
     def _floor(self, errors: NDArray[np.float64], most: NDArray[np.float64]) -> MeasuredFloor:
         """Return the floor of estimates and surprises of tiles [3, T]: log, linear, of objects."""
-        deviations = 1.0, LINEAR_STANDARD_ERRORS, 1.0
-        log_db, linear_db, object_log_db = (
-            estimate_noise_floor_db(
-                error.sum() / max(count.sum(), 1), float(surprise.max()), error, count, more
-            )
-            for error, surprise, count, more in zip(
-                errors, most, self._counts, deviations, strict=True
-            )
+        return measured_floor(
+            (error.sum() / max(count.sum(), 1), float(surprise.max()), error, count)
+            for error, surprise, count in zip(errors, most, self._counts, strict=True)
         )
-        return MeasuredFloor(log_db=log_db, linear_db=linear_db, object_log_db=object_log_db)
 
     def _denoise_raws(self, sums: Sums, quality: Filtered, *, of_both: bool) -> list[list[Any]]:
         """Return what the denoiser makes of each half, or of the mean of both."""
@@ -280,13 +269,14 @@ def _estimate_error(
     rows: list[tuple[list[Any], list[Any]]] = []
     for group in groups:
         a, b, da, db = (mi.Color3d(add_up(each[slice(*group)])) for each in (*raws, *corrected))
+        halves = Halves(a, b, da, db, da - db)
         if finished:
             denoised_both = mi.Color3d(dr.unravel(mi.Color3f, finished[0]))
-            measured, surprises = error_measures(a, b, da, db, denoised_both, hit, resolution)
+            measured, surprises = error_measures(halves, denoised_both, hit, resolution)
             totals.append(measured)
             rows.append(([], surprises))
         else:
-            rows.append(estimates(a, b, da, db, hit, is_filtered))
+            rows.append(estimates(halves, hit, is_filtered))
     brightest = functools.reduce(dr.maximum, [dr.max(part) for half in raws for part in half])
     adds = [*changes, _broken(sums), *(row for errors, _ in rows for row in errors)]
     most = [*(row for _, surprises in rows for row in surprises), brightest]

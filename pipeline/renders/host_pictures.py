@@ -13,32 +13,31 @@ import numpy as np
 from numpy.lib.stride_tricks import sliding_window_view
 from numpy.typing import NDArray
 
-from pipeline.renders.calibrated_error import is_far, statement_for
+from pipeline.renders.calibrated_error import is_far, measures_of_totals, statement_for
 from pipeline.renders.noise_floor import (
-    BLOCK_PX,
-    LINEAR_STANDARD_ERRORS,
     Curve,
     ErrorMeasures,
+    Halves,
     MeasuredFloor,
+    PixelArithmetic,
     clamped_radiance,
-    estimate_noise_floor_db,
-    secant_slope,
+    measured_floor,
+    pixel_errors,
+    pixel_measures,
 )
 from pipeline.renders.samples import DualBuffer, by_tiles, tile_means
 from pipeline.renders.settings import Filtered, RenderSettings
 from pipeline.renders.tracer import PixelCamera, Tracer
 from pipeline.renders.view_pictures import (
-    DARKER,
     GLINT,
     LEAST_PASSES,
     MOST_APART,
-    STANDARD_ERRORS,
-    STANDS_OUT,
     MeasuredLook,
     floor_groups,
     put_together,
     require_bounded,
     require_finite,
+    stands_out,
     to_filter,
 )
 from storage.conventions import log10_radiance
@@ -55,6 +54,21 @@ class Half:
     """[R, R, 3] the same, denoised."""
 
 
+NUMPY = PixelArithmetic(
+    select=np.where,
+    channel_mean=lambda values: values.mean(axis=-1),
+    log10=log10_radiance,
+    clamp=clamped_radiance,
+)
+
+
+def join_halves(a: Half, b: Half) -> Halves:
+    """Return both halves in double precision; their difference is taken before."""
+    raws = a.raw_rgb, b.raw_rgb
+    denoised = a.denoised_rgb, b.denoised_rgb, a.denoised_rgb - b.denoised_rgb
+    return Halves(*(values.astype(np.float64) for values in (*raws, *denoised)))
+
+
 def estimate_error(a: Half, b: Half, hits: NDArray[np.bool_]) -> MeasuredFloor:
     """Return the floor of the picture made from both halves.
 
@@ -62,39 +76,22 @@ def estimate_error(a: Half, b: Half, hits: NDArray[np.bool_]) -> MeasuredFloor:
         a, b: halves that share no sample, denoised apart.
         hits: [R, R] pixels that show geometry.
     """
-    everywhere = np.ones_like(hits)
-    return MeasuredFloor(
-        log_db=_floor_db(a, b, log10_radiance, everywhere),
-        linear_db=_floor_db(a, b, clamped_radiance, everywhere, LINEAR_STANDARD_ERRORS),
-        object_log_db=_floor_db(a, b, log10_radiance, hits),
-    )
-
-
-def squared_error(a: Half, b: Half, curve: Curve) -> NDArray[np.float64]:
-    """Return an estimate of the squared error of the mean of both denoised halves, [R, R].
-
-    It is the mean over the channels. Single pixels may be far below 0; the mean over many pixels
-    is what it is for.
-    """
-    raw_a = a.raw_rgb.astype(np.float64)
-    raw_b = b.raw_rgb.astype(np.float64)
-    if np.array_equal(a.denoised_rgb, a.raw_rgb):
-        of_half: NDArray[np.float64] = 0.5 * np.square(curve(raw_a) - curve(raw_b)).mean(axis=-1)
-        return of_half
-    of_halves = 0.5 * (np.square(a.denoised_rgb - raw_b) + np.square(b.denoised_rgb - raw_a))
-    noise = 0.5 * np.square(raw_a - raw_b)
-    half_difference_sq = 0.25 * np.square(a.denoised_rgb - b.denoised_rgb, dtype=np.float64)
-    slope = secant_slope(curve, *_means(a, b))
-    estimate = of_halves - noise - half_difference_sq
-    mean: NDArray[np.float64] = (np.square(slope) * estimate).mean(axis=-1)
-    return mean
-
-
-def surprises(a: Half, b: Half, curve: Curve) -> NDArray[np.float64]:
-    """Return the squared difference that the denoiser made in each pixel of the mean, [R, R]."""
-    denoised, raw = _means(a, b)
-    squared: NDArray[np.float64] = np.square(curve(raw) - curve(denoised)).mean(axis=-1)
-    return squared
+    halves = join_halves(a, b)
+    is_filtered = not np.array_equal(a.denoised_rgb, a.raw_rgb)
+    rows = []
+    for _, curve, objects in _METRICS:
+        pixels = hits if objects else np.ones_like(hits)
+        error, surprise = (
+            values * pixels
+            for values in pixel_errors(halves, curve, NUMPY, is_filtered=is_filtered)
+        )
+        sums, counts = (
+            by_tiles(values).sum(axis=(1, 3)).ravel()
+            for values in (error, pixels.astype(np.float64))
+        )
+        mean = error.sum() / max(int(pixels.sum()), 1)
+        rows.append((mean, float(surprise.max()), sums, counts))
+    return measured_floor(rows)
 
 
 def measure_errors(
@@ -111,54 +108,13 @@ def measure_errors(
         objects: count these pixels alone.
     """
     pixels = hits if objects else np.ones_like(hits)
-    count = max(int(pixels.sum()), 1)
-    denoised, raw = _means(a, b)
     picture = picture_rgb.astype(np.float64)
-    slope = secant_slope(curve, picture, raw) * pixels[..., None]
-    residual = slope * (picture - raw)
-    probe = slope * (0.5 * (a.raw_rgb.astype(np.float64) - b.raw_rgb))
-    difference = slope * (a.denoised_rgb.astype(np.float64) - b.denoised_rgb)
-    blocks = [tile_means(values) for values in (residual, probe, difference)]
-    to_mean = BLOCK_PX**2 / count
-
-    def over_pixels(values: NDArray[np.float64]) -> float:
-        return float((values.mean(axis=-1) * pixels).sum() / count)
-
-    of_halves = [curve(half.denoised_rgb.astype(np.float64)) for half in (a, b)]
-    agreement_in_blocks = 0.25 * np.square(blocks[2]).mean(axis=-1).sum() * to_mean
-    agreement_in_pixels = 0.25 * np.square(difference).mean(axis=-1).sum() / count
-    return ErrorMeasures(
-        estimate=float((squared_error(a, b, curve) * pixels).sum() / count),
-        agreement=over_pixels(0.25 * np.square(of_halves[0] - of_halves[1])),
-        move=over_pixels(np.square(curve(picture) - curve(denoised))),
-        surprise=float((surprises(a, b, curve) * pixels).max() / count),
-        sure=float(
-            (np.square(blocks[0]) + blocks[1] * blocks[2] - np.square(blocks[1]))
-            .mean(axis=-1).sum() * to_mean
-        ),
-        block_agreement=float(agreement_in_blocks / agreement_in_pixels)
-        if agreement_in_pixels
-        else 1.0,
-        hits=float(hits.mean()),
-    )  # fmt: skip
-
-
-def _means(a: Half, b: Half) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Return the means of both halves, denoised and raw."""
-    denoised = 0.5 * (a.denoised_rgb.astype(np.float64) + b.denoised_rgb)
-    return denoised, 0.5 * (a.raw_rgb.astype(np.float64) + b.raw_rgb)
-
-
-def _floor_db(
-    a: Half, b: Half, curve: Curve, pixels: NDArray[np.bool_], standard_errors: float = 1.0
-) -> float:
-    error = squared_error(a, b, curve) * pixels
-    surprise = float((surprises(a, b, curve) * pixels).max())
-    mean = error.sum() / max(int(pixels.sum()), 1)
-    sums, counts = (
-        by_tiles(values).sum(axis=(1, 3)).ravel() for values in (error, pixels.astype(np.float64))
-    )
-    return estimate_noise_floor_db(mean, surprise, sums, counts, standard_errors)
+    values, signed, surprise = pixel_measures(join_halves(a, b), picture, curve, NUMPY)
+    x, z, h = (by_tiles(each * pixels[..., None]).sum(axis=(1, 3)) for each in signed)
+    blocks = [np.mean(each, axis=-1).sum() for each in (x * x + z * h - z * z, h * h / 4)]
+    totals = np.array([*((each * pixels).sum() for each in values), *blocks])
+    most = float((surprise * pixels).max())
+    return measures_of_totals(totals, most, int(pixels.sum()), float(hits.mean()))
 
 
 _METRICS = (
@@ -210,11 +166,8 @@ def converged_mask(
     raw, denoised = (
         parts.sum(axis=0).mean(axis=-1, dtype=np.float64) for parts in (raw_rgb, denoised_rgb)
     )
-    bright = raw - denoised > STANDARD_ERRORS * standard_error
     around = np.sqrt(sliding_window_view(np.pad(standard_error**2, 1, "edge"), (3, 3)).mean((2, 3)))
-    dark = denoised - raw > STANDARD_ERRORS * around
-    mask: NDArray[np.bool_] = bright & (raw > STANDS_OUT * denoised)
-    mask |= dark & (denoised > DARKER * raw)
+    mask: NDArray[np.bool_] = stands_out(denoised, raw, standard_error, around)
     return mask
 
 

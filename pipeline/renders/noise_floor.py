@@ -32,13 +32,14 @@ Two allowances are added to the mean over the pixels:
 
 Light that no sample has found is not seen: a view whose only caustic was never hit looks converged.
 
-The terms of each pixel are in host_pictures and in pixel_arithmetic.estimates
-(kernels); both hand their sums over blocks to `estimate_noise_floor_db` here. The error that is
-stated by calibration on other scenes is in pipeline.renders.calibrated_error.
+The terms of each pixel are here, for numpy and for kernels. host_pictures and device_pictures add
+them up, and hand their sums over blocks to `measured_floor`. The error that is stated by
+calibration on other scenes is in pipeline.renders.calibrated_error.
 """
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 from dataclasses import dataclass
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -56,8 +57,98 @@ of float32 values are rounding."""
 LINEAR_STANDARD_ERRORS = 2.0
 """Of one, 3 to 10 % of the linear floors of 16 scenes were more than 1 dB too good (study S16)."""
 
-Curve = Callable[[NDArray[np.float64]], NDArray[np.float64]]
+Curve = Callable[[Any], Any]
 """What errors are taken in, of radiance."""
+
+
+class Halves(NamedTuple):
+    """Both halves of the samples of a picture, which share none: numpy [R, R, 3], or Color3d."""
+
+    a: Any
+    b: Any
+    """Means of the samples, in double precision."""
+    denoised_a: Any
+    denoised_b: Any
+    difference: Any
+    """Difference of both denoised ones."""
+
+    @property
+    def raw(self) -> Any:
+        """Mean of both halves."""
+        return (self.a + self.b) / 2
+
+    @property
+    def denoised(self) -> Any:
+        """Mean of both denoised halves."""
+        return (self.denoised_a + self.denoised_b) / 2
+
+
+@dataclass(frozen=True, kw_only=True)
+class PixelArithmetic:
+    """What numpy and kernels write unlike."""
+
+    select: Callable[..., Any]
+    channel_mean: Callable[[Any], Any]
+    log10: Curve
+    """log10(1 + radiance)."""
+    clamp: Curve
+    """Radiance clamped to [0, 1]."""
+
+
+def pixel_errors(
+    halves: Halves, curve: Curve, arithmetic: PixelArithmetic, *, is_filtered: bool
+) -> tuple[Any, Any]:
+    """Return the estimate and the surprise of each pixel in a curve, as means over its channels.
+
+    Single estimates may be far below 0; the mean over many pixels is what they are for. A surprise
+    is the squared difference that the denoiser made in the mean of both halves.
+    """
+    mean = arithmetic.channel_mean
+    surprise = mean(_square(curve(halves.raw) - curve(halves.denoised)))
+    if not is_filtered:
+        return mean(_square(curve(halves.a) - curve(halves.b))) / 2, surprise
+    slope = secant_slope(curve, halves.denoised, halves.raw, select=arithmetic.select)
+    return mean(_square(slope) * _half_estimate(halves)), surprise
+
+
+def pixel_measures(
+    halves: Halves, picture: Any, curve: Curve, arithmetic: PixelArithmetic
+) -> tuple[list[Any], list[Any], Any]:
+    """Return what `ErrorMeasures` are made of, pixel by pixel.
+
+    Args:
+        halves: of the samples.
+        picture: one denoise of the mean of both, as they are.
+        curve: tone curve in which errors are taken.
+        arithmetic: of the halves.
+
+    Returns:
+        Estimate, agreement, move, and a quarter of the squared difference of the halves with the
+        picture's slope; residual, probe and difference of `sure` with that slope, by channel; and
+        the surprise.
+    """
+    mean = arithmetic.channel_mean
+    estimate, surprise = pixel_errors(halves, curve, arithmetic, is_filtered=True)
+    slope = secant_slope(curve, picture, halves.raw, select=arithmetic.select)
+    difference = slope * (halves.denoised_a - halves.denoised_b)
+    values = [
+        estimate,
+        mean(_square(curve(halves.denoised_a) - curve(halves.denoised_b))) / 4,
+        mean(_square(curve(picture) - curve(halves.denoised))),
+        mean(_square(difference)) / 4,
+    ]
+    signed = [slope * (picture - halves.raw), slope * (halves.a - halves.b) / 2, difference]
+    return values, signed, surprise
+
+
+def _half_estimate(halves: Halves) -> Any:
+    a, b, denoised_a, denoised_b, difference = halves
+    estimate = _square(denoised_a - b) + _square(denoised_b - a) - _square(a - b)
+    return estimate / 2 - _square(difference) / 4
+
+
+def _square(value: Any) -> Any:
+    return value * value
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -132,6 +223,22 @@ def estimate_noise_floor_db(
     return MAX_DB if bound <= 10 ** (-MAX_DB / 10) else float(-10 * np.log10(bound))
 
 
+def measured_floor(
+    rows: Iterable[tuple[float, float, NDArray[np.float64], NDArray[np.float64]]],
+) -> MeasuredFloor:
+    """Return the floor of a picture.
+
+    Args:
+        rows: of log and linear light and of objects: mean error, greatest surprise, and the sums of
+            estimates and pixels over the blocks, as `estimate_noise_floor_db` takes them.
+    """
+    log_db, linear_db, object_log_db = (
+        estimate_noise_floor_db(*row, standard_errors)
+        for row, standard_errors in zip(rows, (1.0, LINEAR_STANDARD_ERRORS, 1.0), strict=True)
+    )
+    return MeasuredFloor(log_db=log_db, linear_db=linear_db, object_log_db=object_log_db)
+
+
 def _standard_error(sums: NDArray[np.float64], counts: NDArray[np.float64]) -> float:
     """Return the standard error of the mean error over the pixels, from sums over blocks."""
     total = counts.sum()
@@ -142,14 +249,13 @@ def _standard_error(sums: NDArray[np.float64], counts: NDArray[np.float64]) -> f
 
 
 def secant_slope(
-    curve: Curve, first: NDArray[np.float64], second: NDArray[np.float64]
-) -> NDArray[np.float64]:
+    curve: Curve, first: Any, second: Any, *, select: Callable[..., Any] = np.where
+) -> Any:
     """Return the slope of the line through two points of a curve, or its own where they are one."""
     step = second - first
-    least = SMALLEST_STEP * (1 + np.abs(first))
-    step = np.where(np.abs(step) < least, least, step)
-    slope: NDArray[np.float64] = (curve(first + step) - curve(first)) / step
-    return slope
+    least = SMALLEST_STEP * (1 + abs(first))
+    step = select(abs(step) < least, least, step)
+    return (curve(first + step) - curve(first)) / step
 
 
 def clamped_radiance(radiance: NDArray[np.float64]) -> NDArray[np.float64]:

@@ -5,22 +5,15 @@ taken over tiles of 64 pixels, then over rows of tiles: in their own order, but 
 Pictures are Color3f, what is worked out of them is Float64, pixel by pixel.
 """
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from typing import Any
 
 import drjit as dr
 import mitsuba as mi
 
-from pipeline.renders.noise_floor import SMALLEST_STEP
+from pipeline.renders.noise_floor import Halves, PixelArithmetic, pixel_errors, pixel_measures
 from pipeline.renders.samples import TILE_PX
-from pipeline.renders.view_pictures import (
-    DARKER,
-    GLINT,
-    MOST_APART,
-    STANDARD_ERRORS,
-    STANDS_OUT,
-    add_up,
-)
+from pipeline.renders.view_pictures import GLINT, MOST_APART, add_up, stands_out
 
 TILE = TILE_PX * TILE_PX
 """Pixels of a tile."""
@@ -82,65 +75,36 @@ def converged_mask(denoised: list[Any], raw: list[Any], squared_error: Any, reso
             y = mi.UInt32(dr.clip(mi.Int32(row) + down, 0, resolution - 1))
             x = mi.UInt32(dr.clip(mi.Int32(column) + right, 0, resolution - 1))
             around += dr.gather(mi.Float64, squared_error, y * resolution + x)
-    bright = was - is_now > STANDARD_ERRORS * dr.sqrt(squared_error)
-    dark = is_now - was > STANDARD_ERRORS * dr.sqrt(around / 9)
-    return (bright & (was > STANDS_OUT * is_now)) | (dark & (is_now > DARKER * was))
+    return stands_out(is_now, was, dr.sqrt(squared_error), dr.sqrt(around / 9))
 
 
 def choose(right: Any, raw: list[Any], denoised: list[Any]) -> list[Any]:
     return [dr.select(right, *pair) for pair in zip(raw, denoised, strict=True)]
 
 
-def estimates(
-    a: Any, b: Any, denoised_a: Any, denoised_b: Any, hit: Any, is_filtered: bool
-) -> tuple[list[Any], list[Any]]:
-    """Return the squared errors and the surprises of pixels (Float64): log, linear, of objects.
-
-    The pictures (Color3d) are those of `Half`.
-    """
-    raw = (a + b) / 2
-    denoised = (denoised_a + denoised_b) / 2
-    estimate = _half_estimate(a, b, denoised_a, denoised_b)
-    errors = []
-    surprises = []
-    for curve in (log10, _clamp):
-        if is_filtered:
-            slope = _secant_slope(curve, denoised, raw)
-            errors.append(channel_mean(dr.square(slope) * estimate))
-        else:
-            errors.append(channel_mean(dr.square(curve(a) - curve(b))) / 2)
-        surprises.append(channel_mean(dr.square(curve(raw) - curve(denoised))))
-    of_objects = [dr.select(hit, values[0], 0) for values in (errors, surprises)]
-    return [*errors, of_objects[0]], [*surprises, of_objects[1]]
+def estimates(halves: Halves, hit: Any, is_filtered: bool) -> tuple[list[Any], list[Any]]:
+    """Return the squared errors and the surprises of pixels (Float64): log, linear, of objects."""
+    rows = [
+        pixel_errors(halves, curve, KERNELS, is_filtered=is_filtered)
+        for curve in (KERNELS.log10, KERNELS.clamp)
+    ]
+    rows.append((dr.select(hit, rows[0][0], 0), dr.select(hit, rows[0][1], 0)))
+    return [error for error, _ in rows], [surprise for _, surprise in rows]
 
 
 def error_measures(
-    a: Any, b: Any, denoised_a: Any, denoised_b: Any, picture: Any, hit: Any, resolution: int
+    halves: Halves, picture: Any, hit: Any, resolution: int
 ) -> tuple[Any, list[Any]]:
     """Return the totals of `measures_of_totals`, of one metric after another, and surprises.
 
-    The pictures (Color3d) are those of `Half`, and one denoise of all samples.
+    The picture (Color3d) is one denoise of all samples.
     """
-    raw = (a + b) / 2
-    denoised = (denoised_a + denoised_b) / 2
-    estimate = _half_estimate(a, b, denoised_a, denoised_b)
     metrics = []
     surprises = []
-    for curve in (log10, _clamp):
-        slope = _secant_slope(curve, denoised, raw)
-        own_slope = _secant_slope(curve, picture, raw)
-        difference = own_slope * (denoised_a - denoised_b)
-        signed = own_slope * (picture - raw), own_slope * (a - b) / 2, difference
-        metrics.append(
-            [
-                channel_mean(dr.square(slope) * estimate),
-                channel_mean(dr.square(curve(denoised_a) - curve(denoised_b))) / 4,
-                channel_mean(dr.square(curve(picture) - curve(denoised))),
-                channel_mean(dr.square(difference)) / 4,
-                *(channel for color in signed for channel in (color.x, color.y, color.z)),
-            ]
-        )
-        surprises.append(channel_mean(dr.square(curve(raw) - curve(denoised))))
+    for curve in (KERNELS.log10, KERNELS.clamp):
+        values, signed, surprise = pixel_measures(halves, picture, curve, KERNELS)
+        metrics.append([*values, *(channel for color in signed for channel in color)])
+        surprises.append(surprise)
     metrics.append([dr.select(hit, each, 0) for each in metrics[0]])
     flat = [each for values in metrics for each in values]
     tiles = reduce_tiles(flat, dr.ReduceOp.Add, resolution)
@@ -160,24 +124,8 @@ def error_measures(
     return rows_of_tiles, [*surprises, dr.select(hit, surprises[0], 0)]
 
 
-def _half_estimate(a: Any, b: Any, denoised_a: Any, denoised_b: Any) -> Any:
-    estimate = dr.square(denoised_a - b) + dr.square(denoised_b - a) - dr.square(a - b)
-    return estimate / 2 - dr.square(denoised_a - denoised_b) / 4
-
-
-def _secant_slope(curve: Callable[[Any], Any], first: Any, second: Any) -> Any:
-    least = SMALLEST_STEP * (1 + dr.abs(first))
-    step = second - first
-    step = dr.select(dr.abs(step) < least, least, step)
-    return (curve(first + step) - curve(first)) / step
-
-
 def log10(radiance: Any) -> Any:
     return dr.log(1 + radiance) * _INV_LN_10
-
-
-def _clamp(radiance: Any) -> Any:
-    return dr.clip(radiance, 0, 1)
 
 
 def channel_sum(color: Any) -> Any:
@@ -186,6 +134,11 @@ def channel_sum(color: Any) -> Any:
 
 def channel_mean(color: Any) -> Any:
     return channel_sum(color) / 3
+
+
+KERNELS = PixelArithmetic(
+    select=dr.select, channel_mean=channel_mean, log10=log10, clamp=lambda v: dr.clip(v, 0, 1)
+)
 
 
 def where_any(mask: Any, values: Any) -> Any:

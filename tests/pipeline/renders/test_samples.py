@@ -12,13 +12,14 @@ from numpy.typing import NDArray
 
 from infra.render.quality import ToStatedError
 from pipeline.renders.host_pictures import (
+    NUMPY,
     Half,
     HostMeans,
     LogChanges,
     estimate_error,
-    squared_error,
-    surprises,
+    join_halves,
 )
+from pipeline.renders.noise_floor import Curve, pixel_errors
 from pipeline.renders.renderer import SceneRenderer
 from pipeline.renders.samples import (
     TILE_PX,
@@ -235,15 +236,19 @@ def half(rng: np.random.Generator) -> Half:
     return Half(raw_rgb=raw, denoised_rgb=blurred(raw))
 
 
+def errors(a: Half, b: Half, curve: Curve) -> tuple[Any, Any]:
+    return pixel_errors(join_halves(a, b), curve, NUMPY, is_filtered=True)
+
+
 def test_on_average_the_estimate_is_the_error_of_the_mean_of_both_halves() -> None:
     """In linear light the law is exact: stripes lose two thirds, of the noise a sixth remains."""
     rng = np.random.default_rng(0)
     pairs = [(half(rng), half(rng)) for _ in range(200)]
-    estimates = [squared_error(a, b, lambda radiance: radiance).mean() for a, b in pairs]
+    estimates = [errors(a, b, lambda radiance: radiance)[0].mean() for a, b in pairs]
     exact = (2 / 3 * 0.3) ** 2 + NOISE**2 / 6
     spread = np.std(estimates) / np.sqrt(len(estimates))
     assert abs(np.mean(estimates) - exact) < 4 * spread < 0.01 * exact
-    found = np.mean([squared_error(a, b, log10_radiance).mean() for a, b in pairs[:50]])
+    found = np.mean([errors(a, b, log10_radiance)[0].mean() for a, b in pairs[:50]])
     means = [0.5 * (a.denoised_rgb + b.denoised_rgb) for a, b in pairs[:50]]
     wanted = np.mean([10 ** (-psnr_log_db(mean, truth()) / 10) for mean in means])
     # The secant goes through the raw mean, whose noise of 0.035 bends it by some per cent.
@@ -268,7 +273,7 @@ def test_rare_light_that_one_half_found_is_allowed_for() -> None:
     found, missed = (Half(raw_rgb=picture, denoised_rgb=calm) for picture in (raw, calm))
     mean = 0.5 * (raw[3, 4] + calm[3, 4])
     surprise = np.square(log10_radiance(mean) - log10_radiance(calm[3, 4])).mean()
-    assert surprises(found, missed, log10_radiance).max() == pytest.approx(surprise)
+    assert errors(found, missed, log10_radiance)[1].max() == pytest.approx(surprise)
     floor = estimate_error(found, missed, EVERYWHERE)
     # What one half alone has cancels in the estimate: the allowance is all that is stated.
     assert floor.log_db == pytest.approx(-10 * np.log10(surprise / PX**2), abs=0.1)
