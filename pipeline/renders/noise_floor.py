@@ -39,7 +39,7 @@ calibration on other scenes is in pipeline.renders.calibrated_error.
 
 from collections.abc import Callable, Iterable
 from dataclasses import dataclass
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, Protocol
 
 import numpy as np
 from numpy.typing import NDArray
@@ -83,16 +83,16 @@ class Halves(NamedTuple):
         return (self.denoised_a + self.denoised_b) / 2
 
 
-@dataclass(frozen=True, kw_only=True)
-class PixelArithmetic:
-    """What numpy and kernels write unlike."""
+class PixelArithmetic(Protocol):
+    """Operations on colors and on values of pixels that numpy and kernels write unlike."""
 
-    select: Callable[..., Any]
-    channel_mean: Callable[[Any], Any]
-    log10: Curve
-    """log10(1 + radiance)."""
-    clamp: Curve
-    """Radiance clamped to [0, 1]."""
+    def select(self, mask: Any, first: Any, second: Any) -> Any: ...
+    def channel_mean(self, color: Any) -> Any: ...
+    def log10(self, radiance: Any) -> Any:
+        """Return the logarithm of 1 + radiance to base 10."""
+
+    def clamp(self, radiance: Any) -> Any:
+        """Return radiance clamped to [0, 1]."""
 
 
 def pixel_errors(

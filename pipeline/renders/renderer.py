@@ -24,6 +24,7 @@ from numpy.typing import ArrayLike, NDArray
 from pipeline.renders.calibrated_error import first_spp
 from pipeline.renders.host_pictures import HostPictures
 from pipeline.renders.noise_floor import MeasuredFloor
+from pipeline.renders.pictures import Pictures
 from pipeline.renders.results import GrowingPicture, RenderedView, run_to_end
 from pipeline.renders.samples import (
     DualBuffer,
@@ -36,7 +37,7 @@ from pipeline.renders.samples import (
 )
 from pipeline.renders.settings import RenderSettings
 from pipeline.renders.tracer import load_tracer, pixel_camera
-from pipeline.renders.view_pictures import MeasuredLook, ViewPictures
+from pipeline.renders.view_pictures import MeasuredLook
 from storage.conventions import HALF_FLOAT_MAX
 from storage.denoiser import set_denoiser_threads
 from storage.errors import Rejected
@@ -155,7 +156,7 @@ class SceneRenderer:
             raise Rejected("black_view", f"mean radiance {mean:.2g} is below {bound:.2g}")
         for _ in samples.passes_to(settled):
             yield Sampling(spp=samples.spp, expected_spp=settled, missing_db=None)
-        pictures: ViewPictures = self._arithmetic(samples, self.tracer, camera, settings)
+        pictures: Pictures = self._arithmetic(samples, self.tracer, camera, settings)
         if not self._sees_sky:
             samples.count_over(pictures.visible)
         look = yield from self._render_until_targets(samples, pictures)
@@ -202,7 +203,7 @@ class SceneRenderer:
         }
 
     def _render_until_targets(
-        self, samples: DualBuffer, pictures: ViewPictures
+        self, samples: DualBuffer, pictures: Pictures
     ) -> Generator[Sampling, None, MeasuredLook]:
         targets_db = self._settings.targets_db
         max_spp = self._settings.max_spp
@@ -235,7 +236,7 @@ class SceneRenderer:
     def _growing(
         self,
         samples: DualBuffer,
-        pictures: ViewPictures,
+        pictures: Pictures,
         floor: MeasuredFloor,
         expected_spp: int,
         missing_db: float,

@@ -1,4 +1,4 @@
-"""`ViewPictures`: means, errors and denoised pictures of a view, in numpy or on the device.
+"""Rules of pictures: which pixels the denoiser may not change, what it filters, and sums of that.
 
 The denoiser may not change converged pixels, nor the mean brightness of a picture. It takes single
 bright pixels for noise. A glint that many passes agree on is none: where the raw mean stands out of
@@ -16,14 +16,12 @@ import functools
 import operator
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
-from typing import Any, Protocol
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from pipeline.renders.noise_floor import MeasuredFloor
-from pipeline.renders.samples import DualBuffer
-from pipeline.renders.settings import Filtered
 from storage.errors import Rejected
 
 LEAST_PASSES = 10
@@ -72,32 +70,6 @@ class MeasuredLook:
     changes: Sequence[NDArray[np.float64]]
     """Mean squared change of the denoised log radiance of each tile since the look before, [T, T]
     for each half; the first look has none that means anything."""
-
-
-class ViewPictures(Protocol):
-    """The pictures of one view, of samples that grow.
-
-    There are P of them, of lights and of their parts: all parts of the first light come first.
-    """
-
-    hits: NDArray[np.bool_]
-    """[R, R] true where `Tracer.hits` is."""
-    visible: NDArray[np.bool_]
-    """[R, R] pixels with a first surface, anywhere within the pixel; all of them if none has."""
-
-    @staticmethod
-    def mean_radiance(samples: DualBuffer) -> float:
-        """Return the mean radiance of all pixels so far; raises as `look`."""
-
-    def look(self, quality: Filtered) -> MeasuredLook:
-        """Return what is measured now, with halves denoised by a filter of this quality.
-
-        Raises:
-            Rejected: "nonfinite_radiance" where a raw sample is not finite, "radiance_overflow".
-        """
-
-    def finish(self) -> NDArray[np.float32]:
-        """Return the pictures of all samples of the last look, [P, R, R, 3]."""
 
 
 def require_finite(num_broken: int) -> None:

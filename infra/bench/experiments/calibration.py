@@ -27,7 +27,7 @@ from pipeline.isolation import IsolatedChild
 from pipeline.objects.generated import BENCHMARK, PREFIX
 from pipeline.presets.training import smoke
 from pipeline.renders.calibrated_error import MEASURES, METRICS, versions_of_pictures
-from pipeline.renders.host_pictures import HostPictures, measure_errors
+from pipeline.renders.host_pictures import HostPictures
 from pipeline.renders.noise_floor import Curve, clamped_radiance
 from pipeline.renders.renderer import SceneRenderer
 from pipeline.renders.settings import Filtered, RenderSettings
@@ -97,7 +97,7 @@ class _RecordingPictures(HostPictures):
         """Measure, and record what was measured."""
         look = super().look(quality)
         (picture,) = self.finish()
-        a, b = self._halves
+        measured = self._measures(self._numbers(picture))
         row = {
             "spp": float(self._samples.spp),
             "hits": float(self.hits.mean()),
@@ -109,7 +109,7 @@ class _RecordingPictures(HostPictures):
         for metric in METRICS:
             curve = CURVES[metric]
             objects = metric == "object"
-            measures = measure_errors(a, b, picture, curve, self.hits, objects=objects)
+            measures = measured[metric]
             pixels = self.hits if objects and self.hits.any() else everywhere
             true, open_error = true_error(picture, self._reference, curve, pixels)
             errors = {name: getattr(measures, name) for name in _MEASURED}

@@ -3,11 +3,21 @@
 import subprocess
 import sys
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 from scipy import stats
 
+from pipeline.renders.host_pictures import NUMPY, add_numbers
+from pipeline.renders.noise_floor import Halves, MeasuredFloor
+from pipeline.renders.pictures import (
+    PixelNumbers,
+    estimates,
+    floors_of,
+    join_halves,
+    metric_counts,
+)
 from pipeline.renders.renderer import SceneRenderer
 from pipeline.renders.results import RenderedView
 from pipeline.renders.settings import RenderSettings
@@ -120,6 +130,29 @@ def scores(ours: Estimate, theirs: Estimate) -> NDArray[np.float64]:
     """Return the differences of what is lit, in standard errors."""
     lit = ours.mean > 0.01 * ours.mean.max()
     return (ours.mean - theirs.mean)[lit] / np.hypot(ours.error, theirs.error)[lit]
+
+
+class Half(NamedTuple):
+    """One half of the samples of a view, [R, R, 3], raw and denoised."""
+
+    raw_rgb: NDArray[np.float32]
+    denoised_rgb: NDArray[np.float32]
+
+
+def halves_of(a: Half, b: Half) -> Halves:
+    return join_halves(a.raw_rgb, b.raw_rgb, a.denoised_rgb, b.denoised_rgb, NUMPY)
+
+
+def floor_of(a: Half, b: Half, hits: NDArray[np.bool_]) -> MeasuredFloor:
+    """Return the floor of the picture made from both halves."""
+    is_filtered = not np.array_equal(*a)
+    rows, nothing = estimates(halves_of(a, b), hits, NUMPY, is_filtered), np.zeros(hits.shape)
+    errors, surprises = zip(*rows, strict=True)
+    numbers = PixelNumbers(
+        totals=[], adds=[nothing] * 3 + list(errors), most=[*surprises, nothing], logs=[]
+    )
+    (floor,) = floors_of(add_numbers(numbers), metric_counts(hits))
+    return floor
 
 
 def exact(mean: NDArray[np.float64]) -> Estimate:

@@ -20,7 +20,8 @@ from infra.bench.workloads.traced_pictures import (
 from infra.render.raw_references import raw_reference
 from pipeline.foreign.mesh import TriangleMesh
 from pipeline.renders import host_pictures
-from pipeline.renders.host_pictures import HostMeans, with_mean_of
+from pipeline.renders.host_pictures import NUMPY, read_sums, with_mean_of
+from pipeline.renders.pictures import means
 from pipeline.renders.renderer import SceneRenderer, set_threads
 from pipeline.renders.results import RenderedView
 from pipeline.renders.samples import DualBuffer
@@ -269,7 +270,8 @@ def test_lights_apart_add_up_to_one_denoised_picture() -> None:
     samples = DualBuffer(parts, camera_of(scene, 32), 0, first_spp=32, max_spp=32)
     assert len(list(samples.passes_to(SETTINGS.max_spp))) == 2
     features = tracer.features(camera_of(scene, 32), spp=SETTINGS.aux_spp)
-    raw = HostMeans(samples).mean().sum(axis=0)
+    (pictures,) = means(read_sums(samples), NUMPY, of_both=True)
+    raw = np.sum(pictures, axis=0)
     expected = with_mean_of(denoise(raw, features, "high"), raw)
     # rounded to half floats four times, each light and their sum: 2^-11 of each
     np.testing.assert_allclose(

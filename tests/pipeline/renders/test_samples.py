@@ -11,15 +11,9 @@ from hypothesis.extra import numpy as hnp
 from numpy.typing import NDArray
 
 from infra.render.quality import ToStatedError
-from pipeline.renders.host_pictures import (
-    NUMPY,
-    Half,
-    HostMeans,
-    LogChanges,
-    estimate_error,
-    join_halves,
-)
+from pipeline.renders.host_pictures import NUMPY, read_sums
 from pipeline.renders.noise_floor import Curve, pixel_errors
+from pipeline.renders.pictures import means
 from pipeline.renders.renderer import SceneRenderer
 from pipeline.renders.samples import (
     TILE_PX,
@@ -31,6 +25,7 @@ from pipeline.renders.samples import (
     next_spp,
     passes_of_tiles,
     slope_db,
+    tile_means,
 )
 from pipeline.renders.settings import NoiseTargets, RenderSettings
 from pipeline.renders.tracer import Chosen, PixelCamera, load_tracer
@@ -39,7 +34,7 @@ from storage.errors import TrilightError
 from storage.metrics import MAX_DB, psnr_linear_db, psnr_log_db
 from storage.records.scene import Scene
 from tests.oracle.plugin_tracer import HostSum
-from tests.pipeline.renders.sampling import camera_of
+from tests.pipeline.renders.sampling import Half, camera_of, floor_of, halves_of
 from tests.pipeline.renders.scene_kit import lit_by_a_mirror, sampled_like_scene
 
 CAMERA = PixelCamera(c2w=np.eye(4), fov_deg=40.0, resolution=32)
@@ -81,10 +76,19 @@ def test_passes_are_the_largest_that_fit_and_weigh_by_their_samples() -> None:
         assert samples.spp == spp
         assert [size for size, _ in tracer.asked] == [size for size in of_a_half for _ in range(2)]
         assert len({seed for _, seed in tracer.asked}) == len(tracer.asked), "no two are equal"
-    means = HostMeans(samples)
     expected = (4 * 16 * 16 + 64 * 64) / 128
-    assert means.mean().max() == means.mean().min() == expected
-    assert [float(half.mean()) for half in means.half_means()] == [expected, expected]
+    both, halves = mean_of(samples), half_means_of(samples)
+    assert both.max() == both.min() == expected
+    assert [float(half.mean()) for half in halves] == [expected, expected]
+
+
+def mean_of(samples: DualBuffer) -> NDArray[np.float32]:
+    ((picture,),) = means(read_sums(samples), NUMPY, of_both=True)
+    return np.asarray(picture)
+
+
+def half_means_of(samples: DualBuffer) -> list[NDArray[np.float32]]:
+    return [picture for (picture,) in means(read_sums(samples), NUMPY, of_both=False)]
 
 
 def test_light_paths_are_those_of_other_views_and_of_no_other_half_or_pass(
@@ -237,7 +241,7 @@ def half(rng: np.random.Generator) -> Half:
 
 
 def errors(a: Half, b: Half, curve: Curve) -> tuple[Any, Any]:
-    return pixel_errors(join_halves(a, b), curve, NUMPY, is_filtered=True)
+    return pixel_errors(halves_of(a, b), curve, NUMPY, is_filtered=True)
 
 
 def test_on_average_the_estimate_is_the_error_of_the_mean_of_both_halves() -> None:
@@ -260,7 +264,7 @@ def test_a_bias_that_both_halves_share_is_stated() -> None:
     flat = np.full((PX, PX, 3), truth().mean(), np.float32)
     a, b = (Half(raw_rgb=half(rng).raw_rgb, denoised_rgb=flat) for _ in range(2))
     assert psnr_log_db(a.denoised_rgb, b.denoised_rgb) == MAX_DB, "the halves agree exactly"
-    floor = estimate_error(a, b, EVERYWHERE)
+    floor = floor_of(a, b, EVERYWHERE)
     # The allowances take off what one standard error and one pixel's surprise are: under 1 dB here.
     assert psnr_log_db(flat, truth()) - 1 < floor.log_db < psnr_log_db(flat, truth())
     assert psnr_linear_db(flat, truth()) - 1 < floor.linear_db < psnr_linear_db(flat, truth())
@@ -274,10 +278,10 @@ def test_rare_light_that_one_half_found_is_allowed_for() -> None:
     mean = 0.5 * (raw[3, 4] + calm[3, 4])
     surprise = np.square(log10_radiance(mean) - log10_radiance(calm[3, 4])).mean()
     assert errors(found, missed, log10_radiance)[1].max() == pytest.approx(surprise)
-    floor = estimate_error(found, missed, EVERYWHERE)
+    floor = floor_of(found, missed, EVERYWHERE)
     # What one half alone has cancels in the estimate: the allowance is all that is stated.
     assert floor.log_db == pytest.approx(-10 * np.log10(surprise / PX**2), abs=0.1)
-    both = estimate_error(found, found, EVERYWHERE)
+    both = floor_of(found, found, EVERYWHERE)
     assert both.log_db < floor.log_db - 3, "light that both found is an error, and still a surprise"
 
 
@@ -287,16 +291,16 @@ def test_raw_halves_state_the_error_of_one() -> None:
     halves = [Half(raw_rgb=picture, denoised_rgb=picture) for picture in raw]
     exact = psnr_log_db(raw[0], truth())
     # One standard error of 64 blocks more: 0.2 dB.
-    assert estimate_error(halves[0], halves[1], EVERYWHERE).log_db == pytest.approx(exact, abs=0.4)
+    assert floor_of(halves[0], halves[1], EVERYWHERE).log_db == pytest.approx(exact, abs=0.4)
 
 
 def test_pictures_without_error_or_without_geometry_state_the_cap() -> None:
     calm = Half(raw_rgb=truth(), denoised_rgb=truth())
-    assert estimate_error(calm, calm, EVERYWHERE).log_db == MAX_DB
+    assert floor_of(calm, calm, EVERYWHERE).log_db == MAX_DB
     rng = np.random.default_rng(4)
     a, b = half(rng), half(rng)
-    assert estimate_error(a, b, ~EVERYWHERE).object_log_db == MAX_DB
-    assert estimate_error(a, b, EVERYWHERE) == estimate_error(b, a, EVERYWHERE)
+    assert floor_of(a, b, ~EVERYWHERE).object_log_db == MAX_DB
+    assert floor_of(a, b, EVERYWHERE) == floor_of(b, a, EVERYWHERE)
 
 
 def test_an_empty_background_earns_nothing() -> None:
@@ -308,7 +312,7 @@ def test_an_empty_background_earns_nothing() -> None:
         Half(raw_rgb=np.pad(each.raw_rgb, wide), denoised_rgb=np.pad(each.denoised_rgb, wide))
         for each in inner
     )
-    alone, floor = estimate_error(*inner, EVERYWHERE), estimate_error(framed, other, hits)
+    alone, floor = floor_of(*inner, EVERYWHERE), floor_of(framed, other, hits)
     assert floor.object_log_db == pytest.approx(alone.log_db, abs=1e-9)
     assert floor.log_db > alone.log_db + 3, "three quarters of the pixels are exact"
 
@@ -341,14 +345,15 @@ def _adapted(
 ) -> DualBuffer:
     samples = DualBuffer([tracer], CAMERA, seed, first_spp=32, max_spp=4096)  # type: ignore[list-item]
     samples.count_over(counted)
-    tiles, changes = TileChoice(counted), LogChanges()
+    tiles, before = TileChoice(counted), np.zeros((2, 1, 1, 1))
     for spp in measured_at:
         more = tiles.passes(samples, spp) if samples.spp else None
         for _ in samples.passes_to(spp) if more is None else samples.passes_over(more):
             pass
-        raws = [raw[0] for raw in HostMeans(samples).half_means()]
-        halves = [Half(raw_rgb=raw, denoised_rgb=raw) for raw in raws]
-        tiles.learn(changes.since(halves), samples, "off")
+        logs = log10_radiance(np.array(half_means_of(samples), np.float64))
+        changes = [tile_means(each.mean(axis=-1)) for each in np.square(logs - before)]
+        tiles.learn(changes, samples, "off")
+        before = logs
     return samples
 
 
@@ -362,7 +367,7 @@ def test_the_mean_stays_unbiased_where_tiles_are_chosen_by_rare_light() -> None:
     means, spread = [], []
     for seed in range(1000):
         samples = _adapted(RareLight(), seed, [32, 128, 512])
-        means.append(HostMeans(samples).mean().mean())
+        means.append(mean_of(samples).mean())
         spread.append(samples.spp_of(0).max() > samples.spp_of(0).min())
     assert np.mean(spread) > 0.9, "the samples are spread unevenly"
     error = np.std(means, ddof=1) / np.sqrt(len(means))
