@@ -28,7 +28,7 @@ from pipeline.renders.pictures import (
 )
 from pipeline.renders.pixel_arithmetic import KernelPixels, channel_sum
 from pipeline.renders.samples import DualBuffer
-from pipeline.renders.settings import Filtered, RenderSettings
+from pipeline.renders.settings import Filtered
 from pipeline.renders.tracer import PixelCamera
 from pipeline.renders.view_pictures import Group, add_up, require_finite, to_filter
 from storage.denoiser import INPUTS, Quality, open_filter
@@ -37,23 +37,17 @@ from storage.denoiser import INPUTS, Quality, open_filter
 class DevicePictures(Pictures):
     """See `Pictures` for the meaning of its methods."""
 
-    def __init__(
-        self, samples: DualBuffer, tracer: Any, camera: PixelCamera, settings: RenderSettings
-    ) -> None:
-        """Trace what guides the denoiser.
-
-        Args:
-            samples: whose sums are `DeviceSum`.
-        """
+    def _trace_guides(
+        self, tracer: Any, camera: PixelCamera
+    ) -> tuple[NDArray[np.bool_], NDArray[np.bool_]]:
         self._resolution = camera.resolution
-        arrays = tracer.feature_arrays(camera, spp=settings.aux_spp)
-        names = settings.part_names or ("",)
-        self._guides, self._masks = _guides(
-            KernelInputs(), arrays, tracer.hit_array(camera), names, camera.resolution
-        )
+        arrays = tracer.feature_arrays(camera, spp=self._settings.aux_spp)
+        hits, names = tracer.hit_array(camera), self._names or ("",)
+        kind = names, camera.resolution
+        self._guides, self._masks = _guides(KernelInputs(), arrays, hits, *kind)
+        self._logs = [dr.opaque(mi.Color3d, 0, camera.resolution**2) for _ in range(2)]
         bits = read_back(self._masks).reshape(camera.resolution, camera.resolution)
-        logs = [dr.opaque(mi.Color3d, 0, camera.resolution**2) for _ in range(2)]
-        super().__init__(samples, settings, bits & 1 > 0, bits & 2 > 0, logs)
+        return bits & 1 > 0, bits & 2 > 0
 
     @staticmethod
     def mean_radiance(samples: DualBuffer) -> float:
@@ -66,18 +60,18 @@ class DevicePictures(Pictures):
         pictures = read_back(self._finished())
         return pictures.reshape(-1, self._resolution, self._resolution, 3)
 
-    def _finished(self) -> Any:
+    def _begin_look(self) -> None:
+        self._sums = _sums(self._samples)
+
+    def _finish(self, filtered: Sequence[Any]) -> Any:
         """Return the pictures of all samples of this look (Float), one after another."""
-        if self._picture is None:
-            filtered = self._denoise_raws(self._settings.denoiser, of_both=True)
-            arrays = _sums(self._samples), filtered, self._guides
-            self._picture = _finish(KernelInputs(), *arrays, self._names, self._resolution)
-        return self._picture
+        arrays = self._sums, filtered, self._guides
+        return _finish(KernelInputs(), *arrays, self._names, self._resolution)
 
     def _denoise_raws(self, quality: Filtered, *, of_both: bool) -> Sequence[Any]:
         if quality == "off":
             return []
-        sums = _sums(self._samples)
+        sums = self._sums
         raws = _raws(KernelInputs(), sums, self._names, of_both, self._resolution)
         pictures = range(sum(len(tracer) - 3 for tracer in sums[0]))
         guides = [self._guides[name] for _, name in to_filter(pictures, self._names)]
@@ -87,7 +81,7 @@ class DevicePictures(Pictures):
         picture = [] if finished is None else [finished]
         arrays = self._filtered, self._guides, self._masks, self._logs, picture
         kind = self._names, self._groups(), self._resolution
-        numbers, logs = _measure(KernelInputs(), _sums(self._samples), *arrays, *kind)
+        numbers, logs = _measure(KernelInputs(), self._sums, *arrays, *kind)
         totals, tiles = np.split(read_back(numbers), [6 * len(METRICS) if picture else 0])
         rows = tiles.reshape(-1, len(self._counts[0]))
         num_surprises = 3 if picture else 3 * len(kind[1])
@@ -161,13 +155,13 @@ def _measure(
     """
     pixels = KernelPixels(resolution)
     picture = dr.unravel(mi.Color3f, finished[0]) if finished else None
-    measured = measure_pixels(
-        sums, filtered, guides, (masks & 1) > 0, logs, picture, pixels, names, groups
+    totals, adds, most, new_logs = measure_pixels(
+        pixels, names, groups, sums, filtered, guides, (masks & 1) > 0, logs, picture
     )
-    dr.eval(measured.logs)
-    added = pixels.reduce_tiles(measured.adds, dr.ReduceOp.Add)
-    greatest = pixels.reduce_tiles(measured.most, dr.ReduceOp.Max)
-    return dr.concat([*measured.totals, added, greatest]), measured.logs
+    dr.eval(new_logs)
+    added = pixels.reduce_tiles(adds, dr.ReduceOp.Add)
+    greatest = pixels.reduce_tiles(most, dr.ReduceOp.Max)
+    return dr.concat([*totals, added, greatest]), new_logs
 
 
 @record_launches

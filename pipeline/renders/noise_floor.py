@@ -32,14 +32,14 @@ Two allowances are added to the mean over the pixels:
 
 Light that no sample has found is not seen: a view whose only caustic was never hit looks converged.
 
-The terms of each pixel are here, for numpy and for kernels. host_pictures and device_pictures add
-them up, and hand their sums over blocks to `measured_floor`. The error that is stated by
+The terms of each pixel are in pipeline.renders.pictures, for numpy and for kernels, which hands
+their sums over blocks to `measured_floor` here. The error that is stated by
 calibration on other scenes is in pipeline.renders.calibrated_error.
 """
 
 from collections.abc import Callable, Iterable
 from dataclasses import dataclass
-from typing import Any, NamedTuple, Protocol
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -59,96 +59,6 @@ LINEAR_STANDARD_ERRORS = 2.0
 
 Curve = Callable[[Any], Any]
 """What errors are taken in, of radiance."""
-
-
-class Halves(NamedTuple):
-    """Both halves of the samples of a picture, which share none: numpy [R, R, 3], or Color3d."""
-
-    a: Any
-    b: Any
-    """Means of the samples, in double precision."""
-    denoised_a: Any
-    denoised_b: Any
-    difference: Any
-    """Difference of both denoised ones."""
-
-    @property
-    def raw(self) -> Any:
-        """Mean of both halves."""
-        return (self.a + self.b) / 2
-
-    @property
-    def denoised(self) -> Any:
-        """Mean of both denoised halves."""
-        return (self.denoised_a + self.denoised_b) / 2
-
-
-class PixelArithmetic(Protocol):
-    """Operations on colors and on values of pixels that numpy and kernels write unlike."""
-
-    def select(self, mask: Any, first: Any, second: Any) -> Any: ...
-    def channel_mean(self, color: Any) -> Any: ...
-    def log10(self, radiance: Any) -> Any:
-        """Return the logarithm of 1 + radiance to base 10."""
-
-    def clamp(self, radiance: Any) -> Any:
-        """Return radiance clamped to [0, 1]."""
-
-
-def pixel_errors(
-    halves: Halves, curve: Curve, arithmetic: PixelArithmetic, *, is_filtered: bool
-) -> tuple[Any, Any]:
-    """Return the estimate and the surprise of each pixel in a curve, as means over its channels.
-
-    Single estimates may be far below 0; the mean over many pixels is what they are for. A surprise
-    is the squared difference that the denoiser made in the mean of both halves.
-    """
-    mean = arithmetic.channel_mean
-    surprise = mean(_square(curve(halves.raw) - curve(halves.denoised)))
-    if not is_filtered:
-        return mean(_square(curve(halves.a) - curve(halves.b))) / 2, surprise
-    slope = secant_slope(curve, halves.denoised, halves.raw, select=arithmetic.select)
-    return mean(_square(slope) * _half_estimate(halves)), surprise
-
-
-def pixel_measures(
-    halves: Halves, picture: Any, curve: Curve, arithmetic: PixelArithmetic
-) -> tuple[list[Any], list[Any], Any]:
-    """Return what `ErrorMeasures` are made of, pixel by pixel.
-
-    Args:
-        halves: of the samples.
-        picture: one denoise of the mean of both, as they are.
-        curve: tone curve in which errors are taken.
-        arithmetic: of the halves.
-
-    Returns:
-        Estimate, agreement, move, and a quarter of the squared difference of the halves with the
-        picture's slope; residual, probe and difference of `sure` with that slope, by channel; and
-        the surprise.
-    """
-    mean = arithmetic.channel_mean
-    estimate, surprise = pixel_errors(halves, curve, arithmetic, is_filtered=True)
-    slope = secant_slope(curve, picture, halves.raw, select=arithmetic.select)
-    difference = slope * (halves.denoised_a - halves.denoised_b)
-    values = [
-        estimate,
-        mean(_square(curve(halves.denoised_a) - curve(halves.denoised_b))) / 4,
-        mean(_square(curve(picture) - curve(halves.denoised))),
-        mean(_square(difference)) / 4,
-    ]
-    signed = [slope * (picture - halves.raw), slope * (halves.a - halves.b) / 2, difference]
-    return values, signed, surprise
-
-
-def _half_estimate(halves: Halves) -> Any:
-    a, b, denoised_a, denoised_b, difference = halves
-    estimate = _square(denoised_a - b) + _square(denoised_b - a) - _square(a - b)
-    return estimate / 2 - _square(difference) / 4
-
-
-def _square(value: Any) -> Any:
-    return value * value
 
 
 @dataclass(frozen=True, kw_only=True)

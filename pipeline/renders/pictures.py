@@ -1,29 +1,30 @@
 """`Pictures`: what the samples of a view show and how far it is from the truth, as they grow.
 
-The same formulas run in numpy (host_pictures) and as kernels (device_pictures); `Pixels` are the
-operations that those write unlike. Sums are taken in the order of each.
+Here they are worked out in numpy, on sums that are read back. Sets choose it by their render
+settings (`arithmetic`); all others take pipeline.renders.device_pictures, of which this is the
+tests' oracle. Both have the same formulas; `Pixels` are the operations that they write unlike.
 """
 
 import functools
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Any, Protocol
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
 from pipeline.renders.calibrated_error import METRICS, is_far, measures_of_totals, statement_for
 from pipeline.renders.noise_floor import (
+    Curve,
     ErrorMeasures,
-    Halves,
     MeasuredFloor,
-    PixelArithmetic,
     measured_floor,
-    pixel_errors,
-    pixel_measures,
+    secant_slope,
 )
-from pipeline.renders.samples import TILE_PX, DualBuffer, tile_means
+from pipeline.renders.pixels import Pixels
+from pipeline.renders.samples import TILE_PX, DualBuffer, by_tiles, tile_means
 from pipeline.renders.settings import Filtered, RenderSettings
+from pipeline.renders.tracer import PixelCamera, Tracer
 from pipeline.renders.view_pictures import (
     LEAST_PASSES,
     Group,
@@ -36,6 +37,7 @@ from pipeline.renders.view_pictures import (
     stands_out,
     to_filter,
 )
+from storage.denoiser import denoise
 
 TILE = TILE_PX * TILE_PX
 """Pixels of a tile."""
@@ -48,51 +50,82 @@ _CHANNEL_ROWS = 13
 """Rows of a metric in `error_measures`: four values, and three colors by channel."""
 
 
-class Pixels(PixelArithmetic, Protocol):
-    """Operations on pictures (colors in single or double precision) and on values of pixels."""
+class Halves(NamedTuple):
+    """Both halves of the samples of a picture, which share none: numpy [R, R, 3], or Color3d."""
 
-    def single(self, color: Any) -> Any: ...
-    def double(self, color: Any) -> Any: ...
-    def sqrt(self, values: Any) -> Any: ...
-    def maximum(self, values: Any, least: Any) -> Any: ...
-    def channels(self, color: Any) -> Sequence[Any]: ...
-    def brightest(self, color: Any) -> Any:
-        """Return the largest channel of each pixel."""
+    a: Any
+    b: Any
+    """Means of the samples, in double precision."""
+    denoised_a: Any
+    denoised_b: Any
+    difference: Any
+    """Difference of both denoised ones."""
 
-    def is_finite(self, color: Any) -> Any: ...
-    def mean(self, total: Any, count: Any) -> Any:
-        """Return the color of pixels whose sum is `total`."""
+    @property
+    def raw(self) -> Any:
+        """Mean of both halves."""
+        return (self.a + self.b) / 2
 
-    def difference(self, first: Any, second: Any) -> Any:
-        """Return the difference of single colors in double precision."""
+    @property
+    def denoised(self) -> Any:
+        """Mean of both denoised halves."""
+        return (self.denoised_a + self.denoised_b) / 2
 
-    def are_equal(self, first: Any, second: Any) -> bool:
-        """Return whether pictures are known to be equal."""
 
-    def error_around(self, squared_error: Any) -> Any:
-        """Return the root of the mean over 3 x 3 pixels."""
+def pixel_errors(
+    halves: Halves, curve: Curve, pixels: Pixels, *, is_filtered: bool
+) -> tuple[Any, Any]:
+    """Return the estimate and the surprise of each pixel in a curve, as means over its channels.
 
-    def clean(self, inputs: Any, outputs: Any, guides: Any, *, are_lights: bool) -> list[Any]:
-        """Return what the filter made of inputs, without what it paints where no light is.
+    Single estimates may be far below 0; the mean over many pixels is what they are for. A surprise
+    is the squared difference that the denoiser made in the mean of both halves.
+    """
+    mean = pixels.channel_mean
+    surprise = mean(_square(curve(halves.raw) - curve(halves.denoised)))
+    if not is_filtered:
+        return mean(_square(curve(halves.a) - curve(halves.b))) / 2, surprise
+    slope = secant_slope(curve, halves.denoised, halves.raw, select=pixels.select)
+    return mean(_square(slope) * _half_estimate(halves)), surprise
 
-        Args:
-            inputs: what `to_filter` yields.
-            outputs: pictures by the filter.
-            guides: albedo and normal by the name of a part.
-            are_lights: whether lights alone are among them.
-        """
 
-    def with_means(self, pairs: Sequence[tuple[Any, Any]]) -> list[Any]:
-        """Return pictures (denoised, raw) with the mean of the raw ones (see view_pictures)."""
+def pixel_measures(
+    halves: Halves, picture: Any, curve: Curve, pixels: Pixels
+) -> tuple[list[Any], list[Any], Any]:
+    """Return what `ErrorMeasures` are made of, pixel by pixel.
 
-    def shares(self, parts: Sequence[Any]) -> list[Any]:
-        """Return what share of their sum each of some pictures is: equal ones where all are 0."""
+    Args:
+        halves: of the samples.
+        picture: one denoise of the mean of both, as they are.
+        curve: tone curve in which errors are taken.
+        pixels: operations on all of these.
 
-    def tile_sums(self, values: Sequence[Any]) -> Sequence[Any]:
-        """Return the sums over tiles of each of some values of pixels."""
+    Returns:
+        Estimate, agreement, move, and a quarter of the squared difference of the halves with the
+        picture's slope; residual, probe and difference of `sure` with that slope, by channel; and
+        the surprise.
+    """
+    mean = pixels.channel_mean
+    estimate, surprise = pixel_errors(halves, curve, pixels, is_filtered=True)
+    slope = secant_slope(curve, picture, halves.raw, select=pixels.select)
+    difference = slope * (halves.denoised_a - halves.denoised_b)
+    values = [
+        estimate,
+        mean(_square(curve(halves.denoised_a) - curve(halves.denoised_b))) / 4,
+        mean(_square(curve(picture) - curve(halves.denoised))),
+        mean(_square(difference)) / 4,
+    ]
+    signed = [slope * (picture - halves.raw), slope * (halves.a - halves.b) / 2, difference]
+    return values, signed, surprise
 
-    def totals_of_tiles(self, values: Sequence[Any]) -> Any:
-        """Return the sum over all tiles of each of some values of tiles."""
+
+def _half_estimate(halves: Halves) -> Any:
+    a, b, denoised_a, denoised_b, difference = halves
+    estimate = _square(denoised_a - b) + _square(denoised_b - a) - _square(a - b)
+    return estimate / 2 - _square(difference) / 4
+
+
+def _square(value: Any) -> Any:
+    return value * value
 
 
 def half_means(sums: Sums, pixels: Pixels) -> list[list[Any]]:
@@ -209,33 +242,25 @@ def finish_pictures(
     return pixels.with_means(list(zip(kept, raws[0], strict=True)))
 
 
-@dataclass(frozen=True, kw_only=True, eq=False)
-class PixelNumbers:
-    """What a look measures in each pixel."""
-
-    totals: list[Any]
-    """Totals of `measures_of_totals`, of one metric after another; empty without a picture."""
-    adds: list[Any]
-    """What is added up: the changes of both halves, broken pixels, and three estimates of each of
-    `floor_groups`; no estimates with a picture."""
-    most: list[Any]
-    """Of which the greatest counts: surprises of the same, and the brightest raw channel."""
-    logs: list[Any]
-    """Log radiance of both halves."""
-
-
 def measure_pixels(
+    pixels: Pixels,
+    names: Sequence[str],
+    groups: Sequence[Group],
     sums: Sums,
     filtered: Sequence[Any],
     guides: Any,
     hit: Any,
     logs: Sequence[Any],
     finished: Any,
-    pixels: Pixels,
-    names: Sequence[str],
-    groups: Sequence[Group],
-) -> PixelNumbers:
-    """Measure the halves, and with `finished`, one denoise of all samples, the error of that."""
+) -> tuple[list[Any], list[Any], list[Any], list[Any]]:
+    """Measure the halves, and with `finished`, one denoise of all samples, the error of that.
+
+    Returns:
+        Totals of `measures_of_totals`, of one metric after another; none without a picture. What
+        is added up: the changes of both halves, broken pixels, and three estimates of each of
+        `floor_groups`; no estimates with a picture. What the greatest counts of: surprises of the
+        same, and the brightest raw channel. And the log radiance of both halves.
+    """
     raws = means(sums, pixels, of_both=False)
     denoised = clean_pictures(raws, filtered, guides, pixels, names) if filtered else raws
     new_logs = [pixels.log10(pixels.double(add_up(each))) for each in denoised]
@@ -263,12 +288,8 @@ def measure_pixels(
             surprises += more
     channels = [pixels.brightest(part) for half in raws for part in half]
     brightest = functools.reduce(pixels.maximum, channels)
-    return PixelNumbers(
-        totals=totals,
-        adds=[*changes, broken_pixels(sums, pixels), *errors],
-        most=[*surprises, brightest],
-        logs=new_logs,
-    )
+    adds = [*changes, broken_pixels(sums, pixels), *errors]
+    return totals, adds, [*surprises, brightest], new_logs
 
 
 def join_halves(a: Any, b: Any, denoised_a: Any, denoised_b: Any, pixels: Pixels) -> Halves:
@@ -314,13 +335,13 @@ class LookNumbers:
     totals: NDArray[np.float64]
     """[3, 6] totals of `measures_of_totals`; empty without a picture."""
     adds: NDArray[np.float64]
-    """[N, T] sums over tiles of `PixelNumbers.adds`."""
+    """[N, T] sums over tiles of what `measure_pixels` adds up."""
     sums: NDArray[np.float64]
     """[N] the same over all pixels."""
     most: NDArray[np.float64]
-    """[M, T] largest of `PixelNumbers.most` in each tile."""
+    """[M, T] largest in each tile of what the greatest counts of."""
     logs: Sequence[Any]
-    """`PixelNumbers.logs`."""
+    """Log radiance of both halves."""
 
 
 def metric_counts(hits: NDArray[np.bool_]) -> tuple[NDArray[np.float64], ...]:
@@ -350,6 +371,37 @@ def _require_numbers(numbers: LookNumbers) -> None:
     require_bounded(float(numbers.most[-1].max()))
 
 
+NUMPY = Pixels()
+
+
+def read_sums(samples: DualBuffer, *, squares: bool = False) -> Sums:
+    """Return the sums of a view, with their squares or 0; raises Rejected as `Pictures.look`."""
+    shape = samples.spp_of(0).shape
+    sums = [
+        [
+            [*each.read(), each.read_squares() if squares else np.zeros(shape), spp, passes]
+            for each in samples.sums[half]
+        ]
+        for half, spp, passes in ((n, samples.spp_of(n), samples.count_of(n)) for n in range(2))
+    ]
+    require_finite(int(broken_pixels(sums, NUMPY).sum()))
+    return sums
+
+
+def add_numbers(
+    totals: list[Any], adds: list[Any], most: list[Any], logs: list[Any]
+) -> LookNumbers:
+    """Return the numbers of pixels by tile and in all."""
+    greatest = [by_tiles(each).max(axis=(1, 3)).ravel() for each in most]
+    return LookNumbers(
+        totals=np.array(totals).reshape(-1, 6),
+        adds=np.array(NUMPY.tile_sums(adds)),
+        sums=np.array([each.sum() for each in adds]),
+        most=np.array(greatest, np.float64),
+        logs=logs,
+    )
+
+
 class Pictures:
     """The pictures of one view, of samples that grow.
 
@@ -362,27 +414,31 @@ class Pictures:
     """[R, R] pixels with a first surface, anywhere within the pixel; all of them if none has."""
 
     def __init__(
-        self,
-        samples: DualBuffer,
-        settings: RenderSettings,
-        hits: NDArray[np.bool_],
-        visible: NDArray[np.bool_],
-        logs: Sequence[Any],
+        self, samples: DualBuffer, tracer: Tracer, camera: PixelCamera, settings: RenderSettings
     ) -> None:
+        """Begin a view of a camera with the samples that are there."""
         self._samples = samples
         self._settings = settings
         self._names = settings.part_names
-        self._logs = logs
+        self._logs: Sequence[Any] = (0.0, 0.0)
         self._filtered: Sequence[Any] = []
         self._picture: Any = None
-        self.hits = hits
+        self.hits, visible = self._trace_guides(tracer, camera)
         self.visible = visible if visible.any() else np.ones_like(visible)
-        self._counts = metric_counts(hits)
+        self._counts = metric_counts(self.hits)
+
+    def _trace_guides(
+        self, tracer: Any, camera: PixelCamera
+    ) -> tuple[NDArray[np.bool_], NDArray[np.bool_]]:
+        """Trace what guides the denoiser; return pixels that hit and that show anything."""
+        self._features = tracer.features(camera, spp=self._settings.aux_spp)
+        return tracer.hits(camera), np.any(self._features.normal != 0, axis=-1)
 
     @staticmethod
     def mean_radiance(samples: DualBuffer) -> float:
         """Return the mean radiance of all pixels so far; raises as `look`."""
-        raise NotImplementedError
+        (pictures,) = means(read_sums(samples), NUMPY, of_both=True)
+        return float(add_up(pictures).mean(dtype=np.float64))
 
     def look(self, quality: Filtered) -> MeasuredLook:
         """Return what is measured now, with halves denoised by a filter of this quality.
@@ -430,22 +486,38 @@ class Pictures:
 
     def finish(self) -> NDArray[np.float32]:
         """Return the pictures of all samples of the last look, [P, R, R, 3]."""
-        raise NotImplementedError
-
-    def _begin_look(self) -> None:
-        """Take the samples as they are now."""
-
-    def _denoise_raws(self, quality: Filtered, *, of_both: bool) -> Sequence[Any]:
-        """Return what the denoiser makes of each half, or of the mean of both; empty if off."""
-        raise NotImplementedError
+        return np.stack(self._finished())
 
     def _finished(self) -> Any:
         """Return the pictures of `finish` where they are worked out, once for a look."""
-        raise NotImplementedError
+        if self._picture is None:
+            filtered = self._denoise_raws(self._settings.denoiser, of_both=True)
+            self._picture = self._finish(filtered)
+        return self._picture
+
+    def _begin_look(self) -> None:
+        self._sums = read_sums(self._samples, squares=len(self._samples.sums[0]) == 1)
+
+    def _finish(self, filtered: Sequence[Any]) -> Any:
+        return finish_pictures(self._sums, filtered, None, NUMPY, self._names)
+
+    def _denoise_raws(self, quality: Filtered, *, of_both: bool) -> Sequence[Any]:
+        raws = means(self._sums, NUMPY, of_both=of_both)
+        require_bounded(float(np.max(raws)))
+        if quality == "off":
+            return []
+        return [
+            [
+                denoise(picture, self._features.of_part(name), quality)
+                for picture, name in to_filter(pictures, self._names)
+            ]
+            for pictures in raws
+        ]
 
     def _numbers(self, finished: Any) -> LookNumbers:
-        """Return what this look measures, with or without the finished pictures."""
-        raise NotImplementedError
+        picture = None if finished is None else finished[0]
+        arrays = self._sums, self._filtered, None, self.hits, self._logs, picture
+        return add_numbers(*measure_pixels(NUMPY, self._names, self._groups(), *arrays))
 
     def _groups(self) -> Sequence[Group]:
         count = len(self._samples.sums[0]) * max(1, len(self._names))

@@ -11,18 +11,19 @@ import drjit as dr
 import mitsuba as mi
 
 from pipeline.renders.pictures import TILE
+from pipeline.renders.pixels import Pixels
 from pipeline.renders.samples import TILE_PX
 from pipeline.renders.view_pictures import GLINT, MOST_APART, add_up
 
 _INV_LN_10 = 0.4342944819032518
 
 
-class KernelPixels:
+class KernelPixels(Pixels):
     """`Pixels` of a width, of Dr.Jit's arrays."""
 
-    select = staticmethod(dr.select)
-    sqrt = staticmethod(dr.sqrt)
-    maximum = staticmethod(dr.maximum)
+    select: Any = staticmethod(dr.select)
+    sqrt: Any = staticmethod(dr.sqrt)
+    maximum: Any = staticmethod(dr.maximum)
 
     def __init__(self, resolution: int) -> None:
         self._resolution = resolution

@@ -22,7 +22,6 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from pipeline.renders.calibrated_error import first_spp
-from pipeline.renders.host_pictures import HostPictures
 from pipeline.renders.noise_floor import MeasuredFloor
 from pipeline.renders.pictures import Pictures
 from pipeline.renders.results import GrowingPicture, RenderedView, run_to_end
@@ -97,7 +96,7 @@ class SceneRenderer:
                 bounces=settings.split, lobes=settings.split_lobes
             )
         self._tracers = [self.tracer]
-        self._arithmetic: Any = HostPictures
+        self._arithmetic: Any = Pictures
         if settings.arithmetic == "device":
             from pipeline.renders.device_pictures import DevicePictures  # imports mitsuba
 

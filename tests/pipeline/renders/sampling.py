@@ -9,10 +9,11 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy import stats
 
-from pipeline.renders.host_pictures import NUMPY, add_numbers
-from pipeline.renders.noise_floor import Halves, MeasuredFloor
+from pipeline.renders.noise_floor import MeasuredFloor
 from pipeline.renders.pictures import (
-    PixelNumbers,
+    NUMPY,
+    Halves,
+    add_numbers,
     estimates,
     floors_of,
     join_halves,
@@ -148,10 +149,8 @@ def floor_of(a: Half, b: Half, hits: NDArray[np.bool_]) -> MeasuredFloor:
     is_filtered = not np.array_equal(*a)
     rows, nothing = estimates(halves_of(a, b), hits, NUMPY, is_filtered), np.zeros(hits.shape)
     errors, surprises = zip(*rows, strict=True)
-    numbers = PixelNumbers(
-        totals=[], adds=[nothing] * 3 + list(errors), most=[*surprises, nothing], logs=[]
-    )
-    (floor,) = floors_of(add_numbers(numbers), metric_counts(hits))
+    numbers = add_numbers([], [nothing] * 3 + list(errors), [*surprises, nothing], [])
+    (floor,) = floors_of(numbers, metric_counts(hits))
     return floor
 
 

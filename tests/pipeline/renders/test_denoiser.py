@@ -22,15 +22,17 @@ from pipeline.renders.calibrated_error import (
     measures_of_totals,
     versions_of_pictures,
 )
-from pipeline.renders.host_pictures import NUMPY, read_sums, with_mean_of
 from pipeline.renders.noise_floor import ErrorMeasures
 from pipeline.renders.pictures import (
+    NUMPY,
     converged_mask,
     error_measures,
     keep,
     keep_in_halves,
+    read_sums,
     squared_error,
 )
+from pipeline.renders.pixels import with_mean_of
 from pipeline.renders.samples import DualBuffer, TileChoice
 from pipeline.renders.settings import Arithmetic, RenderSettings
 from pipeline.renders.tracer import load_tracer

@@ -19,9 +19,9 @@ from infra.bench.workloads.traced_pictures import (
 )
 from infra.render.raw_references import raw_reference
 from pipeline.foreign.mesh import TriangleMesh
-from pipeline.renders import host_pictures
-from pipeline.renders.host_pictures import NUMPY, read_sums, with_mean_of
-from pipeline.renders.pictures import means
+from pipeline.renders import pictures
+from pipeline.renders.pictures import NUMPY, means, read_sums
+from pipeline.renders.pixels import with_mean_of
 from pipeline.renders.renderer import SceneRenderer, set_threads
 from pipeline.renders.results import RenderedView
 from pipeline.renders.samples import DualBuffer
@@ -140,13 +140,13 @@ def test_a_view_says_how_far_it_is() -> None:
 
 def test_halves_of_many_samples_have_the_best_filter(monkeypatch: pytest.MonkeyPatch) -> None:
     filtered: list[str] = []
-    denoise = host_pictures.denoise
+    denoise = pictures.denoise
 
     def noted(raw: NDArray[np.float32], features: Features, quality: Quality) -> Any:
         filtered.append(quality)
         return denoise(raw, features, quality)
 
-    monkeypatch.setattr(host_pictures, "denoise", noted)
+    monkeypatch.setattr(pictures, "denoise", noted)
     settings = dataclasses.replace(GROWING, noise_floor_db=95.0, min_spp=64, max_spp=512)
     render_view(simple_scene(), settings)
     # Two halves at 256 and at 512 samples, and the picture.

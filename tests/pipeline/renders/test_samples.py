@@ -11,9 +11,8 @@ from hypothesis.extra import numpy as hnp
 from numpy.typing import NDArray
 
 from infra.render.quality import ToStatedError
-from pipeline.renders.host_pictures import NUMPY, read_sums
-from pipeline.renders.noise_floor import Curve, pixel_errors
-from pipeline.renders.pictures import means
+from pipeline.renders.noise_floor import Curve
+from pipeline.renders.pictures import NUMPY, means, pixel_errors, read_sums
 from pipeline.renders.renderer import SceneRenderer
 from pipeline.renders.samples import (
     TILE_PX,
