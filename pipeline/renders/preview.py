@@ -14,12 +14,9 @@ from typing import Annotated, Any, get_args
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from pipeline.renders.calibrated_error import first_spp
-from pipeline.renders.renderer import SceneRenderer, representable, require_surfaces
-from pipeline.renders.results import GrowingPicture, RenderedView, run_to_end
 from pipeline.renders.settings import PASS_SPP, Depth, Filtered, RenderSettings, Resolution
 from pipeline.renders.tracer import PixelCamera, Tracer, load_tracer, pixel_camera
-from pipeline.renders.view_pictures import require_bounded
+from pipeline.renders.view_pictures import representable, require_bounded
 from storage.denoiser import Features, Quality, denoise
 from storage.errors import Rejected, TrilightError
 from storage.records.scene import Scene
@@ -88,7 +85,6 @@ class PreviewRenderer:
         Raises:
             Rejected: "unlit_scene" or "no_surfaces", as of `SceneRenderer`.
         """
-        require_surfaces(scene)
         self._settings = settings
         self._tracer = load_tracer(scene, max_depth=settings.max_depth, rr_depth=settings.rr_depth)
 
@@ -218,44 +214,3 @@ def seconds_of(parts: Mapping[str, int], part_s: Mapping[str, float]) -> float:
 FIRST_LOOKS_SPP = (1, 4, 16)
 """Samples of the previews; each is a picture of its own, and together they cost less than a third
 of the samples before the first measurement."""
-
-
-class ProgressiveRenderer:
-    """A scene loaded once, for pictures that appear at once and then improve step by step.
-
-    First come previews of few samples, whose error is unknown; then the picture of `SceneRenderer`
-    grows to its target, shown at each measurement. What comes at the end is, bit by bit, what
-    `SceneRenderer` alone makes.
-    """
-
-    def __init__(self, scene: Scene, settings: RenderSettings) -> None:
-        """Load a scene; raises as `SceneRenderer`, which `settings` are for."""
-        self._settings = settings
-        self._measured = SceneRenderer(scene, settings, shows_looks=True)
-
-    def view_steps(
-        self, c2w: ArrayLike, fov_deg: float, seed: int
-    ) -> Iterator[Sampling | RenderedView]:
-        """Yield looks, the progress of sampling between them, and last the finished picture.
-
-        Args:
-            c2w: [4, 4] camera to world.
-            fov_deg: full field of view in degrees.
-            seed: of the samples.
-
-        Raises:
-            Rejected: as of `SceneRenderer.render_view`.
-        """
-        camera = pixel_camera(c2w, fov_deg, self._settings.resolution)
-        for spp in FIRST_LOOKS_SPP:
-            steps = preview_steps(self._measured.tracer, camera, seed, spp, usual_filter(spp))
-            preview = run_to_end(steps)
-            yield GrowingPicture(
-                spp=preview.spp,
-                expected_spp=first_spp(self._settings),
-                missing_db=None,
-                radiance_rgb=preview.radiance_rgb,
-                floor=None,
-                core_s=preview.core_s,
-            )
-        yield from self._measured.view_steps(c2w, fov_deg, seed)

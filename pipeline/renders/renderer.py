@@ -24,6 +24,7 @@ from numpy.typing import ArrayLike, NDArray
 from pipeline.renders.calibrated_error import first_spp
 from pipeline.renders.noise_floor import MeasuredFloor
 from pipeline.renders.pictures import Pictures
+from pipeline.renders.preview import FIRST_LOOKS_SPP, preview_steps, usual_filter
 from pipeline.renders.results import GrowingPicture, RenderedView, run_to_end
 from pipeline.renders.samples import (
     DualBuffer,
@@ -36,8 +37,7 @@ from pipeline.renders.samples import (
 )
 from pipeline.renders.settings import RenderSettings
 from pipeline.renders.tracer import load_tracer, pixel_camera
-from pipeline.renders.view_pictures import MeasuredLook
-from storage.conventions import HALF_FLOAT_MAX
+from pipeline.renders.view_pictures import MeasuredLook, representable
 from storage.denoiser import set_denoiser_threads
 from storage.errors import Rejected
 from storage.records.lights import (
@@ -75,8 +75,10 @@ class SceneRenderer:
         """Load a scene that passes `Scene.check`; `activate` must have been called.
 
         Args:
-            shows_looks: whether `view_steps` yields a `GrowingPicture` after each measurement by
-                which a target is missed; pictures stay the same, each look costs one denoise.
+            shows_looks: whether `view_steps` yields pictures that appear at once and then improve:
+                previews of few samples, whose error is unknown, and a `GrowingPicture` after each
+                measurement by which a target is missed, each of which costs one denoise. The
+                picture at the end is the same, bit by bit.
             light_seed: of the light paths of all views, where the settings let them share these;
                 None: each view has its own.
 
@@ -86,7 +88,6 @@ class SceneRenderer:
                 picture would be black), "too_many_lights" where more than MAX_LIGHTS would be
                 kept apart.
         """
-        require_surfaces(scene)
         self._settings = settings
         self._shows_looks = shows_looks
         self._began_s = 0.0
@@ -136,9 +137,19 @@ class SceneRenderer:
     ) -> Iterator[Sampling | RenderedView]:
         """Do what `render_view` does: yield after each pass of one half, and last the picture."""
         settings = self._settings
-        self._began_s = time.process_time()
         camera = pixel_camera(c2w, fov_deg, settings.resolution)
         settled = first_spp(settings)
+        for spp in FIRST_LOOKS_SPP if self._shows_looks else ():
+            preview = run_to_end(preview_steps(self.tracer, camera, seed, spp, usual_filter(spp)))
+            yield GrowingPicture(
+                spp=preview.spp,
+                expected_spp=settled,
+                missing_db=None,
+                radiance_rgb=preview.radiance_rgb,
+                floor=None,
+                core_s=preview.core_s,
+            )
+        self._began_s = time.process_time()
         samples = DualBuffer(
             self._tracers,
             camera,
@@ -252,19 +263,6 @@ class SceneRenderer:
             floor=floor,
             core_s=core_s,
         )
-
-
-def require_surfaces(scene: Scene) -> None:
-    """Raise Rejected("no_surfaces") where all triangles emit: every picture would be black."""
-    if scene.triangle_emits.all():
-        raise Rejected("no_surfaces", f"all {scene.num_triangles} triangles are emitters")
-
-
-def representable(radiance_rgb: NDArray[np.float32]) -> NDArray[np.float32]:
-    """Return radiance that half floats can hold; raises Rejected("radiance_overflow") else."""
-    if radiance_rgb.max() >= HALF_FLOAT_MAX:
-        raise Rejected("radiance_overflow", f"a pixel of radiance {radiance_rgb.max():.3g}")
-    return radiance_rgb
 
 
 def set_threads(count: int) -> None:

@@ -15,7 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pipeline.renders.device_memory import opaque_vector, own_floats
-from pipeline.renders.emitter_table import ONE_MINUS_EPSILON, sample_alias
+from pipeline.renders.emitter_table import ONE_MINUS_EPSILON, sample_alias, triangle_areas
 from storage.records.environment import Environment, row_solid_angles, texel_means
 from storage.records.material import EMISSION
 from storage.records.scene import Scene
@@ -186,10 +186,8 @@ def sky_share(scene: Scene, sky: Environment) -> float:
 def lamp_power(scene: Scene) -> float:
     """Return the sum over emitting triangles of area x mean radiance of the three channels."""
     emits = scene.triangle_emits
-    corners = scene.vertex_positions[scene.faces[emits]].astype(np.float64)
-    normal = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
     radiance = scene.materials[scene.material_index[emits]][:, EMISSION].astype(np.float64)
-    return float((0.5 * np.linalg.norm(normal, axis=1) * radiance.mean(axis=1)).sum())
+    return float((triangle_areas(scene, emits)[3] * radiance.mean(axis=1)).sum())
 
 
 def surface_radius(scene: Scene) -> float:

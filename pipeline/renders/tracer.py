@@ -14,6 +14,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from storage.denoiser import Features
+from storage.errors import Rejected
 from storage.records.retextured import without_constant_textures
 from storage.records.scene import Scene
 
@@ -144,9 +145,14 @@ def load_tracer(scene: Scene, *, max_depth: int, rr_depth: int) -> Tracer:
     """Return the tracer of a scene; call after `activate`.
 
     Textures of one value are the constants that they are: they cost nothing.
+
+    Raises:
+        Rejected: "unlit_scene"; "no_surfaces" where all triangles emit: pictures would be black.
     """
     from pipeline.renders.vector_tracer import VectorTracer  # imports mitsuba
 
+    if scene.triangle_emits.all():
+        raise Rejected("no_surfaces", f"all {scene.num_triangles} triangles are emitters")
     scale = choose_tracing_scale(scene)
     scene = without_constant_textures(scene)
     if scale != 1:

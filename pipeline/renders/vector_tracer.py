@@ -285,16 +285,8 @@ def _trace_light_paths(scene: Any, seed: Any, shifts: list[Any], count: int, rec
     trace_light(scene, emitter, mi.Point2f(u[2], u[3]), sampler, record)
 
 
-@record_launches
-def _land(objects: Any, resolution: int, count: int) -> list[list[Any]]:
-    landed = land(objects, resolution, count)
-    dr.eval(landed)
-    return landed
-
-
-@record_launches
-def _means(*arguments: Any) -> Any:
-    return _traced(*arguments)
+_land = record_launches(land)
+_means = record_launches(_traced)
 
 
 @record_launches

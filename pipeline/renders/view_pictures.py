@@ -22,6 +22,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pipeline.renders.noise_floor import MeasuredFloor
+from storage.conventions import HALF_FLOAT_MAX
 from storage.errors import Rejected
 
 LEAST_PASSES = 10
@@ -82,6 +83,13 @@ def require_bounded(brightest: float) -> None:
     """Raise Rejected("radiance_overflow") where the denoiser would hide what is too bright."""
     if brightest >= MAX_RAW:
         raise Rejected("radiance_overflow", f"a raw pixel of radiance {brightest:.3g}")
+
+
+def representable(radiance_rgb: NDArray[np.float32]) -> NDArray[np.float32]:
+    """Return radiance that half floats can hold; raises Rejected("radiance_overflow") else."""
+    if radiance_rgb.max() >= HALF_FLOAT_MAX:
+        raise Rejected("radiance_overflow", f"a pixel of radiance {radiance_rgb.max():.3g}")
+    return radiance_rgb
 
 
 def stands_out(denoised: Any, raw: Any, standard_error: Any, error_around: Any) -> Any:
