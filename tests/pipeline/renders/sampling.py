@@ -3,7 +3,7 @@
 import subprocess
 import sys
 from dataclasses import dataclass
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -22,7 +22,7 @@ from pipeline.renders.pictures import (
 from pipeline.renders.renderer import SceneRenderer
 from pipeline.renders.results import RenderedView
 from pipeline.renders.settings import RenderSettings
-from pipeline.renders.tracer import PixelCamera, Tracer, load_tracer, pixel_camera
+from pipeline.renders.tracer import PixelCamera, load_tracer, pixel_camera
 from storage.records.scene import Scene
 from tests.conftest import ROOT
 
@@ -60,7 +60,7 @@ def render_blocks(
     max_depth: int = 10,
     rr_depth: int = 5,
     first_seed: int = 0,
-    tracer: Tracer | None = None,
+    tracer: Any = None,
 ) -> Estimate:
     """Return the means of `block` x `block` pixels, [R / block, R / block, 3]."""
     traced = tracer or load_tracer(scene, max_depth=max_depth, rr_depth=rr_depth)
@@ -71,7 +71,7 @@ def render_blocks(
 
 
 def render_passes(
-    tracer: Tracer, scene: Scene, *, resolution: int = 32, passes: int, first_seed: int = 0
+    tracer: Any, scene: Scene, *, resolution: int = 32, passes: int, first_seed: int = 0
 ) -> NDArray[np.float64]:
     """Return independent pictures of 64 samples, [passes, R, R, 3]."""
     camera, seeds = camera_of(scene, resolution), range(first_seed, first_seed + passes)

@@ -39,7 +39,6 @@ from storage.records.retextured import without_constant_textures
 from storage.records.scene import Scene, SceneObject
 from storage.records.texture import MAX_SIDE, Texture
 from storage.seeds import SceneKey
-from tests.oracle.plugin_tracer import PluginTracer
 from tests.pipeline.assets.meshes_by_hand import prepare
 from tests.pipeline.assets.source_materials.textured_kit import CORNERS as PICTURE_CORNERS
 from tests.pipeline.assets.source_materials.textured_kit import (
@@ -77,17 +76,16 @@ from trilight import render
 
 pytestmark = pytest.mark.usefixtures("llvm")
 
-TRACERS = [load_tracer, pytest.param(PluginTracer, marks=pytest.mark.slow("statistics"))]
 
-
-@pytest.mark.parametrize("tracer", TRACERS)
-def test_guides_are_the_lookup_of_the_records(tracer: Any) -> None:
+def test_guides_are_the_lookup_of_the_records() -> None:
     """Coordinates from -1.75 to 1.25 wrap; a diffuse and a specular map of unlike sizes add up."""
     corners = np.array([[(0.8, 0.1, 0.1), (0.1, 0.8, 0.1)], [(0.1, 0.1, 0.8), (0.7, 0.7, 0.1)]])
     maps = noise_map(1, 3, 0, 0.6), Texture(texels=(0.3 * corners).astype(np.float32))
     scene = textured([textured_floor(material(roughness=0.4)), SKY_LAMP], maps, [0, 1, -1])
     scene = _moved(scene, 3.0, np.array([-1.75, -1.75]))
-    albedo = tracer(scene, max_depth=2, rr_depth=5).features(camera_of(scene, 32), spp=1).albedo
+    albedo = (
+        load_tracer(scene, max_depth=2, rr_depth=5).features(camera_of(scene, 32), spp=1).albedo
+    )
     rows = np.nan_to_num(first_hits(scene, resolution=32).material)
     wanted = rows[..., 0:3] + rows[..., 3:6]
     # Float32 places of hits: 1e-6 of a coordinate is 7e-6 texels, whose values differ by up to .6.
@@ -95,7 +93,7 @@ def test_guides_are_the_lookup_of_the_records(tracer: Any) -> None:
     assert np.mean(np.abs(albedo - wanted).max(axis=-1) > 2e-5) < 0.01
     assert np.ptp(wanted, axis=(0, 1)).min() > 0.5
     far = _moved(scene, 1.0, np.array([1000.0, -512.0]))
-    moved = tracer(far, max_depth=2, rr_depth=5).features(camera_of(far, 32), spp=1).albedo
+    moved = load_tracer(far, max_depth=2, rr_depth=5).features(camera_of(far, 32), spp=1).albedo
     # The stored coordinates know 1000 to 3e-5: two ten-thousandths of a texel.
     assert np.abs(albedo - moved).max() < 5e-4
 
