@@ -32,6 +32,7 @@ from pipeline.renders.pixels import Pixels
 from pipeline.renders.samples import TILE_PX, DualBuffer
 from pipeline.renders.settings import Filtered
 from pipeline.renders.tracer import PixelCamera
+from pipeline.renders.vector_tracer import VectorTracer
 from pipeline.renders.view_pictures import (
     GLINT,
     MOST_APART,
@@ -188,7 +189,7 @@ class DevicePictures(Pictures):
     """See `Pictures` for the meaning of its methods."""
 
     def _trace_guides(
-        self, tracer: Any, camera: PixelCamera
+        self, tracer: VectorTracer, camera: PixelCamera
     ) -> tuple[NDArray[np.bool_], NDArray[np.bool_]]:
         self._resolution = camera.resolution
         arrays = tracer.feature_arrays(camera, spp=self._settings.aux_spp)
@@ -241,7 +242,7 @@ class DevicePictures(Pictures):
 
 
 def _sums(samples: DualBuffer) -> Sums:
-    return [[each.sums for each in half] for half in samples.sums]  # type: ignore[attr-defined]
+    return [[each.sums for each in half] for half in samples.sums]
 
 
 @record_launches

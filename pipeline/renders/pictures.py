@@ -8,7 +8,7 @@ tests' oracle. Both have the same formulas; `Pixels` are the operations that the
 import functools
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Any, NamedTuple
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -24,7 +24,7 @@ from pipeline.renders.noise_floor import (
 from pipeline.renders.pixels import Pixels
 from pipeline.renders.samples import TILE_PX, DualBuffer, by_tiles, tile_means
 from pipeline.renders.settings import Filtered, RenderSettings
-from pipeline.renders.tracer import PixelCamera, Tracer
+from pipeline.renders.tracer import PixelCamera
 from pipeline.renders.view_pictures import (
     LEAST_PASSES,
     Group,
@@ -38,6 +38,9 @@ from pipeline.renders.view_pictures import (
     to_filter,
 )
 from storage.denoiser import denoise
+
+if TYPE_CHECKING:
+    from pipeline.renders.vector_tracer import VectorTracer
 
 TILE = TILE_PX * TILE_PX
 """Pixels of a tile."""
@@ -409,12 +412,16 @@ class Pictures:
     """
 
     hits: NDArray[np.bool_]
-    """[R, R] true where `Tracer.hits` is."""
+    """[R, R] true where `VectorTracer.hits` is."""
     visible: NDArray[np.bool_]
     """[R, R] pixels with a first surface, anywhere within the pixel; all of them if none has."""
 
     def __init__(
-        self, samples: DualBuffer, tracer: Tracer, camera: PixelCamera, settings: RenderSettings
+        self,
+        samples: DualBuffer,
+        tracer: "VectorTracer",
+        camera: PixelCamera,
+        settings: RenderSettings,
     ) -> None:
         """Begin a view of a camera with the samples that are there."""
         self._samples = samples
@@ -428,7 +435,7 @@ class Pictures:
         self._counts = metric_counts(self.hits)
 
     def _trace_guides(
-        self, tracer: Any, camera: PixelCamera
+        self, tracer: "VectorTracer", camera: PixelCamera
     ) -> tuple[NDArray[np.bool_], NDArray[np.bool_]]:
         """Trace what guides the denoiser; return pixels that hit and that show anything."""
         self._features = tracer.features(camera, spp=self._settings.aux_spp)

@@ -9,13 +9,13 @@ from collections import Counter
 from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass
 from functools import partial
-from typing import Annotated, Any, get_args
+from typing import TYPE_CHECKING, Annotated, Any, get_args
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from pipeline.renders.settings import PASS_SPP, Depth, Filtered, RenderSettings, Resolution
-from pipeline.renders.tracer import PixelCamera, Tracer, load_tracer, pixel_camera
+from pipeline.renders.tracer import PixelCamera, load_tracer, pixel_camera
 from pipeline.renders.view_pictures import representable, require_bounded
 from storage.denoiser import Features, Quality, denoise
 from storage.errors import Rejected, TrilightError
@@ -24,6 +24,9 @@ from storage.renderer import Sampling
 from storage.seeds import seed_for
 from storage.settings.described import checked
 from storage.settings.ranges import Within
+
+if TYPE_CHECKING:
+    from pipeline.renders.vector_tracer import VectorTracer
 
 MOST_SPP = 4096
 """Maximum number of samples of a preview; above it, use a stated error."""
@@ -100,7 +103,7 @@ class PreviewRenderer:
 
 
 def preview_steps(
-    tracer: Tracer, camera: PixelCamera, seed: int, spp: int, denoiser: Filtered
+    tracer: "VectorTracer", camera: PixelCamera, seed: int, spp: int, denoiser: Filtered
 ) -> Iterator[Sampling | Preview]:
     """Do what `PreviewRenderer.view_steps` does, for a scene that a tracer has loaded."""
     began_s = time.process_time()

@@ -23,14 +23,18 @@ doubling of the samples bought in its own metric, and the one that needs most sa
 import math
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
+from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import NDArray
 
 from pipeline.renders.noise_floor import BLOCK_PX
 from pipeline.renders.settings import PASS_SPP, Filtered
-from pipeline.renders.tracer import Chosen, PixelCamera, Tracer
+from pipeline.renders.tracer import Chosen, PixelCamera
 from storage.seeds import seed_for
+
+if TYPE_CHECKING:
+    from pipeline.renders.vector_tracer import VectorTracer
 
 
 class DualBuffer:
@@ -43,7 +47,7 @@ class DualBuffer:
 
     def __init__(
         self,
-        tracers: Sequence[Tracer],
+        tracers: Sequence["VectorTracer"],
         camera: PixelCamera,
         seed: int,
         *,

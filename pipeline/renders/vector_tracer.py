@@ -105,7 +105,10 @@ _Loaded = TypeVar("_Loaded", "VectorTracer", KernelScene)
 
 
 class VectorTracer:
-    """A scene on the LLVM or CUDA backend; see `Tracer` for the meaning of its methods."""
+    """One loaded scene, on the LLVM or CUDA backend.
+
+    Emitters are hidden from camera rays in everything that it returns.
+    """
 
     _light_paths = LIGHT_PATHS
     """Light paths for each camera path, as weights have it."""
@@ -123,6 +126,14 @@ class VectorTracer:
         self._landed = LandedLight()
 
     def only_light(self, row: int | None) -> "VectorTracer":
+        """Return the same loaded scene in which only the emitter `objects[row]` is switched on.
+
+        The others stay where they are, black, and an environment is off; None leaves only that on.
+        Equal seeds give equal camera rays in both.
+
+        Raises:
+            Rejected: "unlit_scene" where it has no area.
+        """
         _, emitters = split_triangles(self._record)
         lit = self._record.object_index[emitters] == (-1 if row is None else row)
         sky = shining_sky(self._record) if row is None else None
@@ -131,9 +142,20 @@ class VectorTracer:
         return _changed(self, _scene=_changed(self._scene, **light))
 
     def split_lights(self, *, bounces: bool, lobes: bool) -> "VectorTracer":
+        """Return the same loaded scene, whose sums of passes are by part.
+
+        Args:
+            bounces: keep direct and indirect light apart.
+            lobes: keep the diffuse and the specular lobe of the visible surface apart.
+        """
         return _changed(self, _parts=KernelParts(bounces=bounces, lobes=lobes))
 
     def for_views(self, cameras: Sequence[PixelCamera]) -> "VectorTracer":
+        """Return the same loaded scene, which traces light paths of one seed once for all views.
+
+        Args:
+            cameras: of the views, in the order in which they will be asked for.
+        """
         return _changed(self, _landed=LandedLight(cameras))
 
     def with_guide(self) -> "VectorTracer":
@@ -147,6 +169,17 @@ class VectorTracer:
     def radiance(
         self, camera: PixelCamera, *, seed: int, spp: int, chosen: Chosen = None
     ) -> NDArray[np.float32]:
+        """Return the mean of one pass of samples, linear radiance [R, R, 3]; 0 if not chosen.
+
+        Equal arguments give equal bits, whatever the number of threads. With other pixels chosen,
+        a pixel's samples may be others.
+
+        Args:
+            camera: the view.
+            seed: 31 bits; passes with different seeds are independent.
+            spp: samples per pixel, a square of a power of two.
+            chosen: the pixels that are wanted. A tracer may trace the others too.
+        """
         pixels = _pixels(camera, chosen)
         picture = dr.zeros(mi.Color3f, camera.resolution**2)
         means = _means(*self._pass(camera, self._film(camera), pixels, seed, spp))
@@ -203,6 +236,7 @@ class VectorTracer:
         return _PassNumbers(seed, self._light_paths * camera.resolution**2, count), count
 
     def features(self, camera: PixelCamera, *, spp: int) -> Features:
+        """Return the albedo and normal pictures, of `spp` evenly spread rays in each pixel."""
         named = self.feature_arrays(camera, spp=spp)
         return Features(
             albedo=_picture(camera, named.pop("albedo")),
@@ -217,6 +251,7 @@ class VectorTracer:
         return arrays
 
     def hits(self, camera: PixelCamera) -> NDArray[np.bool_]:
+        """Return whether the ray through each pixel's centre hits a surface, [R, R]."""
         return read_back(self.hit_array(camera)).reshape(camera.resolution, camera.resolution)
 
     def hit_array(self, camera: PixelCamera) -> Any:
@@ -345,7 +380,10 @@ def _first_hit(scene: Any, film: Film, resolution: int, spp: int) -> Any:
 
 
 class DeviceSum:
-    """A `PassSum` in float64 in the memory of the device, so that no pass waits for Python."""
+    """The growing sum of the passes of one view, in float64 in the memory of the device.
+
+    So no pass waits for Python.
+    """
 
     def __init__(self, tracer: VectorTracer, camera: PixelCamera) -> None:
         self._tracer = tracer
@@ -358,17 +396,35 @@ class DeviceSum:
     def add(
         self, *, seed: int, spp: int, chosen: Chosen = None, light_seed: int | None = None
     ) -> None:
+        """Add all samples of one pass: `VectorTracer.radiance` times `spp`.
+
+        It may return before they are traced. With `light_seed` its light paths have that seed.
+        """
         pixels = _pixels(self._camera, chosen)
         arguments = self._tracer._pass(self._camera, self._film, pixels, seed, spp, light_seed)
         self.sums = _sums(*arguments, self.sums)
 
     def guide(self) -> None:
+        """Let the passes from now on be guided (pipeline.renders.guide_table), if they can be.
+
+        Their expected value stays the same. The first call for a scene learns it.
+        """
         self._tracer = self._tracer.with_guide()
 
     def read(self) -> NDArray[np.float64]:
+        """Return the sum over all samples of each part (`split_lights`), [Q, R, R, 3]; else Q = 1.
+
+        It is not finite where any sample was not. It waits until they are traced, and equals the
+        sum in float64 of the passes, one by one.
+        """
         return np.stack([_picture(self._camera, total) for total in self.sums[:-3]])
 
     def read_squares(self) -> NDArray[np.float64]:
+        """Return the sum over the passes of samples times squared grey mean, [R, R].
+
+        Grey is the mean of the three channels of all parts together. With `read` it gives the
+        spread between passes.
+        """
         return read_back(self.sums[-3]).reshape(self._camera.resolution, self._camera.resolution)
 
 

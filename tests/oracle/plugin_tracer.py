@@ -12,15 +12,15 @@ import mitsuba as mi
 import numpy as np
 from numpy.typing import NDArray
 
-from pipeline.renders.tracer import Chosen, PixelCamera, Tracer
+from pipeline.renders.tracer import Chosen, PixelCamera
 from storage.records.scene import Scene
 from tests.oracle.plugin_scene import plugin_feature_scene, plugin_scene
 
 
 class HostSum:
-    """A `PassSum` in numpy's memory, for a tracer that returns its passes there anyway."""
+    """A `DeviceSum` in numpy's memory, for a tracer that returns its passes there anyway."""
 
-    def __init__(self, tracer: Tracer, camera: PixelCamera) -> None:
+    def __init__(self, tracer: Any, camera: PixelCamera) -> None:
         self._tracer, self._camera = tracer, camera
         self._total = np.zeros((camera.resolution, camera.resolution, 3))
         self._squares = np.zeros((camera.resolution, camera.resolution))
@@ -51,7 +51,7 @@ _NEAR_CLIP, _FAR_CLIP = 1e-4, 1e4
 
 
 class PluginTracer:
-    """A scene on any backend, whose sky no camera sees; see `Tracer` for its methods."""
+    """A scene on any backend, whose sky no camera sees; see `VectorTracer` for its methods."""
 
     def __init__(self, scene: Scene, *, max_depth: int, rr_depth: int) -> None:
         self._scene = plugin_scene(scene)

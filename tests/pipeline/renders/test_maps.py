@@ -14,7 +14,8 @@ from pipeline.renders import kernel_scene
 from pipeline.renders.emitter_table import alias_table
 from pipeline.renders.sky_table import SkyTable, alias_rows, peaked_radiance, sky_share
 from pipeline.renders.surface_table import KernelTextures
-from pipeline.renders.tracer import Tracer, load_tracer
+from pipeline.renders.tracer import load_tracer
+from pipeline.renders.vector_tracer import VectorTracer
 from pipeline.scenes.pieces import apply_skin, concatenate_pieces, emitter_piece, object_piece
 from pipeline.scenes.source_materials import source_skins
 from pipeline.scenes.triangle_budget import PooledAsset
@@ -222,7 +223,7 @@ def _require_colours_in_corners(path: Path) -> None:
         assert seen[lit].min() > 4 * seen[~lit].max(initial=0), (right, up, seen)
 
 
-def _tracer(scene: Scene) -> Tracer:
+def _tracer(scene: Scene) -> VectorTracer:
     return load_tracer(scene, max_depth=10, rr_depth=5)
 
 

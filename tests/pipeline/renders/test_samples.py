@@ -49,7 +49,7 @@ class Recorder:
         self.asked: list[tuple[int, int]] = []
 
     def pass_sum(self, camera: PixelCamera) -> HostSum:
-        return HostSum(self, camera)  # type: ignore[arg-type]
+        return HostSum(self, camera)
 
     def radiance(
         self, camera: PixelCamera, *, seed: int, spp: int, chosen: Chosen = None
@@ -326,7 +326,7 @@ class RareLight:
         self.dim = np.repeat(np.linspace(0.1, 1, 32 // TILE_PX), TILE_PX)
 
     def pass_sum(self, camera: PixelCamera) -> HostSum:
-        return HostSum(self, camera)  # type: ignore[arg-type]
+        return HostSum(self, camera)
 
     def radiance(
         self, camera: PixelCamera, *, seed: int, spp: int, chosen: Chosen = None

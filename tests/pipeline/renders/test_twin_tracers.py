@@ -14,7 +14,8 @@ from pipeline.generation.render_sample import RenderInput, ViewProgress, render_
 from pipeline.presets.registry import preset_settings
 from pipeline.renders.renderer import SceneRenderer
 from pipeline.renders.settings import RenderSettings
-from pipeline.renders.tracer import Tracer, load_tracer
+from pipeline.renders.tracer import load_tracer
+from pipeline.renders.vector_tracer import VectorTracer
 from scene_templates.rotations import uniform_rotation
 from storage.conventions import camera_rays
 from storage.dataset.manifest import Manifest
@@ -377,7 +378,7 @@ def test_a_build_with_the_setting_stores_what_verify_accepts() -> None:
         np.testing.assert_array_equal(back.radiance_rgb, sample.radiance_rgb)
 
 
-def _tracer(scene: Scene, *, bounces: bool, lobes: bool, max_depth: int = 10) -> Tracer:
+def _tracer(scene: Scene, *, bounces: bool, lobes: bool, max_depth: int = 10) -> VectorTracer:
     tracer = load_tracer(scene, max_depth=max_depth, rr_depth=2)
     return tracer.split_lights(bounces=bounces, lobes=lobes)
 
