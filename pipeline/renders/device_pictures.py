@@ -357,27 +357,16 @@ def denoise_arrays(
     return outputs
 
 
-class _DLTensor(ctypes.Structure):
-    """The head of DLPack's structure of that name."""
-
-    _fields_ = (
-        ("data", ctypes.c_void_p),
-        ("device", ctypes.c_int32 * 2),
-        ("ndim", ctypes.c_int32),
-        ("dtype", ctypes.c_uint8 * 4),
-        ("shape", ctypes.c_void_p),
-        ("strides", ctypes.c_void_p),
-        ("byte_offset", ctypes.c_uint64),
-    )
-
-
 _capsule_pointer = ctypes.pythonapi.PyCapsule_GetPointer
 _capsule_pointer.restype = ctypes.c_void_p
 _capsule_pointer.argtypes = [ctypes.py_object, ctypes.c_char_p]
 
 
 def _address(array: Any) -> int:
-    """Return where an evaluated array of Dr.Jit is, in the memory of its device."""
+    """Return where an evaluated array of Dr.Jit is, in the memory of its device.
+
+    In DLPack's structure `DLTensor` the first eight bytes are `data`, the sixth are `byte_offset`.
+    """
     capsule = array.__dlpack__()
-    tensor = _DLTensor.from_address(_capsule_pointer(capsule, b"dltensor"))
-    return int(tensor.data) + int(tensor.byte_offset)
+    words = (ctypes.c_uint64 * 6).from_address(_capsule_pointer(capsule, b"dltensor"))
+    return int(words[0]) + int(words[5])

@@ -22,7 +22,6 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from pipeline.renders.calibrated_error import first_spp
-from pipeline.renders.noise_floor import MeasuredFloor
 from pipeline.renders.pictures import Pictures
 from pipeline.renders.preview import FIRST_LOOKS_SPP, preview_steps, usual_filter
 from pipeline.renders.results import GrowingPicture, RenderedView, run_to_end
@@ -234,7 +233,18 @@ class SceneRenderer:
             expected = expected_spp(measured, goal)
             missing_db = max(gaps.values())
             if self._shows_looks:
-                yield self._growing(samples, pictures, look.floor, expected, missing_db)
+                looked_s = time.process_time()
+                radiance_rgb = self._to_stored(pictures.finish())["radiance_rgb"]
+                core_s = time.process_time() - self._began_s
+                self._began_s += time.process_time() - looked_s  # to be shown takes a view no time
+                yield GrowingPicture(
+                    spp=samples.spp,
+                    expected_spp=expected,
+                    missing_db=missing_db,
+                    radiance_rgb=radiance_rgb,
+                    floor=look.floor,
+                    core_s=core_s,
+                )
             if expected >= _GUIDED_SPP:
                 samples.guide()
             spp = next_spp(measured, goal)
@@ -242,27 +252,6 @@ class SceneRenderer:
             passes = samples.passes_to(spp) if chosen is None else samples.passes_over(chosen)
             for _ in passes:
                 yield Sampling(spp=samples.spp, expected_spp=expected, missing_db=missing_db)
-
-    def _growing(
-        self,
-        samples: DualBuffer,
-        pictures: Pictures,
-        floor: MeasuredFloor,
-        expected_spp: int,
-        missing_db: float,
-    ) -> GrowingPicture:
-        looked_s = time.process_time()
-        picture = self._to_stored(pictures.finish())["radiance_rgb"]
-        core_s = time.process_time() - self._began_s
-        self._began_s += time.process_time() - looked_s  # the view takes no time by being shown
-        return GrowingPicture(
-            spp=samples.spp,
-            expected_spp=expected_spp,
-            missing_db=missing_db,
-            radiance_rgb=picture,
-            floor=floor,
-            core_s=core_s,
-        )
 
 
 def set_threads(count: int) -> None:

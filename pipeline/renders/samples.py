@@ -78,14 +78,11 @@ class DualBuffer:
     def count_over(self, counted: NDArray[np.bool_]) -> None:
         """Let `spp` be a mean over some pixels, [R, R], from now on; before, it is over all."""
         self._counted = counted
-        self._mean_spp: int | None = None
 
     @property
     def spp(self) -> int:
         """Samples per pixel so far, both halves together: the mean over the counted pixels."""
-        if self._mean_spp is None:
-            self._mean_spp = int(self._spp.sum(axis=0).mean(where=self._counted))
-        return self._mean_spp
+        return int(self._spp.sum(axis=0).mean(where=self._counted))
 
     def spp_of(self, half: int) -> NDArray[np.int64]:
         """Return the samples of each pixel in one half, [R, R]."""
@@ -140,7 +137,6 @@ class DualBuffer:
             tracer.add(seed=seed, spp=size, chosen=chosen, light_seed=light_seed)
         self._spp[half] += size if chosen is None else size * chosen
         self._count[half] += 1 if chosen is None else chosen
-        self._mean_spp = None
 
     def guide(self) -> None:
         """Let the passes from now on be guided (pipeline.renders.guide_table)."""
