@@ -26,9 +26,6 @@ from storage.records.scene import Scene
 from tests.for_each import case
 from tests.pipeline.renders.sampling import camera_of
 from tests.pipeline.renders.scene_kit import (
-    GUIDED_FLOOR,
-    GUIDED_LAMP,
-    GUIDED_WALL,
     Part,
     flat,
     join,
@@ -218,41 +215,12 @@ def test_any_multiple_of_eight_is_a_resolution(
     assert decode_exr(encode_exr(view.radiance_rgb)).shape == view.radiance_rgb.shape
 
 
-METAL = material(specular=0.9, roughness=0.3)
-MATT = material(diffuse=0.6)
-ROOM = [quad(GUIDED_FLOOR, MATT), quad(GUIDED_WALL, METAL), sphere([0, 0.2, 0.4], 0.3, METAL, 6)]
-
-
-def _seen(parts: list[Part]) -> Scene:
-    return join(parts, eye=(0.3, -2.4, 1.0), target=(0, 0.6, 0.4), fov_deg=50)
-
-
-def _hundred_lamps() -> Scene:
-    rng = np.random.default_rng(1)
-    lamps = [
-        light(
-            np.array(GUIDED_LAMP) * 0.2 + [*rng.uniform(-1.2, 1.2, 2), 1.2], rng.exponential(30.0)
-        )
-        for _ in range(100)
-    ]
-    return _seen([*ROOM, *lamps])
-
-
-def _lamp_that_fills_the_view() -> Scene:
-    """Between the camera and all surfaces, larger than the view; emitters are not seen."""
-    sheet = [[-4, -2.0, -3], [4, -2.0, -3], [0, -2.0, 6]]
-    return _seen([*ROOM, light(sheet, 1.0)])
-
-
-GUIDED = {
-    "hundred lamps": _hundred_lamps(),
-    "roughness 0.01": lit_by_a_mirror(0.3, 0.01),
-    "lamp that fills the view": _lamp_that_fills_the_view(),
-}
-
-
 @pytest.mark.usefixtures("llvm")
-@pytest.mark.parametrize("scene", GUIDED.values(), ids=GUIDED.keys())
+@pytest.mark.parametrize(
+    "scene",
+    [lit_by_a_mirror(0.3, 0.01), join(SHAPES["64 lights"]), join(SHAPES["a light far away"])],
+    ids=["roughness 0.01", "64 lights", "a light far away"],
+)
 def test_a_guided_view_is_finite(scene: Scene) -> None:
     settings = RenderSettings(
         resolution=16, noise_floor_db=90.0, min_spp=8, max_spp=512, min_mean_radiance=0.0

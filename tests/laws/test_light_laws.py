@@ -117,6 +117,7 @@ def test_an_emitter_is_hidden_from_the_camera_but_seen_in_a_mirror() -> None:
     direct, mirrored = pixel([0, 1, 0.9]), pixel([0, 1, -0.9])
     np.testing.assert_array_equal(picture[direct], 0)
     assert not tracer.hits(camera)[direct]
+    np.testing.assert_array_equal(tracer.features(camera, spp=16).albedo[direct], 0)
     # A mirror of roughness 0.01 loses nothing and blurs by 1e-4: the panel shows as it is.
     np.testing.assert_allclose(picture[mirrored], radiance, rtol=5e-3)
 

@@ -2,7 +2,6 @@
 
 import dataclasses
 import tracemalloc
-from pathlib import Path
 from typing import Any
 
 import mitsuba as mi
@@ -16,13 +15,7 @@ from pipeline.renders.sky_table import SkyTable, alias_rows, peaked_radiance, sk
 from pipeline.renders.surface_table import KernelTextures
 from pipeline.renders.tracer import load_tracer
 from pipeline.renders.vector_tracer import VectorTracer
-from pipeline.scenes.pieces import apply_skin, concatenate_pieces, emitter_piece, object_piece
-from pipeline.scenes.source_materials import source_skins
-from pipeline.scenes.triangle_budget import PooledAsset
-from scene_templates.layout import Emitter
 from scene_templates.rotations import uniform_rotation
-from scene_templates.sample_material import MaterialSettings
-from storage.conventions import look_at_c2w
 from storage.errors import TrilightError
 from storage.raycast.first_hits import first_hits
 from storage.records.environment import Environment, row_solid_angles
@@ -36,19 +29,8 @@ from storage.records.lookup import (
     u_directions,
 )
 from storage.records.passes.pictures import view_passes
-from storage.records.retextured import without_constant_textures
-from storage.records.scene import Scene, SceneObject
+from storage.records.scene import Scene
 from storage.records.texture import MAX_SIDE, Texture
-from storage.seeds import SceneKey
-from tests.pipeline.assets.meshes_by_hand import prepare
-from tests.pipeline.assets.source_materials.textured_kit import CORNERS as PICTURE_CORNERS
-from tests.pipeline.assets.source_materials.textured_kit import (
-    KEEP,
-    QUARTERS,
-    picture_bytes,
-    textured_glb,
-    textured_obj,
-)
 from tests.pipeline.renders.sampling import (
     assert_same_light,
     camera_of,
@@ -69,7 +51,6 @@ from tests.pipeline.renders.scene_kit import (
     textured,
     textured_floor,
 )
-from tests.pipeline.scenes.small_pool import LOOK, small_pool
 from tests.rigid_motion import moved
 from tests.sky_maps import as_sky, constant, night, one_sun, six_poles, smooth
 from tests.textured_by_hand import bumps
@@ -178,49 +159,6 @@ def test_maps_that_break_a_law_never_reach_a_kernel() -> None:
         for scene, name in ((below, "environment.radiance_rgb"), (wrong, "textures")):
             with pytest.raises(TrilightError, match=name):
                 render(scene, resolution=16, max_spp=8)
-
-
-def test_a_traced_picture_has_the_colours_in_their_corners(tmp_path: Path) -> None:
-    """From a file to a picture: red at the lower left, as its picture has it."""
-    data = picture_bytes(PICTURE_CORNERS)
-    for path in (
-        textured_glb(tmp_path / "a.glb", data),
-        textured_obj(tmp_path / "o" / "a.obj", data),
-    ):
-        _require_colours_in_corners(path)
-
-
-def _require_colours_in_corners(path: Path) -> None:
-    entry = PooledAsset(locked=small_pool()[0].locked, asset=prepare(path, KEEP))
-    (level, *_) = entry.asset.levels
-    (skin,) = source_skins([entry], [level], MaterialSettings(source="object"), SceneKey(0, 0))
-    assert skin is not None
-    named, rng = SceneObject(name="square", kind="object"), np.random.default_rng(0)
-    square = object_piece(named, level.positions, level.faces, LOOK, rng, 30.0)
-    square = apply_skin(square, level.positions, level.faces, skin)
-    triangle = np.array([[-1, -3, 2], [1, -3, 2], [0, -3, 3.0]])
-    lamp = emitter_piece(
-        Emitter(triangle=triangle, radiance_rgb=(9.0, 9.0, 9.0), reflectance=0.0), 0
-    )
-    pose = look_at_c2w(eye=[0, -2, 0], target=[0, 0, 0], up=[0, 0, 1])
-    scene = without_constant_textures(
-        Scene(
-            **concatenate_pieces([square, lamp]),
-            c2w=pose[None].astype(np.float32),
-            fov_deg=np.array([30], np.float32),
-            objects=(square.entry, lamp.entry),
-            provenance={"template": "none"},
-        )
-    )
-    scene.check()
-    assert len(scene.textures) == 1  # specular and roughness are constants
-    tracer = load_tracer(scene, max_depth=2, rr_depth=5)
-    picture = tracer.radiance(camera_of(scene, 32), spp=64, seed=0)
-    centre, width = 16, 32 / (2 * 2 * np.tan(np.radians(15)))  # pixels for each metre
-    for (right, up), colour in QUARTERS.items():
-        seen = picture[int(centre - up * width), int(centre + right * width)]
-        lit = np.array(colour) > 0
-        assert seen[lit].min() > 4 * seen[~lit].max(initial=0), (right, up, seen)
 
 
 def _tracer(scene: Scene) -> VectorTracer:
