@@ -20,8 +20,8 @@ from pipeline.renders.device_memory import KernelInputs, read_back, record_launc
 from pipeline.renders.pictures import (
     TILE,
     LookNumbers,
-    Pictures,
     Sums,
+    ViewPictures,
     broken_pixels,
     finish_pictures,
     half_means,
@@ -185,8 +185,8 @@ def channel_sum(color: Any) -> Any:
     return color.x + color.y + color.z
 
 
-class DevicePictures(Pictures):
-    """See `Pictures` for the meaning of its methods."""
+class DevicePictures(ViewPictures):
+    """See `ViewPictures` for the meaning of its methods."""
 
     def _trace_guides(
         self, tracer: VectorTracer, camera: PixelCamera

@@ -176,9 +176,9 @@ def vertex_at(
 def face_viewer(
     scene: KernelScene, vertex: Vertex, active: Any, *directions: Any
 ) -> tuple[Vertex, tuple[Any, ...]]:
-    """Return a vertex as the viewer at `incoming` has it, and other directions in its frame.
+    """Return a vertex as seen from `incoming`, and other directions in its frame.
 
-    Its lobes are scaled for the viewer (`ggx.seen_from`), whom its mapped normal faces.
+    Its lobes are scaled for that direction (`ggx.seen_from`), which its mapped normal faces.
     A mapped normal that turns away from a viewer is mirrored at the unmapped one, as by Mitsuba's
     `normalmap`: a half turn about that normal maps one frame to the other. Where the scene has no
     normal map, all stays.

@@ -1,4 +1,4 @@
-"""`Pictures`: what the samples of a view show and how far it is from the truth, as they grow.
+"""`ViewPictures`: what the samples of a view show and how far it is from the truth, as they grow.
 
 Here they are worked out in numpy, on sums that are read back. Sets choose it by their render
 settings (`arithmetic`); all others take pipeline.renders.device_pictures, of which this is the
@@ -378,7 +378,7 @@ NUMPY = Pixels()
 
 
 def read_sums(samples: DualBuffer, *, squares: bool = False) -> Sums:
-    """Return the sums of a view, with their squares or 0; raises Rejected as `Pictures.look`."""
+    """Return the sums of a view, with their squares or 0; raises as `ViewPictures.look`."""
     shape = samples.spp_of(0).shape
     sums = [
         [
@@ -405,7 +405,7 @@ def add_numbers(
     )
 
 
-class Pictures:
+class ViewPictures:
     """The pictures of one view, of samples that grow.
 
     There are P of them, of lights and of their parts: all parts of the first light come first.

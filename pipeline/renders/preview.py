@@ -16,9 +16,9 @@ from numpy.typing import ArrayLike, NDArray
 
 from pipeline.renders.settings import PASS_SPP, Depth, Filtered, RenderSettings, Resolution
 from pipeline.renders.tracer import PixelCamera, load_tracer, pixel_camera
-from pipeline.renders.view_pictures import representable, require_bounded
+from pipeline.renders.view_pictures import representable, require_bounded, require_finite
 from storage.denoiser import Features, Quality, denoise
-from storage.errors import Rejected, TrilightError
+from storage.errors import TrilightError
 from storage.records.scene import Scene
 from storage.renderer import Sampling
 from storage.seeds import seed_for
@@ -115,9 +115,7 @@ def preview_steps(
         done += size
         yield Sampling(spp=done, expected_spp=spp, missing_db=None)
     mean = (total / done).astype(np.float32)
-    if not np.isfinite(mean).all():
-        broken = int((~np.isfinite(mean)).any(axis=-1).sum())
-        raise Rejected("nonfinite_radiance", f"{broken} pixels of raw samples")
+    require_finite(int((~np.isfinite(mean)).any(axis=-1).sum()))
     require_bounded(float(mean.max()))
     if denoiser != "off":
         mean = denoise(mean, tracer.features(camera, spp=guide_rays(done)), denoiser)

@@ -22,7 +22,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from pipeline.renders.calibrated_error import first_spp
-from pipeline.renders.pictures import Pictures
+from pipeline.renders.pictures import ViewPictures
 from pipeline.renders.preview import FIRST_LOOKS_SPP, preview_steps, usual_filter
 from pipeline.renders.results import GrowingPicture, RenderedView, run_to_end
 from pipeline.renders.samples import (
@@ -96,7 +96,7 @@ class SceneRenderer:
                 bounces=settings.split, lobes=settings.split_lobes
             )
         self._tracers = [self.tracer]
-        self._arithmetic: Any = Pictures
+        self._arithmetic: Any = ViewPictures
         if settings.arithmetic == "device":
             from pipeline.renders.device_pictures import DevicePictures  # imports mitsuba
 
@@ -165,7 +165,7 @@ class SceneRenderer:
             raise Rejected("black_view", f"mean radiance {mean:.2g} is below {bound:.2g}")
         for _ in samples.passes_to(settled):
             yield Sampling(spp=samples.spp, expected_spp=settled, missing_db=None)
-        pictures: Pictures = self._arithmetic(samples, self.tracer, camera, settings)
+        pictures: ViewPictures = self._arithmetic(samples, self.tracer, camera, settings)
         if not self._sees_sky:
             samples.count_over(pictures.visible)
         look = yield from self._render_until_targets(samples, pictures)
@@ -212,7 +212,7 @@ class SceneRenderer:
         }
 
     def _render_until_targets(
-        self, samples: DualBuffer, pictures: Pictures
+        self, samples: DualBuffer, pictures: ViewPictures
     ) -> Generator[Sampling, None, MeasuredLook]:
         targets_db = self._settings.targets_db
         max_spp = self._settings.max_spp

@@ -208,10 +208,10 @@ class VectorTracer:
         the same; what lands in other pixels is dropped. In proportion to the chosen pixels they
         saved 10 to 25 % of the time and lost 0.7 to 1.0 dB in hard views.
         """
-        numbers, count = self._numbers(camera, seed, spp)
+        numbers = _PassNumbers(camera, seed, spp, self._light_paths)
         light = self._light(camera, light_seed, spp)
         inputs = KernelInputs(self._scene, film, self._parts, light, numbers)
-        return inputs, pixels, camera.resolution, spp, count
+        return inputs, pixels, camera.resolution, spp
 
     def _light(self, camera: PixelCamera, seed: int | None, spp: int) -> Any:
         """Return the light (Color3f) of each lobe that paths of a seed throw on a whole picture.
@@ -222,18 +222,13 @@ class VectorTracer:
             return self._unit
 
         def land_on(cameras: Sequence[PixelCamera]) -> list[list[Any]]:
-            numbers, count = self._numbers(camera, seed, spp)
+            numbers = _PassNumbers(camera, seed, spp, self._light_paths)
             films = [self._film(each) for each in cameras]
             inputs = KernelInputs(self._scene, films, self._parts, self._unit, numbers)
-            landed: list[list[Any]] = _land(inputs, camera.resolution, count)
+            landed: list[list[Any]] = _land(inputs, camera.resolution)
             return landed
 
         return self._landed.take(camera, (seed, spp, self._scene.guide is not None), land_on)
-
-    def _numbers(self, camera: PixelCamera, seed: int, spp: int) -> tuple["_PassNumbers", int]:
-        """Return the numbers of a pass, and how many light paths it has."""
-        count = int(LIGHT_PATHS * camera.resolution**2 * spp)
-        return _PassNumbers(seed, self._light_paths * camera.resolution**2, count), count
 
     def features(self, camera: PixelCamera, *, spp: int) -> Features:
         """Return the albedo and normal pictures, of `spp` evenly spread rays in each pixel."""
@@ -269,15 +264,18 @@ def _changed(loaded: _Loaded, **fields: Any) -> _Loaded:
 class _PassNumbers:
     """The numbers of a pass, as kernels read them: seeds, and how many light paths there are."""
 
-    def __init__(self, seed: int, light_paths: float, count: int) -> None:
+    def __init__(self, camera: PixelCamera, seed: int, spp: int, light_paths: float) -> None:
+        """Take the numbers of a seed; weights have `light_paths` for each camera path."""
+        light_paths *= camera.resolution**2
+        self.count = int(LIGHT_PATHS * camera.resolution**2 * spp)
         self.camera_seed = dr.opaque(mi.UInt32, seed)
         self.light_seed = dr.opaque(mi.UInt32, seed_for(seed, "light paths"))
         self.shifts = even_shifts(seed)
         self.light_paths = dr.opaque(mi.Float, light_paths)
-        self.share = dr.opaque(mi.Float64, light_paths / count)
+        self.share = dr.opaque(mi.Float64, light_paths / self.count)
 
 
-def _traced(objects: Any, pixels: Any, resolution: int, spp: int, count: int) -> list[Any]:
+def _traced(objects: Any, pixels: Any, resolution: int, spp: int) -> list[Any]:
     """Return the means of some pixels (Color3f) of each part.
 
     Light of whole pictures that was traced before (Color3f) is added to what camera paths find.
@@ -295,17 +293,17 @@ def _traced(objects: Any, pixels: Any, resolution: int, spp: int, count: int) ->
     dr.eval(traced)  # all parts in one kernel
     means = [_pixel_means(spp, part) for part in traced]
     if not isinstance(light, list):
-        (light,) = land((scene, [film], parts, light, numbers), resolution, count)
+        (light,) = land((scene, [film], parts, light, numbers), resolution)
     gathered = [dr.gather(mi.Color3f, each, pixels) for each in light]
     return [part + each for part, each in zip(means, parts.of_indirect(gathered), strict=True)]
 
 
-def land(objects: Any, resolution: int, count: int) -> list[list[Any]]:
-    """Return the light (Color3f) of each lobe that `count` light paths throw on each picture."""
+def land(objects: Any, resolution: int) -> list[list[Any]]:
+    """Return the light (Color3f) of each lobe that light paths throw on each picture."""
     scene, films, parts, unit, numbers = objects
     splats = [[Splats(resolution, unit) for _ in range(parts.num_lobes)] for _ in films]
     record = CameraJoin(films, parts, numbers.light_paths, splats)
-    _trace_light_paths(scene, numbers.light_seed, numbers.shifts, count, record)
+    _trace_light_paths(scene, numbers.light_seed, numbers.shifts, numbers.count, record)
     return [
         [mi.Color3f(total.picture() * numbers.share) for total in of_film] for of_film in splats
     ]
@@ -325,13 +323,9 @@ _means = record_launches(_traced)
 
 
 @record_launches
-def _sums(
-    objects: Any, pixels: Any, resolution: int, spp: int, count: int, sums: list[Any]
-) -> list[Any]:
+def _sums(objects: Any, pixels: Any, resolution: int, spp: int, sums: list[Any]) -> list[Any]:
     """Return the sums with those of a pass."""
-    means: list[Any] = [
-        mi.Color3d(part) for part in _traced(objects, pixels, resolution, spp, count)
-    ]
+    means: list[Any] = [mi.Color3d(part) for part in _traced(objects, pixels, resolution, spp)]
     mean: Any = sum(means)
     square = dr.square((mean.x + mean.y + mean.z) / 3)
     new = [*(part * spp for part in means), square * spp, mi.Float64(spp), mi.Float64(1)]

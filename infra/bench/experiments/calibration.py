@@ -28,7 +28,7 @@ from pipeline.objects.generated import BENCHMARK, PREFIX
 from pipeline.presets.training import smoke
 from pipeline.renders.calibrated_error import MEASURES, METRICS, versions_of_pictures
 from pipeline.renders.noise_floor import Curve, clamped_radiance
-from pipeline.renders.pictures import Pictures
+from pipeline.renders.pictures import ViewPictures
 from pipeline.renders.renderer import SceneRenderer
 from pipeline.renders.settings import Filtered, RenderSettings
 from pipeline.renders.view_pictures import MeasuredLook
@@ -82,10 +82,10 @@ class _RecordingRenderer(SceneRenderer):
     ) -> None:
         super().__init__(scene, settings)
         self._arithmetic = functools.partial(_RecordingPictures, reference, looks)
-        self._arithmetic.mean_radiance = Pictures.mean_radiance
+        self._arithmetic.mean_radiance = ViewPictures.mean_radiance
 
 
-class _RecordingPictures(Pictures):
+class _RecordingPictures(ViewPictures):
     """Pictures in numpy that append the figures of each look to a list."""
 
     def __init__(self, reference: RawReference, looks: list[dict[str, float]], *rest: Any) -> None:
