@@ -73,31 +73,6 @@ class KernelScene:
         return pdf if self.sky is None else self.sky.of_lamps(pdf)
 
 
-def build_mitsuba_mesh(
-    name: str, counts: tuple[int, int], properties: Any = None, **fields: Any
-) -> Any:
-    """Return a Mitsuba mesh; nothing else knows its constructor, which Mitsuba 3.10 changes.
-
-    Args:
-        counts: vertices and faces.
-        properties: a mi.Properties with BSDF and emitter, if any.
-        fields: flat arrays `faces`, `vertex_positions`, `vertex_normals`, `vertex_texcoords`; the
-            mesh has the last two where they are given.
-    """
-    mesh = mi.Mesh(
-        name,
-        *counts,
-        props=mi.Properties() if properties is None else properties,
-        has_vertex_normals="vertex_normals" in fields,
-        has_vertex_texcoords="vertex_texcoords" in fields,
-    )
-    parameters = mi.traverse(mesh)
-    for field, values in fields.items():
-        parameters[field] = values
-    parameters.update()
-    return mesh
-
-
 def build_mitsuba_scene(scene: Scene, triangles: NDArray[np.intp], child: Any = None) -> Any:
     """Return a Mitsuba scene of one mesh, whose triangle numbers are positions in `triangles`.
 
@@ -107,12 +82,11 @@ def build_mitsuba_scene(scene: Scene, triangles: NDArray[np.intp], child: Any = 
     kernel use one OptiX shader binding table, and miss whatever is in another table. A scene that
     has another scene as a child shares its table.
     """
-    mesh = build_mitsuba_mesh(
-        "triangles",
-        (len(scene.vertex_positions), len(triangles)),
-        faces=own_integers(scene.faces[triangles]),
-        vertex_positions=own_floats(scene.vertex_positions),
-    )
+    mesh = mi.Mesh("triangles", len(scene.vertex_positions), len(triangles))
+    parameters = mi.traverse(mesh)
+    parameters["faces"] = own_integers(scene.faces[triangles])
+    parameters["vertex_positions"] = own_floats(scene.vertex_positions)
+    parameters.update()
     children = {"mesh": mesh} if child is None else {"mesh": mesh, "beside": child}
     return mi.load_dict({"type": "scene", **children})
 

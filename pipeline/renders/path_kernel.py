@@ -245,14 +245,14 @@ def picked_light(scene: KernelScene, position: Any, u: Any, active: Any) -> Pick
         return _of_lamps(scene, position, u, active)
     is_sky, u_sky, u_lamp = scene.sky.split_picks(u)
     lamp = _of_lamps(scene, position, u_lamp, active & ~is_sky)
-    sky = scene.sky.sample(u_sky, active & is_sky)
+    direction, pdf, radiance = scene.sky.sample(u_sky, active & is_sky)
     # A light path leaves a lamp with its density among lamps; picks have only their share of it.
     leaving = lamp.leaving / dr.maximum(scene.to_pick_pdf(mi.Float(1)), _LEAST_SHARE)
     return replace(
         lamp,
-        direction=mi.Vector3f(dr.select(is_sky, sky.direction, lamp.direction)),
-        pdf=dr.select(is_sky, sky.pdf, scene.to_pick_pdf(lamp.pdf)),
-        radiance=mi.Color3f(dr.select(is_sky, sky.radiance, lamp.radiance)),
+        direction=mi.Vector3f(dr.select(is_sky, direction, lamp.direction)),
+        pdf=dr.select(is_sky, pdf, scene.to_pick_pdf(lamp.pdf)),
+        radiance=mi.Color3f(dr.select(is_sky, radiance, lamp.radiance)),
         leaving=dr.select(is_sky, 0, leaving),
         distance_sq=dr.select(is_sky, 1, lamp.distance_sq),
         is_sky=is_sky,

@@ -176,14 +176,14 @@ def _mesh(scene: Scene, triangles: NDArray[np.intp], material: Any) -> Any:
 
 
 def _build_mesh(name: str, faces: NDArray[Any], properties: Any, **rows: NDArray[Any]) -> Any:
-    # its types are those of the variant
-    from pipeline.renders.kernel_scene import build_mitsuba_mesh
-
-    flat: dict[str, Any] = {
-        f"vertex_{field}": each.astype(np.float32).ravel() for field, each in rows.items()
-    }
-    flat["faces"] = faces.astype(np.uint32).ravel()
-    return build_mitsuba_mesh(name, (len(rows["positions"]), len(faces)), properties, **flat)
+    has = {f"has_vertex_{field}": field in rows for field in ("normals", "texcoords")}
+    mesh = mi.Mesh(name, len(rows["positions"]), len(faces), props=properties, **has)
+    parameters = mi.traverse(mesh)
+    for field, each in rows.items():
+        parameters[f"vertex_{field}"] = each.astype(np.float32).ravel()
+    parameters["faces"] = faces.astype(np.uint32).ravel()
+    parameters.update()
+    return mesh
 
 
 def _two_sided(material: dict[str, Any]) -> Any:
