@@ -208,7 +208,7 @@ class DevicePictures(ViewPictures):
         return float(total) / (3 * resolution**2)
 
     def finish(self) -> NDArray[np.float32]:
-        pictures = read_back(self._finished())
+        pictures = read_back(self._make_pictures())
         return pictures.reshape(-1, self._resolution, self._resolution, 3)
 
     def _begin_look(self) -> None:

@@ -462,7 +462,7 @@ class ViewPictures:
             floors = floors_of(numbers, self._counts)
             if statement is None or is_far(floors[0], self._settings, self._samples.spp):
                 return self._look(numbers, floors, None)
-        numbers = self._numbers(self._finished())
+        numbers = self._numbers(self._make_pictures())
         resolution = len(self.hits)
         floor, expected = statement.state(self._measures(numbers), resolution, self._samples.spp)
         return self._look(numbers, [floor], expected)
@@ -493,9 +493,9 @@ class ViewPictures:
 
     def finish(self) -> NDArray[np.float32]:
         """Return the pictures of all samples of the last look, [P, R, R, 3]."""
-        return np.stack(self._finished())
+        return np.stack(self._make_pictures())
 
-    def _finished(self) -> Any:
+    def _make_pictures(self) -> Any:
         """Return the pictures of `finish` where they are worked out, once for a look."""
         if self._picture is None:
             filtered = self._denoise_raws(self._settings.denoiser, of_both=True)

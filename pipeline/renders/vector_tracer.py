@@ -139,7 +139,7 @@ class VectorTracer:
         sky = shining_sky(self._record) if row is None else None
         table = EmitterTable(self._record, emitters, lit, may_be_dark=sky is not None)
         light = {"emitters": table, "sky": None if sky is None else SkyTable(sky, 1.0)}
-        return _changed(self, _scene=_changed(self._scene, **light))
+        return _with_fields(self, _scene=_with_fields(self._scene, **light))
 
     def split_lights(self, *, bounces: bool, lobes: bool) -> "VectorTracer":
         """Return the same loaded scene, whose sums of passes are by part.
@@ -148,7 +148,7 @@ class VectorTracer:
             bounces: keep direct and indirect light apart.
             lobes: keep the diffuse and the specular lobe of the visible surface apart.
         """
-        return _changed(self, _parts=KernelParts(bounces=bounces, lobes=lobes))
+        return _with_fields(self, _parts=KernelParts(bounces=bounces, lobes=lobes))
 
     def for_views(self, cameras: Sequence[PixelCamera]) -> "VectorTracer":
         """Return the same loaded scene, which traces light paths of one seed once for all views.
@@ -156,7 +156,7 @@ class VectorTracer:
         Args:
             cameras: of the views, in the order in which they will be asked for.
         """
-        return _changed(self, _landed=LandedLight(cameras))
+        return _with_fields(self, _landed=LandedLight(cameras))
 
     def with_guide(self) -> "VectorTracer":
         """Return the same tracer with a guide where a mirror lights rough surfaces.
@@ -164,7 +164,7 @@ class VectorTracer:
         The first call learns the scene, always the same whatever was traced before. The tracers of
         single lights use the table that was learnt with all of them.
         """
-        return _changed(self, _scene=_changed(self._scene, guide=self._guide()))
+        return _with_fields(self, _scene=_with_fields(self._scene, guide=self._guide()))
 
     def radiance(
         self, camera: PixelCamera, *, seed: int, spp: int, chosen: Chosen = None
@@ -202,7 +202,7 @@ class VectorTracer:
         spp: int,
         light_seed: int | None = None,
     ) -> tuple[Any, ...]:
-        """Return the arguments of `_traced` for a pass.
+        """Return the arguments of `_trace_pass` for a pass.
 
         Light paths are as many as for the whole picture, so that the weights of the strategies stay
         the same; what lands in other pixels is dropped. In proportion to the chosen pixels they
@@ -254,7 +254,7 @@ class VectorTracer:
         return _hits(KernelInputs(self._scene, self._film(camera)), camera.resolution)
 
 
-def _changed(loaded: _Loaded, **fields: Any) -> _Loaded:
+def _with_fields(loaded: _Loaded, **fields: Any) -> _Loaded:
     """Return a shallow copy with other values of some fields."""
     copied = copy.copy(loaded)
     vars(copied).update(fields)
@@ -275,7 +275,7 @@ class _PassNumbers:
         self.share = dr.opaque(mi.Float64, light_paths / self.count)
 
 
-def _traced(objects: Any, pixels: Any, resolution: int, spp: int) -> list[Any]:
+def _trace_pass(objects: Any, pixels: Any, resolution: int, spp: int) -> list[Any]:
     """Return the means of some pixels (Color3f) of each part.
 
     Light of whole pictures that was traced before (Color3f) is added to what camera paths find.
@@ -319,13 +319,13 @@ def _trace_light_paths(scene: Any, seed: Any, shifts: list[Any], count: int, rec
 
 
 _land = record_launches(land)
-_means = record_launches(_traced)
+_means = record_launches(_trace_pass)
 
 
 @record_launches
 def _sums(objects: Any, pixels: Any, resolution: int, spp: int, sums: list[Any]) -> list[Any]:
     """Return the sums with those of a pass."""
-    means: list[Any] = [mi.Color3d(part) for part in _traced(objects, pixels, resolution, spp)]
+    means: list[Any] = [mi.Color3d(part) for part in _trace_pass(objects, pixels, resolution, spp)]
     mean: Any = sum(means)
     square = dr.square((mean.x + mean.y + mean.z) / 3)
     new = [*(part * spp for part in means), square * spp, mi.Float64(spp), mi.Float64(1)]
