@@ -193,8 +193,8 @@ class DevicePictures(ViewPictures):
     ) -> tuple[NDArray[np.bool_], NDArray[np.bool_]]:
         self._resolution = camera.resolution
         arrays = tracer.feature_arrays(camera, spp=self._settings.aux_spp)
-        hits, names = tracer.hit_array(camera), self._names or ("",)
-        kind = names, camera.resolution
+        hits = tracer.hit_array(camera)
+        kind = self._names or ("",), camera.resolution
         self._guides, self._masks = _guides(KernelInputs(), arrays, hits, *kind)
         self._logs = [dr.opaque(mi.Color3d, 0, camera.resolution**2) for _ in range(2)]
         bits = read_back(self._masks).reshape(camera.resolution, camera.resolution)

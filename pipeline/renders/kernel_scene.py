@@ -183,14 +183,14 @@ def _turn_to_viewer(
     return faced, tuple(map(turn, directions))
 
 
-def hit_of(found: Any) -> tuple[Hit, Any]:
+def hit_of(intersection: Any) -> tuple[Hit, Any]:
     """Return what rays meet by a PreliminaryIntersection3f, and whether they meet anything."""
     hit = Hit(
-        distance=mi.Float(found.t),
-        triangle=mi.UInt32(found.prim_index),
-        barycentric=mi.Point2f(found.prim_uv),
+        distance=mi.Float(intersection.t),
+        triangle=mi.UInt32(intersection.prim_index),
+        barycentric=mi.Point2f(intersection.prim_uv),
     )
-    return hit, found.is_valid()
+    return hit, intersection.is_valid()
 
 
 def off_surface(point: SurfacePoint, direction: Any) -> Any:

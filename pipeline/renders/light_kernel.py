@@ -63,7 +63,7 @@ from pipeline.renders.kernel_scene import (
 from pipeline.renders.surface_table import SurfacePoint
 
 
-@dataclass(frozen=True, kw_only=True, eq=False)
+@dataclass(frozen=True, eq=False)
 class Arrival:
     """Light that arrives at a vertex of a light path, lane by lane."""
 
@@ -121,18 +121,9 @@ def trace_light(
         throughput = throughput / spread
         hit_mis_ratio = hit_mis_ratio / spread
         pick_mis_ratio = pick_mis_ratio / spread
-        arrival = Arrival(
-            vertex=vertex,
-            direction=direction,
-            power=power,
-            light=throughput * strength,
-            hit_mis_ratio=hit_mis_ratio,
-            pick_mis_ratio=pick_mis_ratio,
-            drawn=drawn,
-            depth=depth,
-            active=active,
-        )
-        record(scene, arrival)
+        light = throughput * strength
+        ratios = hit_mis_ratio, pick_mis_ratio
+        record(scene, Arrival(vertex, direction, power, light, *ratios, drawn, depth, active))
         depth += 1
         active &= depth < scene.max_depth
         u_lobe = sampler.next_1d(active)

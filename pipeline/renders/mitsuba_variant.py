@@ -282,8 +282,8 @@ def llvm_libraries() -> list[Path]:
     Symbolic links are resolved, so that one library is named once.
     """
     named = os.environ.get("DRJIT_LIBLLVM_PATH")
-    found = {path.resolve() for path in _in_usual_folders()}
-    ordered = sorted(found, key=lambda path: (-_version_in_name(path), str(path)))
+    candidates = {path.resolve() for path in _in_usual_folders()}
+    ordered = sorted(candidates, key=lambda path: (-_version_in_name(path), str(path)))
     first = [Path(named).resolve()] if named else []
     return [path for path in dict.fromkeys([*first, *_of_wheel(), *ordered]) if path.is_file()]
 

@@ -241,8 +241,8 @@ def finish_pictures(
     if len(sums[0]) > 1:  # passes of several tracers are not added: no error tells what is right
         return pictures
     mask = converged_mask(pictures, raws[0], squared_error(sums, pixels), pixels)
-    kept = keep(mask, raws[0], pictures, pixels)
-    return pixels.with_means(list(zip(kept, raws[0], strict=True)))
+    corrected = keep(mask, raws[0], pictures, pixels)
+    return pixels.with_means(list(zip(corrected, raws[0], strict=True)))
 
 
 def measure_pixels(
@@ -297,9 +297,8 @@ def measure_pixels(
 
 def join_halves(a: Any, b: Any, denoised_a: Any, denoised_b: Any, pixels: Pixels) -> Halves:
     """Return both halves of a picture, raw and denoised, in double precision."""
-    a, b = pixels.double(a), pixels.double(b)
-    difference = pixels.difference(denoised_a, denoised_b)
-    return Halves(a, b, pixels.double(denoised_a), pixels.double(denoised_b), difference)
+    doubles = [pixels.double(each) for each in (a, b, denoised_a, denoised_b)]
+    return Halves._make([*doubles, pixels.difference(denoised_a, denoised_b)])
 
 
 def estimates(halves: Halves, hit: Any, pixels: Pixels, is_filtered: bool) -> list[tuple[Any, Any]]:

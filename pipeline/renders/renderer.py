@@ -35,7 +35,7 @@ from pipeline.renders.samples import (
     next_spp,
 )
 from pipeline.renders.settings import RenderSettings
-from pipeline.renders.tracer import load_tracer, pixel_camera
+from pipeline.renders.tracer import PixelCamera, load_tracer, pixel_camera
 from pipeline.renders.view_pictures import MeasuredLook, representable
 from storage.denoiser import set_denoiser_threads
 from storage.errors import Rejected
@@ -138,16 +138,8 @@ class SceneRenderer:
         settings = self._settings
         camera = pixel_camera(c2w, fov_deg, settings.resolution)
         settled = first_spp(settings)
-        for spp in FIRST_LOOKS_SPP if self._shows_looks else ():
-            preview = run_to_end(preview_steps(self.tracer, camera, seed, spp, usual_filter(spp)))
-            yield GrowingPicture(
-                spp=preview.spp,
-                expected_spp=settled,
-                missing_db=None,
-                radiance_rgb=preview.radiance_rgb,
-                floor=None,
-                core_s=preview.core_s,
-            )
+        if self._shows_looks:
+            yield from self._first_looks(camera, seed)
         self._began_s = time.process_time()
         samples = DualBuffer(
             self._tracers,
@@ -194,6 +186,18 @@ class SceneRenderer:
             expected_error=look.expected,
             **stored,
         )
+
+    def _first_looks(self, camera: PixelCamera, seed: int) -> Iterator[GrowingPicture]:
+        for spp in FIRST_LOOKS_SPP:
+            preview = run_to_end(preview_steps(self.tracer, camera, seed, spp, usual_filter(spp)))
+            yield GrowingPicture(
+                spp=preview.spp,
+                expected_spp=first_spp(self._settings),
+                missing_db=None,
+                radiance_rgb=preview.radiance_rgb,
+                floor=None,
+                core_s=preview.core_s,
+            )
 
     def _to_stored(self, pictures: NDArray[np.float32]) -> dict[str, Any]:
         """Return the pictures of a view by their fields: the sum of what is apart, as stored."""
