@@ -16,7 +16,7 @@ from typing import Any
 from infra.render.quality import FixedSamples, ToStatedError
 from pipeline.isolation import ChildFailed, ChildLimits, IsolatedChild, Result, with_retries
 from pipeline.renders.mitsuba_variant import Variant, activate, environment
-from pipeline.renders.preview import Preview, PreviewRenderer, PreviewSettings, ProgressiveRenderer
+from pipeline.renders.preview import Preview, PreviewRenderer, PreviewSettings
 from pipeline.renders.renderer import SceneRenderer, set_threads
 from pipeline.renders.results import GrowingPicture, RenderedView
 from pipeline.renders.settings import FIRST_SPP, RenderSettings
@@ -175,7 +175,7 @@ class RenderWorker:
     def __init__(self, variant: Variant, threads: int) -> None:
         activate(variant)
         set_threads(threads)
-        self._loaded = OrderedDict[int, SceneRenderer | PreviewRenderer | ProgressiveRenderer]()
+        self._loaded = OrderedDict[int, SceneRenderer | PreviewRenderer]()
         self._steps: Iterator[Sampling | GrowingPicture | RenderedView | Preview] = iter(())
 
     def wait(self) -> None:
@@ -194,10 +194,8 @@ class RenderWorker:
         began_s = time.process_time()
         if isinstance(settings, PreviewSettings):
             self._loaded[number] = PreviewRenderer(scene, settings)
-        elif shows_looks:
-            self._loaded[number] = ProgressiveRenderer(scene, settings)
         else:
-            self._loaded[number] = SceneRenderer(scene, settings)
+            self._loaded[number] = SceneRenderer(scene, settings, shows_looks=shows_looks)
         return time.process_time() - began_s
 
     def begin_view(self, number: int, c2w: Any, fov_deg: float, seed: int) -> bool:

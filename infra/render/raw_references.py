@@ -8,6 +8,7 @@ between the picture and the mean of both halves, as in pipeline.renders.noise_fl
 """
 
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -15,7 +16,7 @@ from numpy.typing import NDArray
 from pipeline.renders.calibrated_error import LEAST_ERROR
 from pipeline.renders.noise_floor import Curve, secant_slope
 from pipeline.renders.settings import PASS_SPP, RenderSettings
-from pipeline.renders.tracer import PixelCamera, Tracer, load_tracer, pixel_camera
+from pipeline.renders.tracer import PixelCamera, load_tracer, pixel_camera
 from storage.records.lights import light_rows, num_light_pictures
 from storage.records.scene import Scene
 from storage.seeds import seed_for
@@ -57,12 +58,12 @@ def light_references(scene: Scene, camera: PixelCamera, spp: int) -> list[RawRef
     return [_reference(tracer.only_light(row), camera, spp) for row in rows]
 
 
-def _tracer(scene: Scene) -> Tracer:
+def _tracer(scene: Scene) -> Any:
     depths = {"max_depth": RenderSettings.max_depth, "rr_depth": RenderSettings.rr_depth}
     return load_tracer(scene, **depths)
 
 
-def _reference(tracer: Tracer, camera: PixelCamera, spp: int, *name: int) -> RawReference:
+def _reference(tracer: Any, camera: PixelCamera, spp: int, *name: int) -> RawReference:
     size = PASS_SPP[0]
     halves = []
     for half in range(2):

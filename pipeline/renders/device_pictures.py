@@ -1,6 +1,7 @@
 """`DevicePictures`: the arithmetic of a view as kernels, where its samples are traced.
 
-What is read back are a few numbers of each tile at each look, and the pictures once.
+What is read back are a few numbers of each tile at each look, and the pictures once. Pictures are
+Color3f, what is worked out of them is Float64, pixel by pixel.
 """
 
 import ctypes
@@ -14,219 +15,261 @@ import mitsuba as mi
 import numpy as np
 from numpy.typing import NDArray
 
-from pipeline.renders.calibrated_error import (
-    METRICS,
-    CalibratedStatement,
-    is_far,
-    measures_of_totals,
-    statement_for,
-)
-from pipeline.renders.device_memory import KernelInputs, record_launches
-from pipeline.renders.noise_floor import (
-    LINEAR_STANDARD_ERRORS,
-    ErrorMeasures,
-    MeasuredFloor,
-    estimate_noise_floor_db,
-)
-from pipeline.renders.pixel_arithmetic import (
+from pipeline.renders.calibrated_error import METRICS
+from pipeline.renders.device_memory import KernelInputs, read_back, record_launches
+from pipeline.renders.pictures import (
     TILE,
-    channel_mean,
-    channel_sum,
-    choose,
-    clean,
-    converged_mask,
-    error_measures,
-    estimates,
-    log10,
-    reduce_tiles,
-    shares_of,
-    totals,
-    where_any,
-    with_means_of,
+    LookNumbers,
+    Sums,
+    ViewPictures,
+    broken_pixels,
+    finish_pictures,
+    half_means,
+    means,
+    measure_pixels,
 )
-from pipeline.renders.samples import TILE_PX, DualBuffer, tile_means
-from pipeline.renders.settings import Filtered, RenderSettings
+from pipeline.renders.pixels import Pixels
+from pipeline.renders.samples import TILE_PX, DualBuffer
+from pipeline.renders.settings import Filtered
 from pipeline.renders.tracer import PixelCamera
+from pipeline.renders.vector_tracer import VectorTracer
 from pipeline.renders.view_pictures import (
-    LEAST_PASSES,
+    GLINT,
+    MOST_APART,
     Group,
-    MeasuredLook,
     add_up,
-    floor_groups,
-    put_together,
-    require_bounded,
     require_finite,
     to_filter,
 )
 from storage.denoiser import INPUTS, Quality, open_filter
 
-Sums = Sequence[Sequence[Sequence[Any]]]
-"""Of each half, and in it of each tracer: `DeviceSum.sums`."""
+_INV_LN_10 = 0.4342944819032518
 
 
-def read_numbers(numbers: Any) -> NDArray:
-    """Return an array of Dr.Jit as one of numpy: all that is read back of a view comes this way."""
-    return np.array(numbers)
+class KernelPixels(Pixels):
+    """Operations on Dr.Jit's arrays of the pixels of a picture.
+
+    Sums are taken over tiles of 64 pixels, then over rows of tiles: in their own order, but always
+    the same one.
+    """
+
+    select: Any = staticmethod(dr.select)
+    sqrt: Any = staticmethod(dr.sqrt)
+    maximum: Any = staticmethod(dr.maximum)
+
+    def __init__(self, resolution: int) -> None:
+        self._resolution = resolution
+
+    def single(self, color: Any) -> Any:
+        return mi.Color3f(color)
+
+    def double(self, color: Any) -> Any:
+        return mi.Color3d(color)
+
+    def log10(self, radiance: Any) -> Any:
+        return dr.log(1 + radiance) * _INV_LN_10
+
+    def clamp(self, radiance: Any) -> Any:
+        return dr.clip(radiance, 0, 1)
+
+    def channels(self, color: Any) -> Sequence[Any]:
+        return list(color)
+
+    def channel_mean(self, color: Any) -> Any:
+        return channel_sum(color) / 3
+
+    def brightest(self, color: Any) -> Any:
+        return dr.max(color)
+
+    def is_finite(self, color: Any) -> Any:
+        return dr.all(dr.isfinite(color))
+
+    def mean(self, total: Any, count: Any) -> Any:
+        return total / count
+
+    def difference(self, first: Any, second: Any) -> Any:
+        return mi.Color3d(first) - mi.Color3d(second)
+
+    def are_equal(self, first: Any, second: Any) -> bool:
+        return False
+
+    def error_around(self, squared_error: Any) -> Any:
+        dr.eval(squared_error)  # eight neighbours of each pixel read it
+        row, column = self._rows_and_columns()
+        most = self._resolution - 1
+        around = mi.Float64(0)
+        for down in (-1, 0, 1):
+            for right in (-1, 0, 1):
+                y = mi.UInt32(dr.clip(mi.Int32(row) + down, 0, most))
+                x = mi.UInt32(dr.clip(mi.Int32(column) + right, 0, most))
+                around += dr.gather(mi.Float64, squared_error, y * self._resolution + x)
+        return dr.sqrt(around / 9)
+
+    def clean(self, inputs: Any, outputs: Any, guides: Any, *, are_lights: bool) -> list[Any]:
+        cleaned = []
+        for output, (raw, name) in zip(outputs, inputs, strict=True):
+            picture = mi.Color3f(dr.unravel(mi.Color3f, output))
+            normal = dr.unravel(mi.Color3f, guides[name][1])
+            covered = dr.any(normal != 0) | dr.any(raw != 0)
+            cleaned.append(dr.select(covered, dr.maximum(picture, 0), 0))
+        if not are_lights:
+            return cleaned
+        lit = self.totals([channel_sum(mi.Color3d(raw)) for raw, _ in inputs])
+        return [
+            dr.select(dr.gather(mi.Float64, lit, row) > 0, picture, 0)
+            for row, picture in enumerate(cleaned)
+        ]
+
+    def with_means(self, pairs: Sequence[tuple[Any, Any]]) -> list[Any]:
+        bright = [self.channel_mean(denoised) > GLINT for denoised, _ in pairs]
+        values = [
+            dr.select(part, channel_sum(mi.Color3d(picture)), 0)
+            for glints, pair in zip(bright, pairs, strict=True)
+            for part in (glints, ~glints)
+            for picture in pair
+        ]
+        sums = self.totals(values)
+        pictures = []
+        for row, (glints, (denoised, _)) in enumerate(zip(bright, pairs, strict=True)):
+            is_now, was, rest_is, rest_was = (
+                dr.gather(mi.Float64, sums, 4 * row + each) for each in range(4)
+            )
+            factors = [_factor(is_now, was), _factor(rest_is, rest_was)]
+            least = dr.minimum(*factors)
+            most = dr.maximum(*factors)
+            is_extreme = (least < 1 / MOST_APART) | (most > MOST_APART)
+            common_factor = _factor(is_now + rest_is, was + rest_was)
+            factor = dr.select(is_extreme, common_factor, dr.select(glints, *factors))
+            pictures.append(mi.Color3f(mi.Color3d(denoised) * factor))
+        return pictures
+
+    def shares(self, parts: Sequence[Any]) -> list[Any]:
+        total = add_up([mi.Color3d(part) for part in parts])
+        equal = 1 / len(parts)
+        return [mi.Color3f(dr.select(total > 0, mi.Color3d(part) / total, equal)) for part in parts]
+
+    def tile_sums(self, values: Sequence[Any]) -> Sequence[Any]:
+        count = self._resolution**2 // TILE
+        tiles = self.reduce_tiles(values, dr.ReduceOp.Add)
+        tile = dr.arange(mi.UInt32, count)
+        return [dr.gather(mi.Float64, tiles, tile + row * count) for row in range(len(values))]
+
+    def totals_of_tiles(self, values: Sequence[Any]) -> Any:
+        across = self._resolution // TILE_PX
+        return dr.block_sum(dr.block_sum(dr.concat(list(values)), across), across)
+
+    def reduce_tiles(self, values: Sequence[Any], reduction: Any) -> Any:
+        """Return values of pixels (Float64) reduced over tiles, those of one after another's."""
+        row, column = self._rows_and_columns()
+        tile = row // TILE_PX * (self._resolution // TILE_PX) + column // TILE_PX
+        place = tile * TILE + row % TILE_PX * TILE_PX + column % TILE_PX
+        packed = dr.zeros(mi.Float64, len(values) * self._resolution**2)
+        for number, value in enumerate(values):
+            dr.scatter(packed, mi.Float64(value), place + number * self._resolution**2)
+        return dr.block_reduce(reduction, packed, TILE)
+
+    def totals(self, values: Sequence[Any]) -> Any:
+        """Return the sum over all pixels of each of some values (Float64)."""
+        return self.totals_of_tiles([self.reduce_tiles(values, dr.ReduceOp.Add)])
+
+    def _rows_and_columns(self) -> tuple[Any, Any]:
+        pixel = dr.arange(mi.UInt32, self._resolution**2)
+        return pixel // self._resolution, pixel % self._resolution
 
 
-class DevicePictures:
+def _factor(is_now: Any, was: Any) -> Any:
+    return dr.select(is_now > 0, was / is_now, 1)
+
+
+def channel_sum(color: Any) -> Any:
+    return color.x + color.y + color.z
+
+
+class DevicePictures(ViewPictures):
     """See `ViewPictures` for the meaning of its methods."""
 
-    def __init__(
-        self, samples: DualBuffer, tracer: Any, camera: PixelCamera, settings: RenderSettings
-    ) -> None:
-        """Trace what guides the denoiser.
-
-        Args:
-            samples: whose sums are `DeviceSum`.
-        """
-        self._samples = samples
+    def _trace_guides(
+        self, tracer: VectorTracer, camera: PixelCamera
+    ) -> tuple[NDArray[np.bool_], NDArray[np.bool_]]:
         self._resolution = camera.resolution
-        self._names = settings.part_names
-        self._quality = settings.denoiser
-        self._settings = settings
-        self._picture: Any = None
-        arrays = tracer.feature_arrays(camera, spp=settings.aux_spp)
-        names = self._names or ("",)
-        self._guides, masks = _guides(
-            KernelInputs(), arrays, tracer.hit_array(camera), names, camera.resolution
-        )
+        arrays = tracer.feature_arrays(camera, spp=self._settings.aux_spp)
+        hits = tracer.hit_array(camera)
+        kind = self._names or ("",), camera.resolution
+        self._guides, self._masks = _guides(KernelInputs(), arrays, hits, *kind)
         self._logs = [dr.opaque(mi.Color3d, 0, camera.resolution**2) for _ in range(2)]
-        self._masks = masks
-        bits = read_numbers(masks).reshape(camera.resolution, camera.resolution)
-        self.hits = bits & 1 > 0
-        self.visible = bits & 2 > 0
-        if not self.visible.any():
-            self.visible[:] = True
-        hits = TILE * tile_means(self.hits.astype(np.float64)).ravel()
-        everywhere = np.full_like(hits, TILE)
-        self._counts = everywhere, everywhere, hits
+        bits = read_back(self._masks).reshape(camera.resolution, camera.resolution)
+        return bits & 1 > 0, bits & 2 > 0
 
     @staticmethod
     def mean_radiance(samples: DualBuffer) -> float:
         resolution = len(samples.spp_of(0))
-        total, broken = read_numbers(_brightness(KernelInputs(), _sums(samples), resolution))
+        total, broken = read_back(_brightness(KernelInputs(), _sums(samples), resolution))
         require_finite(int(broken))
         return float(total) / (3 * resolution**2)
 
-    def look(self, quality: Filtered) -> MeasuredLook:
-        statement = statement_for(self._settings, self._samples)
-        self._picture = None
-        filtered = self._denoise_raws(_sums(self._samples), quality, of_both=False)
-        if statement is None or self._settings.picture_within_db is not None:
-            look, logs = self._measure(filtered, quality, None)
-            if statement is None or is_far(look.floor, self._settings, self._samples.spp):
-                self._logs = logs
-                return look
-        look, self._logs = self._measure(filtered, quality, statement)
-        return look
-
-    def _measure(
-        self,
-        filtered: list[list[Any]],
-        quality: Filtered,
-        statement: CalibratedStatement | None,
-    ) -> tuple[MeasuredLook, Any]:
-        """Return a look, by the halves alone without a statement, and the logs of both halves."""
-        sums = _sums(self._samples)
-        count = sum(len(tracer) - 3 for tracer in sums[0])
-        groups = floor_groups(count, self._names, per_light=self._settings.per_light)
-        kind = (self._names, groups, self._resolution, quality != "off")
-        picture = [] if statement is None else [self._filtered_picture()]
-        arrays = sums, filtered, self._guides, self._masks, self._logs, picture
-        numbers, logs = _estimate_error(KernelInputs(), *arrays, *kind)
-        totals, tiles = np.split(read_numbers(numbers), [6 * len(METRICS) if picture else 0])
-        rows = tiles.reshape(-1, len(self._counts[0]))
-        require_finite(int(rows[2].sum()))
-        require_bounded(float(rows[-1].max()))
-        across = self._resolution // TILE_PX
-        if statement is None:
-            errors, surprises = rows[3:-1].reshape(2, -1, 3, across**2)
-            floors = [self._floor(*each) for each in zip(errors, surprises, strict=True)]
-            expected = None
-        else:
-            measures = self._measures(totals.reshape(3, -1), rows[3:-1])
-            floor, expected = statement.state(measures, self._resolution, self._samples.spp)
-            floors = [floor]
-        look = MeasuredLook(
-            floor=floors[0],
-            part_floors=dict(zip(self._names, floors[1:], strict=False)),
-            light_floors=floors[1 + len(self._names) :],
-            expected=expected,
-            changes=list(rows[:2].reshape(2, across, across) / TILE),
-        )
-        return look, logs
-
     def finish(self) -> NDArray[np.float32]:
-        pictures = read_numbers(self._filtered_picture())
+        pictures = read_back(self._make_pictures())
         return pictures.reshape(-1, self._resolution, self._resolution, 3)
 
-    def _filtered_picture(self) -> Any:
+    def _begin_look(self) -> None:
+        self._sums = _sums(self._samples)
+
+    def _finish(self, filtered: Sequence[Any]) -> Any:
         """Return the pictures of all samples of this look (Float), one after another."""
-        if self._picture is None:
-            sums = _sums(self._samples)
-            kind = (self._names, self._resolution, self._quality != "off")
-            filtered = self._denoise_raws(sums, self._quality, of_both=True)
-            self._picture = _finish(KernelInputs(), sums, filtered, self._guides, *kind)
-        return self._picture
+        arrays = self._sums, filtered, self._guides
+        return _finish(KernelInputs(), *arrays, self._names, self._resolution)
 
-    def _measures(
-        self, totals: NDArray[np.float64], surprises: NDArray[np.float64]
-    ) -> dict[str, ErrorMeasures]:
-        """Return the measures of each metric, from totals [3, 6] and largest surprises [3, T]."""
-        share = float(self.hits.mean())
-        return {
-            name: measures_of_totals(added, float(most.max()), int(count.sum()), share)
-            for name, added, most, count in zip(
-                METRICS, totals, surprises, self._counts, strict=True
-            )
-        }
-
-    def _floor(self, errors: NDArray[np.float64], most: NDArray[np.float64]) -> MeasuredFloor:
-        """Return the floor of estimates and surprises of tiles [3, T]: log, linear, of objects."""
-        deviations = 1.0, LINEAR_STANDARD_ERRORS, 1.0
-        log_db, linear_db, object_log_db = (
-            estimate_noise_floor_db(
-                error.sum() / max(count.sum(), 1), float(surprise.max()), error, count, more
-            )
-            for error, surprise, count, more in zip(
-                errors, most, self._counts, deviations, strict=True
-            )
-        )
-        return MeasuredFloor(log_db=log_db, linear_db=linear_db, object_log_db=object_log_db)
-
-    def _denoise_raws(self, sums: Sums, quality: Filtered, *, of_both: bool) -> list[list[Any]]:
-        """Return what the denoiser makes of each half, or of the mean of both."""
+    def _denoise_raws(self, quality: Filtered, *, of_both: bool) -> Sequence[Any]:
         if quality == "off":
             return []
+        sums = self._sums
         raws = _raws(KernelInputs(), sums, self._names, of_both, self._resolution)
         pictures = range(sum(len(tracer) - 3 for tracer in sums[0]))
-        names = [name for _, name in to_filter(pictures, self._names)]
-        guides = [self._guides[name] for name in names]
+        guides = [self._guides[name] for _, name in to_filter(pictures, self._names)]
         return [denoise_arrays(raw, guides, self._resolution, quality) for raw in raws]
+
+    def _numbers(self, finished: Any) -> LookNumbers:
+        picture = [] if finished is None else [finished]
+        arrays = self._filtered, self._guides, self._masks, self._logs, picture
+        kind = self._names, self._groups(), self._resolution
+        numbers, logs = _measure(KernelInputs(), self._sums, *arrays, *kind)
+        totals, tiles = np.split(read_back(numbers), [6 * len(METRICS) if picture else 0])
+        rows = tiles.reshape(-1, len(self._counts[0]))
+        num_surprises = 3 if picture else 3 * len(kind[1])
+        adds, most = np.split(rows, [len(rows) - num_surprises - 1])
+        totals = totals.reshape(-1, 6)
+        return LookNumbers(totals=totals, adds=adds, sums=adds.sum(axis=1), most=most, logs=logs)
 
 
 def _sums(samples: DualBuffer) -> Sums:
-    return [[each.sums for each in half] for half in samples.sums]  # type: ignore[attr-defined]
+    return [[each.sums for each in half] for half in samples.sums]
 
 
 @record_launches
 def _brightness(_: Any, sums: Sums, resolution: int) -> Any:
     """Return the sum of all channels of the mean of both halves, and the broken pixels."""
-    means = [add_up(half) for half in _half_means(sums)]
-    return totals([channel_sum(add_up(means)) / 2, _broken(sums)], resolution)
+    pixels = KernelPixels(resolution)
+    of_halves = [add_up(half) for half in half_means(sums, pixels)]
+    return pixels.totals([channel_sum(add_up(of_halves)) / 2, broken_pixels(sums, pixels)])
 
 
 @record_launches
 def _guides(
     _: Any, arrays: dict[str, Any], hits: Any, names: Sequence[str], resolution: int
 ) -> tuple[Any, Any]:
-    """Return albedo and normal by the name of a part, as `Features.of_part`, and hits and shown."""
+    """Return albedo and normal by the name of a part, as `Features.of_part`, and hits and shown.
+
+    Only `resolution` tells recordings of other sizes apart.
+    """
     normal: Any = mi.Color3f(arrays["normal"])
     guides = dict[str, Any]()
     for name in names:
         albedo = mi.Color3f(arrays.get(name.partition("_")[0], arrays["albedo"]))
-        seen = normal if name.partition("_")[0] not in arrays else where_any(albedo, normal)
+        seen = (
+            normal
+            if name.partition("_")[0] not in arrays
+            else dr.select(dr.any(albedo != 0), normal, 0)
+        )
         guides[name] = dr.ravel(albedo), dr.ravel(seen)
     visible: Any = functools.reduce(operator.or_, normal != 0)
     byte: Any = mi.UInt8
@@ -239,13 +282,13 @@ def _raws(
 ) -> list[list[Any]]:
     """Return what the denoiser is asked for, of each half or of both (Float, pixel by pixel)."""
     return [
-        [dr.ravel(picture) for picture, _ in to_filter(means, names)]
-        for means in _means(sums, of_both)
+        [dr.ravel(picture) for picture, _ in to_filter(pictures, names)]
+        for pictures in means(sums, KernelPixels(resolution), of_both=of_both)
     ]
 
 
 @record_launches
-def _estimate_error(
+def _measure(
     _: Any,
     sums: Sums,
     filtered: list[list[Any]],
@@ -256,44 +299,20 @@ def _estimate_error(
     names: Sequence[str],
     groups: Sequence[Group],
     resolution: int,
-    is_filtered: bool,
 ) -> tuple[Any, list[Any]]:
-    """Return rows of numbers of all tiles (Float64), and the log radiance of both halves.
+    """Return the totals and rows of numbers of all tiles of `measure_pixels` (Float64), and logs.
 
-    The rows are sums: the changes of both halves, broken pixels, and three estimates of each of
-    `floor_groups`; then what is greatest: surprises of the same, and the brightest raw channel.
-    With `finished`, one denoise of all samples, the totals of `error_measures` come first, and no
-    estimates.
+    What is added up comes first, and then what is greatest.
     """
-    raws = _means(sums, of_both=False)
-    denoised = _clean_pictures(raws, filtered, guides, names, resolution) if is_filtered else raws
-    new_logs = [log10(mi.Color3d(add_up(each))) for each in denoised]
-    changes = [channel_mean(dr.square(new - old)) for new, old in zip(new_logs, logs, strict=True)]
-    corrected = denoised
-    if is_filtered and len(sums[0]) == 1:
-        picture = [[(a + b) / 2 for a, b in zip(*each, strict=True)] for each in (denoised, raws)]
-        error = _squared_error_of_means(sums)
-        right = converged_mask(picture[0], picture[1], error, resolution)
-        corrected = [choose(right, *each) for each in zip(raws, denoised, strict=True)]
-    hit = (masks & 1) > 0
-    totals = []
-    rows: list[tuple[list[Any], list[Any]]] = []
-    for group in groups:
-        a, b, da, db = (mi.Color3d(add_up(each[slice(*group)])) for each in (*raws, *corrected))
-        if finished:
-            denoised_both = mi.Color3d(dr.unravel(mi.Color3f, finished[0]))
-            measured, surprises = error_measures(a, b, da, db, denoised_both, hit, resolution)
-            totals.append(measured)
-            rows.append(([], surprises))
-        else:
-            rows.append(estimates(a, b, da, db, hit, is_filtered))
-    brightest = functools.reduce(dr.maximum, [dr.max(part) for half in raws for part in half])
-    adds = [*changes, _broken(sums), *(row for errors, _ in rows for row in errors)]
-    most = [*(row for _, surprises in rows for row in surprises), brightest]
+    pixels = KernelPixels(resolution)
+    picture = dr.unravel(mi.Color3f, finished[0]) if finished else None
+    totals, adds, most, new_logs = measure_pixels(
+        pixels, names, groups, sums, filtered, guides, (masks & 1) > 0, logs, picture
+    )
     dr.eval(new_logs)
-    sums_of_tiles = reduce_tiles(adds, dr.ReduceOp.Add, resolution)
-    most_of_tiles = reduce_tiles(most, dr.ReduceOp.Max, resolution)
-    return dr.concat([*totals, sums_of_tiles, most_of_tiles]), new_logs
+    added = pixels.reduce_tiles(adds, dr.ReduceOp.Add)
+    greatest = pixels.reduce_tiles(most, dr.ReduceOp.Max)
+    return dr.concat([*totals, added, greatest]), new_logs
 
 
 @record_launches
@@ -304,84 +323,11 @@ def _finish(
     guides: dict[str, Any],
     names: Sequence[str],
     resolution: int,
-    is_filtered: bool,
 ) -> Any:
     """Return the pictures of all samples (Float), one after another."""
-    raws = _means(sums, of_both=True)
-    if is_filtered:
-        (pictures,) = _clean_pictures(raws, filtered, guides, names, resolution)
-        if len(sums[0]) == 1:
-            right = converged_mask(pictures, raws[0], _squared_error_of_means(sums), resolution)
-            pairs = list(zip(choose(right, raws[0], pictures), raws[0], strict=True))
-            pictures = with_means_of(pairs, resolution)
-    else:
-        (pictures,) = raws
+    pictures = finish_pictures(sums, filtered, guides, KernelPixels(resolution), names)
     flat: list[Any] = [dr.ravel(picture) for picture in pictures]
     return dr.concat(flat)
-
-
-def _half_means(sums: Sums) -> list[list[Any]]:
-    """Return the mean of each half, of each picture (Color3d)."""
-    return [[total / tracer[-2] for tracer in half for total in tracer[:-3]] for half in sums]
-
-
-def _means(sums: Sums, of_both: bool) -> list[list[Any]]:
-    """Return the mean of each half, or of both alone, of each picture (Color3f)."""
-    halves = _half_means(sums)
-    if of_both:
-        halves = [[(a + b) / 2 for a, b in zip(*halves, strict=True)]]
-    return [[mi.Color3f(picture) for picture in half] for half in halves]
-
-
-def _broken(sums: Sums) -> Any:
-    """Return 1 (Float64) for pixels with a sum that is not finite, else 0."""
-    totals = [total for half in sums for tracer in half for total in tracer[:-3]]
-    finite = [
-        dr.isfinite(total.x) & dr.isfinite(total.y) & dr.isfinite(total.z) for total in totals
-    ]
-    return dr.select(functools.reduce(lambda a, b: a & b, finite), mi.Float64(0), mi.Float64(1))
-
-
-def _squared_error_of_means(sums: Sums) -> Any:
-    """Return the square (Float64) of HostMeans.standard_error."""
-    greys = [channel_mean(add_up(half)) for half in _half_means(sums)]
-    mean = (greys[0] + greys[1]) / 2
-    spread = mi.Float64(0)
-    count = mi.Float64(0)
-    shares = mi.Float64(0)
-    for grey, (tracer,) in zip(greys, sums, strict=True):
-        squares, spp, passes = tracer[-3:]
-        spread += squares - spp * mean * (2 * grey - mean)
-        count += passes
-        shares += 1 / spp
-    error = dr.maximum(spread, 0) / (count - 1) * shares / 4
-    return dr.select(count < LEAST_PASSES, dr.inf, error)
-
-
-def _clean_pictures(
-    raws: list[list[Any]],
-    filtered: list[list[Any]],
-    guides: dict[str, Any],
-    names: Sequence[str],
-    resolution: int,
-) -> list[list[Any]]:
-    """Return the pictures without noise (Color3f), from what the denoiser made of them."""
-    denoised = []
-    for pictures, outputs in zip(raws, filtered, strict=True):
-        inputs = list(to_filter(pictures, names))
-        cleaned = [
-            clean(mi.Color3f(dr.unravel(mi.Color3f, output)), raw, guides[name][1])
-            for output, (raw, name) in zip(outputs, inputs, strict=True)
-        ]
-        if len(inputs) > len(names or ("",)):  # lights alone: of no light nothing is painted
-            lit = totals([channel_sum(mi.Color3d(raw)) for raw, _ in inputs], resolution)
-            cleaned = [
-                dr.select(dr.gather(mi.Float64, lit, row) > 0, picture, 0)
-                for row, picture in enumerate(cleaned)
-            ]
-        with_means = functools.partial(with_means_of, resolution=resolution)
-        denoised.append(put_together(pictures, cleaned, names, with_means, shares_of))
-    return denoised
 
 
 def denoise_arrays(
@@ -411,27 +357,16 @@ def denoise_arrays(
     return outputs
 
 
-class _DLTensor(ctypes.Structure):
-    """The head of DLPack's structure of that name."""
-
-    _fields_ = (
-        ("data", ctypes.c_void_p),
-        ("device", ctypes.c_int32 * 2),
-        ("ndim", ctypes.c_int32),
-        ("dtype", ctypes.c_uint8 * 4),
-        ("shape", ctypes.c_void_p),
-        ("strides", ctypes.c_void_p),
-        ("byte_offset", ctypes.c_uint64),
-    )
-
-
 _capsule_pointer = ctypes.pythonapi.PyCapsule_GetPointer
 _capsule_pointer.restype = ctypes.c_void_p
 _capsule_pointer.argtypes = [ctypes.py_object, ctypes.c_char_p]
 
 
 def _address(array: Any) -> int:
-    """Return where an evaluated array of Dr.Jit is, in the memory of its device."""
+    """Return where an evaluated array of Dr.Jit is, in the memory of its device.
+
+    In DLPack's structure `DLTensor` the first eight bytes are `data`, the sixth are `byte_offset`.
+    """
     capsule = array.__dlpack__()
-    tensor = _DLTensor.from_address(_capsule_pointer(capsule, b"dltensor"))
-    return int(tensor.data) + int(tensor.byte_offset)
+    words = (ctypes.c_uint64 * 6).from_address(_capsule_pointer(capsule, b"dltensor"))
+    return int(words[0]) + int(words[5])

@@ -58,13 +58,10 @@ class EmitterTable:
         Raises:
             Rejected: "unlit_scene" where no emitter that is on has both area and radiance.
         """
-        corners = scene.vertex_positions[scene.faces[order]].astype(np.float64)
+        corner, edge1, edge2, area = triangle_areas(scene, order)
         radiance = scene.materials[scene.material_index[order]][:, EMISSION].astype(np.float64)
         if lit is not None:
             radiance *= lit[:, None]
-        edge1 = corners[:, 1] - corners[:, 0]
-        edge2 = corners[:, 2] - corners[:, 0]
-        area = 0.5 * np.linalg.norm(np.cross(edge1, edge2), axis=1)
         power = area * radiance.mean(axis=1)
         if not power.sum() > 0 and may_be_dark:
             self._rows = own_floats(np.zeros((max(len(order), 1), 16)))
@@ -78,9 +75,7 @@ class EmitterTable:
         pdf = np.divide(share, area, out=np.zeros_like(area), where=area > 0)
         keep, alias = alias_table(share)
         nothing = np.zeros(len(order))
-        rows = np.column_stack(
-            [corners[:, 0], pdf, edge1, nothing, edge2, nothing, radiance, nothing]
-        )
+        rows = np.column_stack([corner, pdf, edge1, nothing, edge2, nothing, radiance, nothing])
         self._rows = own_floats(rows)
         self._alias = own_floats(np.column_stack([keep, alias]))
         self._count = dr.opaque(mi.UInt32, len(order))
@@ -106,6 +101,14 @@ class EmitterTable:
 
     def _group(self, row: Any, group: int, active: Any) -> Any:
         return dr.gather(mi.Vector4f, self._rows, row * 4 + group, active)
+
+
+def triangle_areas(scene: Scene, rows: NDArray[Any]) -> tuple[NDArray[np.float64], ...]:
+    """Return the first corner, both edges from it, and the area of some triangles."""
+    corners = scene.vertex_positions[scene.faces[rows]].astype(np.float64)
+    edge1 = corners[:, 1] - corners[:, 0]
+    edge2 = corners[:, 2] - corners[:, 0]
+    return corners[:, 0], edge1, edge2, 0.5 * np.linalg.norm(np.cross(edge1, edge2), axis=1)
 
 
 def sample_alias(table: Any, first: Any, count: Any, u: Any, active: Any) -> tuple[Any, Any]:

@@ -26,6 +26,7 @@ from numpy.typing import NDArray
 
 from pipeline.renders.device_memory import own_floats, own_integers
 from pipeline.renders.ggx import KernelLobes
+from pipeline.renders.surface_table import Hit
 
 _CELLS = 1500
 """A cell is about as large as so many parts of the scene's whole surface, or smaller."""
@@ -66,14 +67,14 @@ class GuideCells:
         self.facing = 2 * axis + (outward[np.arange(len(axis)), axis] > 0)
         """[C] 0 to 5: the axis and the sign of the largest component of the normal."""
 
-    def index(self, triangle: Any, barycentric: Any, front: Any, active: Any) -> Any:
+    def index(self, hit: Hit, front: Any, active: Any) -> Any:
         """Return the cell (UInt32) of a point; `front` says which side of the triangle it is."""
-        row = dr.gather(mi.Vector2u, self._rows, triangle, active)
+        row = dr.gather(mi.Vector2u, self._rows, hit.triangle, active)
         first = row.x
         cuts = row.y
         column, line = (
             dr.minimum(mi.UInt32(dr.maximum(weight, 0) * mi.Float(cuts)), cuts - 1)
-            for weight in barycentric
+            for weight in hit.barycentric
         )
         return first + 2 * (line * cuts + column) + dr.select(front, mi.UInt32(1), mi.UInt32(0))
 
@@ -100,6 +101,28 @@ class Guidance:
     """Row of the guide table, UInt32; 0 is not guided."""
     share: Any
     """Fraction of directions that are drawn from the row, Float."""
+    table: "GuideTable"
+
+    def pdf(self, direction: Any, active: Any) -> Any:
+        """Return the density (Float, per steradian) with which `sample` draws a unit Vector3f."""
+        index, length = bin_of(direction)
+        learnt = active & (self.row > 0)
+        on_square = dr.gather(mi.Float, self.table.densities, self.row * BINS + index, learnt)
+        return on_square / (length * dr.square(length))
+
+    def mixture(self, unguided: Any, direction: Any, active: Any) -> Any:
+        """Return the density of a path's direction from that of its BRDF sample alone."""
+        learnt = self.pdf(direction, active)
+        return dr.fma(learnt - unguided, self.share, unguided)
+
+    def sample(self, u: Any, active: Any) -> Any:
+        """Return a unit direction (Vector3f) in world space from a uniform Point2f."""
+        scaled = u.x * ENTRIES
+        entry = dr.minimum(mi.UInt32(scaled), ENTRIES - 1)
+        index = dr.gather(mi.UInt32, self.table.bins, self.row * ENTRIES + entry, active)
+        line = index // SIDE
+        x = mi.Float(index - line * SIDE) + (scaled - mi.Float(entry))
+        return _from_square(x * (2 / SIDE) - 1, (mi.Float(line) + u.y) * (2 / SIDE) - 1)
 
 
 class GuideTable:
@@ -119,38 +142,15 @@ class GuideTable:
         on_square = np.concatenate([np.zeros(BINS), counts.ravel() * (BINS / 4 / ENTRIES)])
         self._cells = cells
         self._row_of_cell = own_integers(row_of_cell)
-        self._bins = own_integers(np.concatenate([np.zeros(ENTRIES, np.int64), bins]))
-        self._densities = own_floats(on_square)
+        self.bins = own_integers(np.concatenate([np.zeros(ENTRIES, np.int64), bins]))
+        self.densities = own_floats(on_square)
 
-    def at(
-        self, triangle: Any, barycentric: Any, front: Any, lobes: KernelLobes, active: Any
-    ) -> Guidance:
+    def at(self, hit: Hit, front: Any, lobes: KernelLobes, active: Any) -> Guidance:
         """Return what guides a path; `lobes` are those that its viewer sees."""
-        cell = self._cells.index(triangle, barycentric, front, active)
+        cell = self._cells.index(hit, front, active)
         row = dr.gather(mi.UInt32, self._row_of_cell, cell, active)
         rough = rough_share(lobes)
-        return Guidance(row=row, share=dr.select(row > 0, _SHARE * rough, 0))
-
-    def pdf(self, guidance: Guidance, direction: Any, active: Any) -> Any:
-        """Return the density (Float, per steradian) with which `sample` draws a unit Vector3f."""
-        index, length = bin_of(direction)
-        learnt = active & (guidance.row > 0)
-        on_square = dr.gather(mi.Float, self._densities, guidance.row * BINS + index, learnt)
-        return on_square / (length * dr.square(length))
-
-    def mixture(self, guidance: Guidance, unguided: Any, direction: Any, active: Any) -> Any:
-        """Return the density of a path's direction from that of its BRDF sample alone."""
-        learnt = self.pdf(guidance, direction, active)
-        return dr.fma(learnt - unguided, guidance.share, unguided)
-
-    def sample(self, guidance: Guidance, u: Any, active: Any) -> Any:
-        """Return a unit direction (Vector3f) in world space from a uniform Point2f."""
-        scaled = u.x * ENTRIES
-        entry = dr.minimum(mi.UInt32(scaled), ENTRIES - 1)
-        index = dr.gather(mi.UInt32, self._bins, guidance.row * ENTRIES + entry, active)
-        line = index // SIDE
-        x = mi.Float(index - line * SIDE) + (scaled - mi.Float(entry))
-        return _from_square(x * (2 / SIDE) - 1, (mi.Float(line) + u.y) * (2 / SIDE) - 1)
+        return Guidance(row=row, share=dr.select(row > 0, _SHARE * rough, 0), table=self)
 
 
 def rough_share(lobes: KernelLobes) -> Any:

@@ -14,7 +14,7 @@ from pipeline.renders.emitter_table import EmissionCone, EmitterTable
 from pipeline.renders.ggx import AlbedoLookup, KernelLobes
 from pipeline.renders.guide_table import GuideTable
 from pipeline.renders.sky_table import SkyTable, sky_share
-from pipeline.renders.surface_table import SurfacePoint, SurfaceTable
+from pipeline.renders.surface_table import Hit, SurfacePoint, SurfaceTable
 from pipeline.renders.tracer import split_triangles
 from storage.records.lights import part_names, shining_sky
 from storage.records.scene import Scene
@@ -73,31 +73,6 @@ class KernelScene:
         return pdf if self.sky is None else self.sky.of_lamps(pdf)
 
 
-def build_mitsuba_mesh(
-    name: str, counts: tuple[int, int], properties: Any = None, **fields: Any
-) -> Any:
-    """Return a Mitsuba mesh; nothing else knows its constructor, which Mitsuba 3.10 changes.
-
-    Args:
-        counts: vertices and faces.
-        properties: a mi.Properties with BSDF and emitter, if any.
-        fields: flat arrays `faces`, `vertex_positions`, `vertex_normals`, `vertex_texcoords`; the
-            mesh has the last two where they are given.
-    """
-    mesh = mi.Mesh(
-        name,
-        *counts,
-        props=mi.Properties() if properties is None else properties,
-        has_vertex_normals="vertex_normals" in fields,
-        has_vertex_texcoords="vertex_texcoords" in fields,
-    )
-    parameters = mi.traverse(mesh)
-    for field, values in fields.items():
-        parameters[field] = values
-    parameters.update()
-    return mesh
-
-
 def build_mitsuba_scene(scene: Scene, triangles: NDArray[np.intp], child: Any = None) -> Any:
     """Return a Mitsuba scene of one mesh, whose triangle numbers are positions in `triangles`.
 
@@ -107,12 +82,11 @@ def build_mitsuba_scene(scene: Scene, triangles: NDArray[np.intp], child: Any = 
     kernel use one OptiX shader binding table, and miss whatever is in another table. A scene that
     has another scene as a child shares its table.
     """
-    mesh = build_mitsuba_mesh(
-        "triangles",
-        (len(scene.vertex_positions), len(triangles)),
-        faces=own_integers(scene.faces[triangles]),
-        vertex_positions=own_floats(scene.vertex_positions),
-    )
+    mesh = mi.Mesh("triangles", len(scene.vertex_positions), len(triangles))
+    parameters = mi.traverse(mesh)
+    parameters["faces"] = own_integers(scene.faces[triangles])
+    parameters["vertex_positions"] = own_floats(scene.vertex_positions)
+    parameters.update()
     children = {"mesh": mesh} if child is None else {"mesh": mesh, "beside": child}
     return mi.load_dict({"type": "scene", **children})
 
@@ -122,10 +96,7 @@ class Vertex:
     """A vertex of a path, lane by lane."""
 
     point: SurfacePoint
-    triangle: Any
-    """Triangle number, UInt32; surfaces first, then emitters."""
-    barycentric: Any
-    """Weights of the 2nd and 3rd corner, Point2f."""
+    hit: Hit
     front: Any
     """True where the ray hit the front of the triangle by its winding, Bool."""
     frame: Any
@@ -141,20 +112,24 @@ class Vertex:
     turned: Any = None
     """True where `face_viewer` has turned the frame, Bool; None where it has not been asked to."""
 
+    def evaluate(self, local: Any) -> tuple[Any, Any]:
+        """Return `ggx.evaluate_bsdf` for light that comes from a direction in the frame."""
+        return ggx.evaluate_bsdf(self.lobes, self.incoming, local, self.geometric, self.unmapped)
+
+    def reverse_pdf(self, local: Any) -> Any:
+        """Return `ggx.reverse_pdf`; 0 where turned: a light path is not turned to its viewer."""
+        drawn = ggx.reverse_pdf(self.lobes, self.incoming, local, self.geometric)
+        return drawn if self.turned is None else dr.select(self.turned, 0, drawn)
+
 
 def vertex_at(
-    scene: KernelScene,
-    point: SurfacePoint,
-    triangle: Any,
-    barycentric: Any,
-    direction: Any,
-    active: Any,
+    scene: KernelScene, point: SurfacePoint, hit: Hit, direction: Any, active: Any
 ) -> Vertex:
     """Return the vertex, seen from the side of the triangle that the ray comes from."""
-    normal, lobes = scene.table.shading(triangle, barycentric, active)
+    normal, lobes = scene.table.shading(hit, active)
     geometric = dr.mulsign(point.geometric_normal, dr.dot(point.geometric_normal, normal))
     behind = dr.dot(geometric, direction) > 0
-    mapped = scene.table.mapped_normal(normal, triangle, barycentric, active)
+    mapped = scene.table.mapped_normal(normal, hit, active)
     shading = normal if mapped is None else mapped
     frame = mi.Frame3f(dr.select(behind, -shading, shading))
     unmapped = None
@@ -162,8 +137,7 @@ def vertex_at(
         unmapped = frame.to_local(dr.select(behind, -normal, normal))
     return Vertex(
         point=point,
-        triangle=triangle,
-        barycentric=barycentric,
+        hit=hit,
         front=dr.dot(point.geometric_normal, direction) < 0,
         frame=frame,
         geometric=frame.to_local(dr.select(behind, -geometric, geometric)),
@@ -173,16 +147,25 @@ def vertex_at(
     )
 
 
-def face_viewer(vertex: Vertex, *directions: Any) -> tuple[Vertex, tuple[Any, ...]]:
-    """Return a vertex whose mapped normal faces `incoming`, and other directions in its frame.
+def face_viewer(
+    scene: KernelScene, vertex: Vertex, active: Any, *directions: Any
+) -> tuple[Vertex, tuple[Any, ...]]:
+    """Return a vertex as seen from `incoming`, and other directions in its frame.
 
+    Its lobes are scaled for that direction (`ggx.seen_from`), which its mapped normal faces.
     A mapped normal that turns away from a viewer is mirrored at the unmapped one, as by Mitsuba's
     `normalmap`: a half turn about that normal maps one frame to the other. Where the scene has no
     normal map, all stays.
     """
-    axis = vertex.unmapped
-    if axis is None:
-        return vertex, directions
+    if vertex.unmapped is not None:
+        vertex, directions = _turn_to_viewer(vertex, vertex.unmapped, directions)
+    albedo = scene.albedo(vertex.incoming.z, vertex.lobes.alpha, active)
+    return replace(vertex, lobes=ggx.seen_from(vertex.lobes, vertex.incoming, albedo)), directions
+
+
+def _turn_to_viewer(
+    vertex: Vertex, axis: Any, directions: tuple[Any, ...]
+) -> tuple[Vertex, tuple[Any, ...]]:
     turned = (vertex.incoming.z <= 0) & (dr.dot(vertex.incoming, axis) > 0)
 
     def turn(direction: Any) -> Any:
@@ -200,16 +183,14 @@ def face_viewer(vertex: Vertex, *directions: Any) -> tuple[Vertex, tuple[Any, ..
     return faced, tuple(map(turn, directions))
 
 
-class Hit:
-    """What rays meet. Not a dataclass: Dr.Jit would take it for variables of the loop."""
-
-    def __init__(self, hit: Any) -> None:
-        self.is_valid = hit.is_valid()
-        """Bool."""
-        self.distance = mi.Float(hit.t)
-        self.triangle = mi.UInt32(hit.prim_index)
-        self.barycentric = mi.Point2f(hit.prim_uv)
-        """Weights of the 2nd and 3rd corner."""
+def hit_of(intersection: Any) -> tuple[Hit, Any]:
+    """Return what rays meet by a PreliminaryIntersection3f, and whether they meet anything."""
+    hit = Hit(
+        distance=mi.Float(intersection.t),
+        triangle=mi.UInt32(intersection.prim_index),
+        barycentric=mi.Point2f(intersection.prim_uv),
+    )
+    return hit, intersection.is_valid()
 
 
 def off_surface(point: SurfacePoint, direction: Any) -> Any:
@@ -219,10 +200,12 @@ def off_surface(point: SurfacePoint, direction: Any) -> Any:
     return mi.Point3f(point.position + point.geometric_normal * side)
 
 
-def next_hit(scene: KernelScene, point: SurfacePoint, direction: Any, active: Any) -> Hit:
-    """Return what a ray meets that leaves a surface in a unit direction (Vector3f)."""
+def next_hit(
+    scene: KernelScene, point: SurfacePoint, direction: Any, active: Any
+) -> tuple[Hit, Any]:
+    """Return `hit_of` a ray that leaves a surface in a unit direction (Vector3f)."""
     ray = mi.Ray3f(off_surface(point, direction), direction)
-    return Hit(scene.everything.ray_intersect_preliminary(ray, active=active))
+    return hit_of(scene.everything.ray_intersect_preliminary(ray, active=active))
 
 
 def roulette(

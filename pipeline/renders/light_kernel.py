@@ -35,8 +35,8 @@ arrives by the cosine of the shading normal but spreads by that of the triangle,
 C-/C+ at each vertex (Veach 1996).
 """
 
-from collections.abc import Sequence
-from dataclasses import replace
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
 from typing import Any
 
 import drjit as dr
@@ -63,51 +63,67 @@ from pipeline.renders.kernel_scene import (
 from pipeline.renders.surface_table import SurfacePoint
 
 
+@dataclass(frozen=True, eq=False)
+class Arrival:
+    """Light that arrives at a vertex of a light path, lane by lane."""
+
+    vertex: Vertex
+    direction: Any
+    """Direction in which the light arrives, Vector3f."""
+    power: Any
+    """Mean of the channels of the power before `vertex` spreads it, Float."""
+    light: Any
+    """Color3f: what a viewer's cosine and BRDF are multiplied by."""
+    hit_mis_ratio: Any
+    pick_mis_ratio: Any
+    """Float: densities of `hit` and `pick` over that of `land`, without P, L and c_1."""
+    drawn: Any
+    """Density (Float, per steradian) of the direction of the last bounce; 0 before the first."""
+    depth: Any
+    """Vertices on surfaces so far, UInt32."""
+    active: Any
+
+
 @dr.syntax
 def trace_light(
     scene: KernelScene,
-    films: Sequence[Film],
-    parts: KernelParts,
-    light_paths: Any,
     emitter: EmitterPoint,
     u_direction: Any,
     sampler: Any,
-    splats: Sequence[Sequence[Splats]],
+    record: Callable[[KernelScene, Arrival], None],
 ) -> None:
-    """Add the light that lands to `splats`: radiance times the samples of a pixel.
+    """Trace paths from the emitters, and hand over every arrival at a surface.
 
     Args:
-        films: the cameras that each path is joined to.
-        parts: what is kept apart; all light that lands is indirect.
-        light_paths: Float, light paths for each sample of a pixel, the same as of `trace`.
         emitter: where the path of each lane begins.
         u_direction: Point2f, uniform, for the directions in which they leave.
         sampler: mi.Sampler with a lane for each path.
-        splats: for each camera, the sum of each lobe, or of both.
+        record: `CameraJoin` or `PhotonRecords`.
     """
-    start, direction, leaving, inverse_pdf = _leave_emitter(scene, emitter, u_direction)
+    direction = scene.cone.sample(emitter.position, emitter.normal, u_direction)
+    leaving = scene.cone.pdf(emitter.position, emitter.normal, direction)
+    cosine = dr.abs(dr.dot(emitter.normal, direction))
+    start = SurfacePoint(position=emitter.position, geometric_normal=emitter.normal)
     active = mi.Bool((leaving > 0) & (dr.max(emitter.radiance) > 0))
-    hit_mis_ratio = mi.Float(inverse_pdf)
+    hit_mis_ratio = mi.Float(cosine / (emitter.area_pdf * leaving))  # C+ / (a e)
     strength = dr.max(emitter.radiance) * hit_mis_ratio
     throughput = mi.Color3f(emitter.radiance / dr.max(emitter.radiance))
-    first = next_hit(scene, start, direction, active)
-    active &= first.is_valid
-    triangle = first.triangle
-    barycentric = first.barycentric
-    pick_mis_ratio = mi.Float(scene.to_pick_pdf(dr.square(first.distance) / leaving))
+    hit, is_met = next_hit(scene, start, direction, active)
+    active &= is_met
+    pick_mis_ratio = mi.Float(scene.to_pick_pdf(dr.square(hit.distance) / leaving))
+    drawn = mi.Float(0)
     depth = mi.UInt32(1)
     while active:
-        point = scene.table.point(triangle, barycentric, active)
-        vertex = vertex_at(scene, point, triangle, barycentric, direction, active)
+        point = scene.table.point(hit, active)
+        vertex = vertex_at(scene, point, hit, direction, active)
+        power = dr.mean(throughput) * strength
         spread = dr.maximum(dr.dot(vertex.geometric, vertex.incoming), SMALLEST_COSINE)
         throughput = throughput / spread
         hit_mis_ratio = hit_mis_ratio / spread
         pick_mis_ratio = pick_mis_ratio / spread
-        visible = active & (triangle < scene.num_surfaces)
-        landing = visible & (depth > 1) & (depth < scene.max_depth)
-        mis_ratio = dr.minimum(dr.hypot(hit_mis_ratio, pick_mis_ratio), MAX_MIS_RATIO) / light_paths
-        place = light_paths, vertex, mis_ratio, landing
-        _join_to_cameras(scene, films, parts, splats, throughput * strength, place)
+        light = throughput * strength
+        ratios = hit_mis_ratio, pick_mis_ratio
+        record(scene, Arrival(vertex, direction, power, light, *ratios, drawn, depth, active))
         depth += 1
         active &= depth < scene.max_depth
         u_lobe = sampler.next_1d(active)
@@ -118,79 +134,78 @@ def trace_light(
         onwards = dr.select(depth == 2, 1, forward)  # from x_(k-1) a path is picked, not drawn
         pick_mis_ratio = dr.minimum(pick_mis_ratio * onwards * ratio, MAX_MIS_RATIO)
         throughput, active = roulette(scene, throughput, depth, sampler.next_1d(active), active)
+        drawn = dr.abs(dr.dot(vertex.geometric, local)) / ratio
         direction = mi.Vector3f(vertex.frame.to_world(local))
-        hit = next_hit(scene, point, direction, active)
-        active &= hit.is_valid
-        triangle = hit.triangle
-        barycentric = hit.barycentric
+        hit, is_met = next_hit(scene, point, direction, active)
+        active &= is_met
 
 
-def _leave_emitter(
-    scene: KernelScene, emitter: EmitterPoint, u: Any
-) -> tuple[SurfacePoint, Any, Any, Any]:
-    """Return where paths start, their directions, the density of these, and C+ / (a e)."""
-    direction = scene.cone.sample(emitter.position, emitter.normal, u)
-    leaving = scene.cone.pdf(emitter.position, emitter.normal, direction)
-    cosine = dr.abs(dr.dot(emitter.normal, direction))
-    start = SurfacePoint(position=emitter.position, geometric_normal=emitter.normal)
-    return start, direction, leaving, cosine / (emitter.area_pdf * leaving)
+class CameraJoin:
+    """Adds the light that lands to `splats`: radiance times the samples of a pixel.
 
-
-def _join_to_cameras(
-    scene: KernelScene,
-    films: Sequence[Film],
-    parts: KernelParts,
-    splats: Sequence[Sequence[Splats]],
-    light: Any,
-    place: tuple[Any, Vertex, Any, Any],
-) -> None:
-    """Add the light (Color3f) that reaches a vertex to the pictures in which it shows."""
-    light_paths, vertex, mis_ratio, landing = place
-    for film, sums in zip(films, splats, strict=True):
-        sight = mi.Bool(landing)  # each camera narrows its own
-        value, share, pixel, lands = _connect_to_camera(
-            scene, parts, film, light_paths, vertex, mis_ratio, sight
-        )
-        _add(sums, parts.by_lobe(light * value, share), pixel, lands)
-
-
-def _add(splats: Sequence[Splats], values: list[Any], pixel: Any, active: Any) -> None:
-    for total, value in zip(splats, values, strict=True):
-        total.add(value, pixel, active)
-
-
-def _connect_to_camera(
-    scene: KernelScene,
-    parts: KernelParts,
-    film: Film,
-    light_paths: Any,
-    vertex: Vertex,
-    mis_ratio: Any,
-    active: Any,
-) -> tuple[Any, Any, Any, Any]:
-    """Return the light of a vertex in the picture: value, diffuse share, pixel and visibility.
-
-    The value and the share of the diffuse lobe are Color3f, the pixel UInt32, visibility Bool.
-
-    Args:
-        mis_ratio: Float, the square root of (hit^2 + pick^2) / land^2, without P and c_1.
+    Not a dataclass: Dr.Jit would take its arrays for loop variables.
     """
-    to_camera = film.origin - vertex.point.position
-    distance_sq = dr.squared_norm(to_camera)
-    direction = to_camera * dr.rsqrt(distance_sq)
-    local = vertex.frame.to_local(direction)
-    reflected, forward, _ = _evaluate_brdf(scene, vertex, local, active, None)
-    pixels = film.pdf(-direction) * dr.abs(dr.dot(vertex.geometric, local)) / distance_sq
-    share = 1 / (1 + dr.square(pixels * mis_ratio * forward))
-    pixel, inside = film.pixel(vertex.point.position)
-    active &= inside & (dr.max(reflected) > 0)
-    start = off_surface(vertex.point, to_camera)
-    remaining = film.origin - start
-    ray = mi.Ray3f(start, mi.Vector3f(dr.normalize(remaining)))
-    ray.maxt = dr.norm(remaining)
-    active &= ~scene.surfaces.ray_test(ray, active=active)
-    of_diffuse = parts.share(*_flip_to_viewer(scene, vertex, local, active))
-    return reflected * (share * pixels / light_paths), of_diffuse, pixel, active
+
+    def __init__(
+        self,
+        films: Sequence[Film],
+        parts: KernelParts,
+        light_paths: Any,
+        splats: Sequence[Sequence[Splats]],
+    ) -> None:
+        """Join each path to some cameras.
+
+        Args:
+            films: the cameras that each path is joined to.
+            parts: what is kept apart; all light that lands is indirect.
+            light_paths: Float, light paths for each sample of a pixel, the same as of `trace`.
+            splats: for each camera, the sum of each lobe, or of both.
+        """
+        self._films = films
+        self._parts = parts
+        self._light_paths = light_paths
+        self._splats = splats
+
+    def __call__(self, scene: KernelScene, arrival: Arrival) -> None:
+        """Add the light that reaches a vertex to the pictures in which it shows."""
+        visible = arrival.active & (arrival.vertex.hit.triangle < scene.num_surfaces)
+        landing = visible & (arrival.depth > 1) & (arrival.depth < scene.max_depth)
+        ratio = dr.minimum(dr.hypot(arrival.hit_mis_ratio, arrival.pick_mis_ratio), MAX_MIS_RATIO)
+        for film, sums in zip(self._films, self._splats, strict=True):
+            sight = mi.Bool(landing)  # each camera narrows its own
+            value, share, pixel, lands = self._connect(
+                scene, film, arrival.vertex, ratio / self._light_paths, sight
+            )
+            values = self._parts.by_lobe(arrival.light * value, share)
+            for total, part in zip(sums, values, strict=True):
+                total.add(part, pixel, lands)
+
+    def _connect(
+        self, scene: KernelScene, film: Film, vertex: Vertex, mis_ratio: Any, active: Any
+    ) -> tuple[Any, Any, Any, Any]:
+        """Return the light of a vertex in the picture: value, diffuse share, pixel and visibility.
+
+        The value and the share of the diffuse lobe are Color3f, the pixel UInt32, visibility Bool.
+
+        Args:
+            mis_ratio: Float, the square root of (hit^2 + pick^2) / land^2, without P and c_1.
+        """
+        to_camera = film.origin - vertex.point.position
+        distance_sq = dr.squared_norm(to_camera)
+        direction = to_camera * dr.rsqrt(distance_sq)
+        local = vertex.frame.to_local(direction)
+        reflected, forward, _ = _evaluate_brdf(scene, vertex, local, active, None)
+        pixels = film.pdf(-direction) * dr.abs(dr.dot(vertex.geometric, local)) / distance_sq
+        share = 1 / (1 + dr.square(pixels * mis_ratio * forward))
+        pixel, inside = film.pixel(vertex.point.position)
+        active &= inside & (dr.max(reflected) > 0)
+        start = off_surface(vertex.point, to_camera)
+        remaining = film.origin - start
+        ray = mi.Ray3f(start, mi.Vector3f(dr.normalize(remaining)))
+        ray.maxt = dr.norm(remaining)
+        active &= ~scene.surfaces.ray_test(ray, active=active)
+        of_diffuse = self._parts.share(*_flip_to_viewer(scene, vertex, local, active))
+        return reflected * (share * pixels / self._light_paths), of_diffuse, pixel, active
 
 
 def bounce(
@@ -213,15 +228,12 @@ def _evaluate_brdf(
     `guide` is the guide table of the viewer's path.
     """
     seen, wo = _flip_to_viewer(scene, vertex, view, active)
-    reflected, pdf = ggx.evaluate_bsdf(seen.lobes, seen.incoming, wo, seen.geometric, seen.unmapped)
+    reflected, pdf = seen.evaluate(wo)
     if guide is not None:
-        guidance = guide.at(vertex.triangle, vertex.barycentric, seen.front, seen.lobes, active)
         to_light = vertex.frame.to_world(vertex.incoming)
-        pdf = guide.mixture(guidance, pdf, to_light, active)
-    back = ggx.reverse_pdf(seen.lobes, seen.incoming, wo, seen.geometric)
-    if seen.turned is not None:
-        back = dr.select(seen.turned, 0, back)
-    return reflected, pdf, back
+        guidance = guide.at(seen.hit, seen.front, seen.lobes, active)
+        pdf = guidance.mixture(pdf, to_light, active)
+    return reflected, pdf, seen.reverse_pdf(wo)
 
 
 def _flip_to_viewer(
@@ -241,9 +253,8 @@ def _flip_to_viewer(
         unmapped=None if vertex.unmapped is None else vertex.unmapped * flip * side,
         front=vertex.front ^ (side < 0),
     )
-    seen, (wo,) = face_viewer(turned_over, vertex.incoming * flip)
-    albedo = scene.albedo(seen.incoming.z, vertex.lobes.alpha, active)
-    return replace(seen, lobes=ggx.seen_from(vertex.lobes, seen.incoming, albedo)), wo
+    seen, (wo,) = face_viewer(scene, turned_over, active, vertex.incoming * flip)
+    return seen, wo
 
 
 _SLOTS = 6
@@ -257,22 +268,35 @@ _LEAST_ROUGH = 0.2
 
 
 class PhotonRecords:
-    """Arrivals of each lane. Not a dataclass: Dr.Jit would take its arrays for loop variables."""
+    """Where light arrives by way of narrow lobes; path guiding learns from it (guide_table).
 
-    def __init__(self, count: int) -> None:
+    Arrivals straight from an emitter are not recorded, because the path tracer picks emitters, nor
+    those by way of wide lobes, because a BRDF sample finds such light. Not a dataclass: Dr.Jit
+    would take its arrays for loop variables.
+    """
+
+    def __init__(self, cells: GuideCells, count: int) -> None:
         """Begin with none, for `count` paths."""
+        self._guide_cells = cells
         self._first = dr.arange(mi.UInt32, count) * _SLOTS
         self._cells = dr.zeros(mi.UInt32, count * _SLOTS)
         self._bins = dr.zeros(mi.UInt32, count * _SLOTS)
         self._powers = dr.zeros(mi.Float, count * _SLOTS)
 
-    def add(self, slot: Any, cell: Any, index: Any, power: Any, active: Any) -> None:
-        """Record an arrival of each lane in a cell, from the direction of a bin (UInt32)."""
-        active = active & (slot < _SLOTS)
+    def __call__(self, _: KernelScene, arrival: Arrival) -> None:
+        """Record an arrival of each lane in a cell, from the bin of its direction."""
+        vertex = arrival.vertex
+        cell = self._guide_cells.index(vertex.hit, vertex.front, arrival.active)
+        index, _ = bin_of(-arrival.direction)
+        reflects = dr.max(vertex.lobes.diffuse + vertex.lobes.specular) > 0
+        arrives = arrival.active & (arrival.drawn > _NARROW) & reflects
+        arrives &= rough_share(vertex.lobes) > _LEAST_ROUGH
+        slot = arrival.depth - 2
+        active = arrives & (slot < _SLOTS)
         place = self._first + slot
         dr.scatter(self._cells, cell, place, active)
         dr.scatter(self._bins, index, place, active)
-        dr.scatter(self._powers, power, place, active)
+        dr.scatter(self._powers, arrival.power, place, active)
 
     def photons(self) -> Photons:
         """Return all that was recorded, path by path."""
@@ -280,54 +304,3 @@ class PhotonRecords:
         rows = np.flatnonzero((powers > 0) & np.isfinite(powers))
         cell, number = (read_back(v)[rows].astype(np.int64) for v in (self._cells, self._bins))
         return Photons(cell=cell, bin=number, power=powers[rows])
-
-
-@dr.syntax
-def trace_photons(
-    scene: KernelScene,
-    cells: GuideCells,
-    emitter: EmitterPoint,
-    u_direction: Any,
-    sampler: Any,
-    records: PhotonRecords,
-) -> None:
-    """Record where light arrives by way of narrow lobes; see `trace_light` for shared arguments.
-
-    Path guiding learns from it (pipeline.renders.guide_table). Arrivals straight from an emitter
-    are not recorded, because the path tracer picks emitters, nor those by way of wide lobes,
-    because a BRDF sample finds such light.
-    """
-    start, direction, leaving, inverse_pdf = _leave_emitter(scene, emitter, u_direction)
-    active = mi.Bool((leaving > 0) & (dr.max(emitter.radiance) > 0))
-    strength = dr.max(emitter.radiance) * inverse_pdf
-    throughput = mi.Color3f(emitter.radiance / dr.max(emitter.radiance))
-    first = next_hit(scene, start, direction, active)
-    active &= first.is_valid
-    triangle = first.triangle
-    barycentric = first.barycentric
-    depth = mi.UInt32(1)
-    drawn = mi.Float(0)
-    while active:
-        point = scene.table.point(triangle, barycentric, active)
-        vertex = vertex_at(scene, point, triangle, barycentric, direction, active)
-        cell = cells.index(triangle, barycentric, vertex.front, active)
-        index, _ = bin_of(-direction)
-        reflects = dr.max(vertex.lobes.diffuse + vertex.lobes.specular) > 0
-        arrives = active & (drawn > _NARROW) & (rough_share(vertex.lobes) > _LEAST_ROUGH) & reflects
-        power = dr.mean(throughput) * strength
-        records.add(depth - 2, cell, index, power, arrives)
-        spread = dr.maximum(dr.dot(vertex.geometric, vertex.incoming), SMALLEST_COSINE)
-        throughput /= spread
-        depth += 1
-        active &= depth < scene.max_depth
-        u_lobe = sampler.next_1d(active)
-        u_local = sampler.next_2d(active)
-        local, reflected, _, ratio = bounce(scene, vertex, u_lobe, u_local, active)
-        throughput *= reflected * ratio
-        throughput, active = roulette(scene, throughput, depth, sampler.next_1d(active), active)
-        drawn = dr.abs(dr.dot(vertex.geometric, local)) / ratio
-        direction = mi.Vector3f(vertex.frame.to_world(local))
-        hit = next_hit(scene, point, direction, active)
-        active &= hit.is_valid
-        triangle = hit.triangle
-        barycentric = hit.barycentric

@@ -17,7 +17,6 @@ import json
 import os
 import platform
 import re
-import shutil
 import subprocess
 import sys
 import tempfile
@@ -264,6 +263,7 @@ def run_module(
 
 
 _FOLDERS = (
+    "/usr/lib",
     "/usr/lib/*-linux-gnu",
     "/usr/lib64",
     "/usr/lib64/llvm*/lib64",
@@ -273,7 +273,6 @@ _FOLDERS = (
     "/usr/local/opt/llvm*/lib",
 )
 _NAME = re.compile(r"libLLVM(?:-(\d+))?(?:\.so|\.dylib)?(?:\.(\d+))?[\d.]*(?:\.so|\.dylib)?[\d.]*$")
-_LDCONFIG_S = 20
 _WHEEL = "karellen-llvm-core"
 
 
@@ -283,16 +282,15 @@ def llvm_libraries() -> list[Path]:
     Symbolic links are resolved, so that one library is named once.
     """
     named = os.environ.get("DRJIT_LIBLLVM_PATH")
-    candidates = {path.resolve() for path in (*_known_to_loader(), *_in_usual_folders())}
-
-    def by_version(path: Path) -> tuple[int, str]:
-        match = _NAME.match(path.name)
-        numbers = [int(group) for group in match.groups() if group] if match else []
-        return -numbers[0] if numbers else 0, str(path)
-
-    ordered = sorted(candidates, key=by_version)
+    candidates = {path.resolve() for path in _in_usual_folders()}
+    ordered = sorted(candidates, key=lambda path: (-_version_in_name(path), str(path)))
     first = [Path(named).resolve()] if named else []
     return [path for path in dict.fromkeys([*first, *_of_wheel(), *ordered]) if path.is_file()]
+
+
+def _version_in_name(path: Path) -> int:
+    match = _NAME.match(path.name)
+    return next((int(group) for group in match.groups() if group), 0) if match else 0
 
 
 def _of_wheel() -> list[Path]:
@@ -302,16 +300,6 @@ def _of_wheel() -> list[Path]:
     except metadata.PackageNotFoundError:
         return []
     return [Path(str(file.locate())).resolve() for file in members if _NAME.match(file.name)]
-
-
-def _known_to_loader() -> Iterable[Path]:
-    ldconfig = shutil.which("ldconfig") or shutil.which("ldconfig", path="/sbin:/usr/sbin")
-    if ldconfig is None:
-        return []
-    listing = subprocess.run(
-        [ldconfig, "-p"], capture_output=True, text=True, timeout=_LDCONFIG_S, check=False
-    ).stdout
-    return [Path(path) for path in re.findall(r"=> (\S*/libLLVM[-.]\S*)", listing)]
 
 
 def _in_usual_folders() -> Iterable[Path]:

@@ -32,13 +32,14 @@ Two allowances are added to the mean over the pixels:
 
 Light that no sample has found is not seen: a view whose only caustic was never hit looks converged.
 
-The terms of each pixel are in host_pictures and in pixel_arithmetic.estimates
-(kernels); both hand their sums over blocks to `estimate_noise_floor_db` here. The error that is
-stated by calibration on other scenes is in pipeline.renders.calibrated_error.
+The terms of each pixel are in pipeline.renders.pictures, for numpy and for kernels, which hands
+their sums over blocks to `measured_floor` here. The error that is stated by
+calibration on other scenes is in pipeline.renders.calibrated_error.
 """
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -56,7 +57,7 @@ of float32 values are rounding."""
 LINEAR_STANDARD_ERRORS = 2.0
 """Of one, 3 to 10 % of the linear floors of 16 scenes were more than 1 dB too good (study S16)."""
 
-Curve = Callable[[NDArray[np.float64]], NDArray[np.float64]]
+Curve = Callable[[Any], Any]
 """What errors are taken in, of radiance."""
 
 
@@ -132,6 +133,22 @@ def estimate_noise_floor_db(
     return MAX_DB if bound <= 10 ** (-MAX_DB / 10) else float(-10 * np.log10(bound))
 
 
+def measured_floor(
+    rows: Iterable[tuple[float, float, NDArray[np.float64], NDArray[np.float64]]],
+) -> MeasuredFloor:
+    """Return the floor of a picture.
+
+    Args:
+        rows: of log and linear light and of objects: mean error, greatest surprise, and the sums of
+            estimates and pixels over the blocks, as `estimate_noise_floor_db` takes them.
+    """
+    log_db, linear_db, object_log_db = (
+        estimate_noise_floor_db(*row, standard_errors)
+        for row, standard_errors in zip(rows, (1.0, LINEAR_STANDARD_ERRORS, 1.0), strict=True)
+    )
+    return MeasuredFloor(log_db=log_db, linear_db=linear_db, object_log_db=object_log_db)
+
+
 def _standard_error(sums: NDArray[np.float64], counts: NDArray[np.float64]) -> float:
     """Return the standard error of the mean error over the pixels, from sums over blocks."""
     total = counts.sum()
@@ -142,14 +159,13 @@ def _standard_error(sums: NDArray[np.float64], counts: NDArray[np.float64]) -> f
 
 
 def secant_slope(
-    curve: Curve, first: NDArray[np.float64], second: NDArray[np.float64]
-) -> NDArray[np.float64]:
+    curve: Curve, first: Any, second: Any, *, select: Callable[..., Any] = np.where
+) -> Any:
     """Return the slope of the line through two points of a curve, or its own where they are one."""
     step = second - first
-    least = SMALLEST_STEP * (1 + np.abs(first))
-    step = np.where(np.abs(step) < least, least, step)
-    slope: NDArray[np.float64] = (curve(first + step) - curve(first)) / step
-    return slope
+    least = SMALLEST_STEP * (1 + abs(first))
+    step = select(abs(step) < least, least, step)
+    return (curve(first + step) - curve(first)) / step
 
 
 def clamped_radiance(radiance: NDArray[np.float64]) -> NDArray[np.float64]:

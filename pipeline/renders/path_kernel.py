@@ -24,17 +24,17 @@ from pipeline.renders.guide_table import Guidance
 from pipeline.renders.kernel_scene import (
     MAX_MIS_RATIO,
     SMALLEST_COSINE,
-    Hit,
     KernelParts,
     KernelScene,
     Vertex,
     face_viewer,
+    hit_of,
     next_hit,
     off_surface,
     roulette,
     vertex_at,
 )
-from pipeline.renders.surface_table import SurfacePoint
+from pipeline.renders.surface_table import Hit, SurfacePoint
 
 
 @dr.syntax
@@ -51,11 +51,8 @@ def trace(
         sampler: mi.Sampler with a lane for each ray.
         ray: Ray3f from `film`.
     """
-    first = Hit(scene.surfaces.ray_intersect_preliminary(ray, coherent=True))
-    active = mi.Bool(first.is_valid)
-    distance = first.distance
-    triangle = first.triangle
-    barycentric = first.barycentric
+    hit, is_met = hit_of(scene.surfaces.ray_intersect_preliminary(ray, coherent=True))
+    active = mi.Bool(is_met)
     direction = mi.Vector3f(ray.d)
     radiance = _background(scene, parts, direction, active)
     throughput = mi.Color3f(1)
@@ -64,17 +61,17 @@ def trace(
     depth = mi.UInt32(0)
     guided = mi.Float(1)
     # the ratio L / P * product of C+_i r_i / (c_i C-_(i+1)) of pipeline.renders.light_kernel
-    mis_ratio = light_paths * dr.square(distance) / film.pdf(direction)
+    mis_ratio = light_paths * dr.square(hit.distance) / film.pdf(direction)
     while active:
-        point = scene.table.point(triangle, barycentric, active)
+        point = scene.table.point(hit, active)
         mis_ratio /= dr.maximum(dr.abs(dr.dot(point.geometric_normal, direction)), SMALLEST_COSINE)
-        emits = active & (triangle >= scene.num_surfaces)
+        emits = active & (hit.triangle >= scene.num_surfaces)
         landing = dr.select(depth > 1, mis_ratio, 0)
-        seen = _seen_emission(scene, point, triangle, direction, distance, pdf, landing, emits)
+        seen = _seen_emission(scene, point, hit, direction, pdf, landing, emits)
         radiance = parts.add(radiance, throughput * seen, depth, share)
         depth += 1
         active &= depth < scene.max_depth
-        vertex = _vertex_from_viewer(scene, point, triangle, barycentric, direction, active)
+        vertex, _ = face_viewer(scene, vertex_at(scene, point, hit, direction, active), active)
         guidance = _guidance(scene, vertex, active & (depth > 1))
         u = sampler.next_2d(active)
         lit, local = _direct_light(scene, vertex, guidance, mis_ratio, depth, u, active)
@@ -82,9 +79,9 @@ def trace(
         radiance = parts.add(radiance, throughput * lit, depth, lit_share)
         u_lobe = sampler.next_1d(active)
         u_local = sampler.next_2d(active)
-        local = _sample_direction(scene, vertex, guidance, u_lobe, u_local, active)
-        reflected, unguided = _evaluate_brdf(vertex, local)
-        pdf = _density(scene, vertex, guidance, unguided, local, active)
+        local = _sample_direction(vertex, guidance, u_lobe, u_local, active)
+        reflected, unguided = vertex.evaluate(local)
+        pdf = _density(vertex, guidance, unguided, local, active)
         share = parts.carry_share(vertex, local, depth, share)
         active &= pdf > 0
         guided *= _ratio(guidance, pdf, unguided)
@@ -95,44 +92,27 @@ def trace(
         u_end = sampler.next_1d(active)
         throughput, active = roulette(scene, throughput, depth, u_end, active, guided)
         direction = mi.Vector3f(vertex.frame.to_world(local))
-        hit = next_hit(scene, point, direction, active)
-        lit = _sky_emission(scene, direction, pdf, throughput, active, hit)
+        hit, is_met = next_hit(scene, point, direction, active)
+        lit = _sky_emission(scene, direction, pdf, throughput, active & ~is_met)
         radiance = radiance if lit is None else parts.add(radiance, lit, depth, share)
-        active &= hit.is_valid
-        distance = hit.distance
-        triangle = hit.triangle
-        barycentric = hit.barycentric
+        active &= is_met
     return radiance
-
-
-def _vertex_from_viewer(
-    scene: KernelScene,
-    point: SurfacePoint,
-    triangle: Any,
-    barycentric: Any,
-    direction: Any,
-    active: Any,
-) -> Vertex:
-    vertex, _ = face_viewer(vertex_at(scene, point, triangle, barycentric, direction, active))
-    albedo = scene.albedo(vertex.incoming.z, vertex.lobes.alpha, active)
-    return replace(vertex, lobes=ggx.seen_from(vertex.lobes, vertex.incoming, albedo))
 
 
 def _seen_emission(
     scene: KernelScene,
     point: SurfacePoint,
-    triangle: Any,
+    hit: Hit,
     direction: Any,
-    distance: Any,
     pdf: Any,
     landing: Any,
     emits: Any,
 ) -> Any:
     """Return the emission that a sampled direction hit, weighed against the other strategies."""
-    row = dr.select(emits, triangle - scene.num_surfaces, 0)
+    row = dr.select(emits, hit.triangle - scene.num_surfaces, 0)
     area_pdf, emitted = scene.emitters.pdf_and_radiance(row, emits)
     cosine = dr.abs(dr.dot(point.geometric_normal, direction))
-    emitter_density = scene.to_pick_pdf(area_pdf) * dr.square(distance) / cosine
+    emitter_density = scene.to_pick_pdf(area_pdf) * dr.square(hit.distance) / cosine
     leaving = scene.cone.pdf(point.position, point.geometric_normal, -direction)
     other_ratios_sq = dr.square(emitter_density / pdf) + dr.square(landing * area_pdf * leaving)
     shines = emits & (dr.max(emitted) > 0)  # one that is off has no density: 0/0 at grazing angles
@@ -147,13 +127,10 @@ def _background(scene: KernelScene, parts: KernelParts, direction: Any, is_hit: 
     return parts.add(parts.dark(), dr.select(is_hit, 0, seen), mi.UInt32(1), parts.first_share())
 
 
-def _sky_emission(
-    scene: KernelScene, direction: Any, pdf: Any, throughput: Any, active: Any, hit: Hit
-) -> Any:
+def _sky_emission(scene: KernelScene, direction: Any, pdf: Any, throughput: Any, free: Any) -> Any:
     """Return the sky's light where a sampled direction hits nothing; None without a sky."""
     if scene.sky is None:
         return None
-    free = active & ~hit.is_valid
     radiance, picks = scene.sky.radiance_and_density(direction, free)
     return throughput * dr.select(free, radiance / (1 + dr.square(picks / pdf)), 0)
 
@@ -161,40 +138,29 @@ def _sky_emission(
 def _guidance(scene: KernelScene, vertex: Vertex, active: Any) -> Guidance | None:
     if scene.guide is None:
         return None
-    place = vertex.triangle, vertex.barycentric, vertex.front
-    return scene.guide.at(*place, vertex.lobes, active)
+    return scene.guide.at(vertex.hit, vertex.front, vertex.lobes, active)
 
 
 def _sample_direction(
-    scene: KernelScene,
-    vertex: Vertex,
-    guidance: Guidance | None,
-    u_lobe: Any,
-    u_local: Any,
-    active: Any,
+    vertex: Vertex, guidance: Guidance | None, u_lobe: Any, u_local: Any, active: Any
 ) -> Any:
     """Return the next direction (Vector3f, in the frame) of a path."""
-    if scene.guide is None or guidance is None:
+    if guidance is None:
         return ggx.sample(vertex.lobes, vertex.incoming, u_lobe, u_local)
     guided = u_lobe < guidance.share
-    world = scene.guide.sample(guidance, u_local, active & guided)
+    world = guidance.sample(u_local, active & guided)
     u_rest = (u_lobe - guidance.share) / (1 - guidance.share)
     local = ggx.sample(vertex.lobes, vertex.incoming, u_rest, u_local)
     return mi.Vector3f(dr.select(guided, vertex.frame.to_local(world), local))
 
 
 def _density(
-    scene: KernelScene,
-    vertex: Vertex,
-    guidance: Guidance | None,
-    unguided: Any,
-    local: Any,
-    active: Any,
+    vertex: Vertex, guidance: Guidance | None, unguided: Any, local: Any, active: Any
 ) -> Any:
     """Return the density of `_sample_direction` from that of a BRDF sample."""
-    if scene.guide is None or guidance is None:
+    if guidance is None:
         return unguided
-    return scene.guide.mixture(guidance, unguided, vertex.frame.to_world(local), active)
+    return guidance.mixture(unguided, vertex.frame.to_world(local), active)
 
 
 def _ratio(guidance: Guidance | None, pdf: Any, unguided: Any) -> Any:
@@ -202,18 +168,10 @@ def _ratio(guidance: Guidance | None, pdf: Any, unguided: Any) -> Any:
     return 1 if guidance is None else dr.select(unguided > 0, pdf / unguided, 1)
 
 
-def _evaluate_brdf(vertex: Vertex, local: Any) -> tuple[Any, Any]:
-    return ggx.evaluate_bsdf(
-        vertex.lobes, vertex.incoming, local, vertex.geometric, vertex.unmapped
-    )
-
-
 def _reverse_pdf_term(vertex: Vertex, local: Any, depth: Any) -> Any:
     """Return C+ r of a light path that comes from `local`; r is 1 at x1, where it ends."""
-    drawn = ggx.reverse_pdf(vertex.lobes, vertex.incoming, local, vertex.geometric)
-    if vertex.turned is not None:  # a light path is not turned to its next viewer
-        drawn = dr.select(vertex.turned, 0, drawn)
-    return dr.abs(dr.dot(vertex.geometric, local)) * dr.select(depth > 1, drawn, 1)
+    drawn = dr.select(depth > 1, vertex.reverse_pdf(local), 1)
+    return dr.abs(dr.dot(vertex.geometric, local)) * drawn
 
 
 def _direct_light(
@@ -231,8 +189,8 @@ def _direct_light(
     """
     pick = picked_light(scene, vertex.point.position, u, active)
     local = vertex.frame.to_local(pick.direction)
-    reflected, unguided = _evaluate_brdf(vertex, local)
-    pdf = _density(scene, vertex, guidance, unguided, local, active)
+    reflected, unguided = vertex.evaluate(local)
+    pdf = _density(vertex, guidance, unguided, local, active)
     landing = mis_ratio * _reverse_pdf_term(vertex, local, depth) * pick.leaving / pick.distance_sq
     other_ratios_sq = dr.square(pdf / pick.pdf) + dr.square(dr.select(depth > 1, landing, 0))
     useful = active & (dr.max(reflected) > 0) & dr.isfinite(pick.pdf)
@@ -287,14 +245,14 @@ def picked_light(scene: KernelScene, position: Any, u: Any, active: Any) -> Pick
         return _of_lamps(scene, position, u, active)
     is_sky, u_sky, u_lamp = scene.sky.split_picks(u)
     lamp = _of_lamps(scene, position, u_lamp, active & ~is_sky)
-    sky = scene.sky.sample(u_sky, active & is_sky)
+    direction, pdf, radiance = scene.sky.sample(u_sky, active & is_sky)
     # A light path leaves a lamp with its density among lamps; picks have only their share of it.
     leaving = lamp.leaving / dr.maximum(scene.to_pick_pdf(mi.Float(1)), _LEAST_SHARE)
     return replace(
         lamp,
-        direction=mi.Vector3f(dr.select(is_sky, sky.direction, lamp.direction)),
-        pdf=dr.select(is_sky, sky.pdf, scene.to_pick_pdf(lamp.pdf)),
-        radiance=mi.Color3f(dr.select(is_sky, sky.radiance, lamp.radiance)),
+        direction=mi.Vector3f(dr.select(is_sky, direction, lamp.direction)),
+        pdf=dr.select(is_sky, pdf, scene.to_pick_pdf(lamp.pdf)),
+        radiance=mi.Color3f(dr.select(is_sky, radiance, lamp.radiance)),
         leaving=dr.select(is_sky, 0, leaving),
         distance_sq=dr.select(is_sky, 1, lamp.distance_sq),
         is_sky=is_sky,

@@ -9,24 +9,24 @@ from collections import Counter
 from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass
 from functools import partial
-from typing import Annotated, Any, get_args
+from typing import TYPE_CHECKING, Annotated, Any, get_args
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from pipeline.renders.calibrated_error import first_spp
-from pipeline.renders.renderer import SceneRenderer, representable, require_surfaces
-from pipeline.renders.results import GrowingPicture, RenderedView, run_to_end
 from pipeline.renders.settings import PASS_SPP, Depth, Filtered, RenderSettings, Resolution
-from pipeline.renders.tracer import PixelCamera, Tracer, load_tracer, pixel_camera
-from pipeline.renders.view_pictures import require_bounded
+from pipeline.renders.tracer import PixelCamera, load_tracer, pixel_camera
+from pipeline.renders.view_pictures import representable, require_bounded, require_finite
 from storage.denoiser import Features, Quality, denoise
-from storage.errors import Rejected, TrilightError
+from storage.errors import TrilightError
 from storage.records.scene import Scene
 from storage.renderer import Sampling
 from storage.seeds import seed_for
 from storage.settings.described import checked
 from storage.settings.ranges import Within
+
+if TYPE_CHECKING:
+    from pipeline.renders.vector_tracer import VectorTracer
 
 MOST_SPP = 4096
 """Maximum number of samples of a preview; above it, use a stated error."""
@@ -88,7 +88,6 @@ class PreviewRenderer:
         Raises:
             Rejected: "unlit_scene" or "no_surfaces", as of `SceneRenderer`.
         """
-        require_surfaces(scene)
         self._settings = settings
         self._tracer = load_tracer(scene, max_depth=settings.max_depth, rr_depth=settings.rr_depth)
 
@@ -104,7 +103,7 @@ class PreviewRenderer:
 
 
 def preview_steps(
-    tracer: Tracer, camera: PixelCamera, seed: int, spp: int, denoiser: Filtered
+    tracer: "VectorTracer", camera: PixelCamera, seed: int, spp: int, denoiser: Filtered
 ) -> Iterator[Sampling | Preview]:
     """Do what `PreviewRenderer.view_steps` does, for a scene that a tracer has loaded."""
     began_s = time.process_time()
@@ -116,9 +115,7 @@ def preview_steps(
         done += size
         yield Sampling(spp=done, expected_spp=spp, missing_db=None)
     mean = (total / done).astype(np.float32)
-    if not np.isfinite(mean).all():
-        broken = int((~np.isfinite(mean)).any(axis=-1).sum())
-        raise Rejected("nonfinite_radiance", f"{broken} pixels of raw samples")
+    require_finite(int((~np.isfinite(mean)).any(axis=-1).sum()))
     require_bounded(float(mean.max()))
     if denoiser != "off":
         mean = denoise(mean, tracer.features(camera, spp=guide_rays(done)), denoiser)
@@ -218,44 +215,3 @@ def seconds_of(parts: Mapping[str, int], part_s: Mapping[str, float]) -> float:
 FIRST_LOOKS_SPP = (1, 4, 16)
 """Samples of the previews; each is a picture of its own, and together they cost less than a third
 of the samples before the first measurement."""
-
-
-class ProgressiveRenderer:
-    """A scene loaded once, for pictures that appear at once and then improve step by step.
-
-    First come previews of few samples, whose error is unknown; then the picture of `SceneRenderer`
-    grows to its target, shown at each measurement. What comes at the end is, bit by bit, what
-    `SceneRenderer` alone makes.
-    """
-
-    def __init__(self, scene: Scene, settings: RenderSettings) -> None:
-        """Load a scene; raises as `SceneRenderer`, which `settings` are for."""
-        self._settings = settings
-        self._measured = SceneRenderer(scene, settings, shows_looks=True)
-
-    def view_steps(
-        self, c2w: ArrayLike, fov_deg: float, seed: int
-    ) -> Iterator[Sampling | RenderedView]:
-        """Yield looks, the progress of sampling between them, and last the finished picture.
-
-        Args:
-            c2w: [4, 4] camera to world.
-            fov_deg: full field of view in degrees.
-            seed: of the samples.
-
-        Raises:
-            Rejected: as of `SceneRenderer.render_view`.
-        """
-        camera = pixel_camera(c2w, fov_deg, self._settings.resolution)
-        for spp in FIRST_LOOKS_SPP:
-            steps = preview_steps(self._measured.tracer, camera, seed, spp, usual_filter(spp))
-            preview = run_to_end(steps)
-            yield GrowingPicture(
-                spp=preview.spp,
-                expected_spp=first_spp(self._settings),
-                missing_db=None,
-                radiance_rgb=preview.radiance_rgb,
-                floor=None,
-                core_s=preview.core_s,
-            )
-        yield from self._measured.view_steps(c2w, fov_deg, seed)

@@ -22,8 +22,8 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from pipeline.renders.calibrated_error import first_spp
-from pipeline.renders.host_pictures import HostPictures
-from pipeline.renders.noise_floor import MeasuredFloor
+from pipeline.renders.pictures import ViewPictures
+from pipeline.renders.preview import FIRST_LOOKS_SPP, preview_steps, usual_filter
 from pipeline.renders.results import GrowingPicture, RenderedView, run_to_end
 from pipeline.renders.samples import (
     DualBuffer,
@@ -35,9 +35,8 @@ from pipeline.renders.samples import (
     next_spp,
 )
 from pipeline.renders.settings import RenderSettings
-from pipeline.renders.tracer import load_tracer, pixel_camera
-from pipeline.renders.view_pictures import MeasuredLook, ViewPictures
-from storage.conventions import HALF_FLOAT_MAX
+from pipeline.renders.tracer import PixelCamera, load_tracer, pixel_camera
+from pipeline.renders.view_pictures import MeasuredLook, representable
 from storage.denoiser import set_denoiser_threads
 from storage.errors import Rejected
 from storage.records.lights import (
@@ -75,8 +74,10 @@ class SceneRenderer:
         """Load a scene that passes `Scene.check`; `activate` must have been called.
 
         Args:
-            shows_looks: whether `view_steps` yields a `GrowingPicture` after each measurement by
-                which a target is missed; pictures stay the same, each look costs one denoise.
+            shows_looks: whether `view_steps` yields pictures that appear at once and then improve:
+                previews of few samples, whose error is unknown, and a `GrowingPicture` after each
+                measurement by which a target is missed, each of which costs one denoise. The
+                picture at the end is the same, bit by bit.
             light_seed: of the light paths of all views, where the settings let them share these;
                 None: each view has its own.
 
@@ -86,7 +87,6 @@ class SceneRenderer:
                 picture would be black), "too_many_lights" where more than MAX_LIGHTS would be
                 kept apart.
         """
-        require_surfaces(scene)
         self._settings = settings
         self._shows_looks = shows_looks
         self._began_s = 0.0
@@ -96,7 +96,7 @@ class SceneRenderer:
                 bounces=settings.split, lobes=settings.split_lobes
             )
         self._tracers = [self.tracer]
-        self._arithmetic: Any = HostPictures
+        self._arithmetic: Any = ViewPictures
         if settings.arithmetic == "device":
             from pipeline.renders.device_pictures import DevicePictures  # imports mitsuba
 
@@ -136,9 +136,11 @@ class SceneRenderer:
     ) -> Iterator[Sampling | RenderedView]:
         """Do what `render_view` does: yield after each pass of one half, and last the picture."""
         settings = self._settings
-        self._began_s = time.process_time()
         camera = pixel_camera(c2w, fov_deg, settings.resolution)
         settled = first_spp(settings)
+        if self._shows_looks:
+            yield from self._first_looks(camera, seed)
+        self._began_s = time.process_time()
         samples = DualBuffer(
             self._tracers,
             camera,
@@ -185,6 +187,18 @@ class SceneRenderer:
             **stored,
         )
 
+    def _first_looks(self, camera: PixelCamera, seed: int) -> Iterator[GrowingPicture]:
+        for spp in FIRST_LOOKS_SPP:
+            preview = run_to_end(preview_steps(self.tracer, camera, seed, spp, usual_filter(spp)))
+            yield GrowingPicture(
+                spp=preview.spp,
+                expected_spp=first_spp(self._settings),
+                missing_db=None,
+                radiance_rgb=preview.radiance_rgb,
+                floor=None,
+                core_s=preview.core_s,
+            )
+
     def _to_stored(self, pictures: NDArray[np.float32]) -> dict[str, Any]:
         """Return the pictures of a view by their fields: the sum of what is apart, as stored."""
         per_light = self._settings.per_light
@@ -223,7 +237,18 @@ class SceneRenderer:
             expected = expected_spp(measured, goal)
             missing_db = max(gaps.values())
             if self._shows_looks:
-                yield self._growing(samples, pictures, look.floor, expected, missing_db)
+                looked_s = time.process_time()
+                radiance_rgb = self._to_stored(pictures.finish())["radiance_rgb"]
+                core_s = time.process_time() - self._began_s
+                self._began_s += time.process_time() - looked_s  # to be shown takes a view no time
+                yield GrowingPicture(
+                    spp=samples.spp,
+                    expected_spp=expected,
+                    missing_db=missing_db,
+                    radiance_rgb=radiance_rgb,
+                    floor=look.floor,
+                    core_s=core_s,
+                )
             if expected >= _GUIDED_SPP:
                 samples.guide()
             spp = next_spp(measured, goal)
@@ -231,40 +256,6 @@ class SceneRenderer:
             passes = samples.passes_to(spp) if chosen is None else samples.passes_over(chosen)
             for _ in passes:
                 yield Sampling(spp=samples.spp, expected_spp=expected, missing_db=missing_db)
-
-    def _growing(
-        self,
-        samples: DualBuffer,
-        pictures: ViewPictures,
-        floor: MeasuredFloor,
-        expected_spp: int,
-        missing_db: float,
-    ) -> GrowingPicture:
-        looked_s = time.process_time()
-        picture = self._to_stored(pictures.finish())["radiance_rgb"]
-        core_s = time.process_time() - self._began_s
-        self._began_s += time.process_time() - looked_s  # the view takes no time by being shown
-        return GrowingPicture(
-            spp=samples.spp,
-            expected_spp=expected_spp,
-            missing_db=missing_db,
-            radiance_rgb=picture,
-            floor=floor,
-            core_s=core_s,
-        )
-
-
-def require_surfaces(scene: Scene) -> None:
-    """Raise Rejected("no_surfaces") where all triangles emit: every picture would be black."""
-    if scene.triangle_emits.all():
-        raise Rejected("no_surfaces", f"all {scene.num_triangles} triangles are emitters")
-
-
-def representable(radiance_rgb: NDArray[np.float32]) -> NDArray[np.float32]:
-    """Return radiance that half floats can hold; raises Rejected("radiance_overflow") else."""
-    if radiance_rgb.max() >= HALF_FLOAT_MAX:
-        raise Rejected("radiance_overflow", f"a pixel of radiance {radiance_rgb.max():.3g}")
-    return radiance_rgb
 
 
 def set_threads(count: int) -> None:

@@ -23,14 +23,18 @@ doubling of the samples bought in its own metric, and the one that needs most sa
 import math
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
+from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import NDArray
 
 from pipeline.renders.noise_floor import BLOCK_PX
 from pipeline.renders.settings import PASS_SPP, Filtered
-from pipeline.renders.tracer import Chosen, PixelCamera, Tracer
+from pipeline.renders.tracer import Chosen, PixelCamera
 from storage.seeds import seed_for
+
+if TYPE_CHECKING:
+    from pipeline.renders.vector_tracer import VectorTracer
 
 
 class DualBuffer:
@@ -43,7 +47,7 @@ class DualBuffer:
 
     def __init__(
         self,
-        tracers: Sequence[Tracer],
+        tracers: Sequence["VectorTracer"],
         camera: PixelCamera,
         seed: int,
         *,
@@ -74,14 +78,11 @@ class DualBuffer:
     def count_over(self, counted: NDArray[np.bool_]) -> None:
         """Let `spp` be a mean over some pixels, [R, R], from now on; before, it is over all."""
         self._counted = counted
-        self._mean_spp: int | None = None
 
     @property
     def spp(self) -> int:
         """Samples per pixel so far, both halves together: the mean over the counted pixels."""
-        if self._mean_spp is None:
-            self._mean_spp = int(self._spp.sum(axis=0).mean(where=self._counted))
-        return self._mean_spp
+        return int(self._spp.sum(axis=0).mean(where=self._counted))
 
     def spp_of(self, half: int) -> NDArray[np.int64]:
         """Return the samples of each pixel in one half, [R, R]."""
@@ -136,7 +137,6 @@ class DualBuffer:
             tracer.add(seed=seed, spp=size, chosen=chosen, light_seed=light_seed)
         self._spp[half] += size if chosen is None else size * chosen
         self._count[half] += 1 if chosen is None else chosen
-        self._mean_spp = None
 
     def guide(self) -> None:
         """Let the passes from now on be guided (pipeline.renders.guide_table)."""

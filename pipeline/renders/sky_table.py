@@ -6,7 +6,6 @@ solid angle. Radiance is interpolated between texels, so a texel's light is the 
 a sun of one texel shines into its eight neighbours, and they are drawn by what they have of it.
 """
 
-from dataclasses import dataclass
 from typing import Any
 
 import drjit as dr
@@ -15,24 +14,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pipeline.renders.device_memory import opaque_vector, own_floats
-from pipeline.renders.emitter_table import ONE_MINUS_EPSILON, sample_alias
+from pipeline.renders.emitter_table import ONE_MINUS_EPSILON, sample_alias, triangle_areas
 from storage.records.environment import Environment, row_solid_angles, texel_means
 from storage.records.material import EMISSION
 from storage.records.scene import Scene
 
 _TINY = 1e-30
-
-
-@dataclass(frozen=True, kw_only=True, eq=False)
-class SkySample:
-    """A direction drawn from a map, lane by lane."""
-
-    direction: Any
-    """Unit direction in world space, Vector3f."""
-    pdf: Any
-    """Density of the direction per steradian, Float; not finite where there is no light."""
-    radiance: Any
-    """Radiance from the direction, Color3f."""
 
 
 class SkyTable:
@@ -72,8 +59,13 @@ class SkyTable:
         """Return a density (Float) among lamps as one among all picks."""
         return value * self._rest
 
-    def sample(self, u: Any, active: Any) -> SkySample:
-        """Return a direction drawn by the light of the map, from a uniform Point2f."""
+    def sample(self, u: Any, active: Any) -> tuple[Any, Any, Any]:
+        """Return a direction drawn by the light of the map, from a uniform Point2f.
+
+        Returns:
+            Unit direction in world space, Vector3f; its density per steradian, Float, not finite
+            where there is no light; and the radiance that comes from it, Color3f.
+        """
         row, down = sample_alias(self._rows, mi.UInt32(0), self._height, u.x, active)
         column, along = sample_alias(self._columns, row * self._width, self._width, u.y, active)
         above = dr.gather(mi.Float, self._edges, row, active)
@@ -85,8 +77,7 @@ class SkyTable:
         x, y, up = self._to_world
         direction = mi.Vector3f(dr.normalize(x * (flat * cosine) + y * (flat * sine) + up * z))
         radiance, pdf = self.radiance_and_density(direction, active)
-        pdf = dr.select(pdf > 0, pdf, dr.inf)
-        return SkySample(direction=direction, pdf=pdf, radiance=radiance)
+        return direction, dr.select(pdf > 0, pdf, dr.inf), radiance
 
     def radiance_and_density(self, direction: Any, active: Any) -> tuple[Any, Any]:
         """Return the radiance (Color3f) that comes from a unit direction of the world.
@@ -186,10 +177,8 @@ def sky_share(scene: Scene, sky: Environment) -> float:
 def lamp_power(scene: Scene) -> float:
     """Return the sum over emitting triangles of area x mean radiance of the three channels."""
     emits = scene.triangle_emits
-    corners = scene.vertex_positions[scene.faces[emits]].astype(np.float64)
-    normal = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
     radiance = scene.materials[scene.material_index[emits]][:, EMISSION].astype(np.float64)
-    return float((0.5 * np.linalg.norm(normal, axis=1) * radiance.mean(axis=1)).sum())
+    return float((triangle_areas(scene, emits)[3] * radiance.mean(axis=1)).sum())
 
 
 def surface_radius(scene: Scene) -> float:

@@ -27,6 +27,18 @@ _GROUPS = 8
 _TINY = 1e-20
 
 
+@dataclass(kw_only=True, eq=False)
+class Hit:
+    """What rays meet, lane by lane; a variable of loops, in which Dr.Jit sets its fields."""
+
+    distance: Any
+    """Length of the ray, Float."""
+    triangle: Any
+    """Triangle number, UInt32; surfaces first, then emitters."""
+    barycentric: Any
+    """Weights of the 2nd and 3rd corner, Point2f."""
+
+
 @dataclass(frozen=True, kw_only=True, eq=False)
 class SurfacePoint:
     """Hit point of each ray, lane by lane."""
@@ -67,21 +79,20 @@ class SurfaceTable:
         self._rows = own_floats(padded)
         self._textures = KernelTextures(scene, order) if scene.textures else None
 
-    def point(self, triangle: Any, barycentric: Any, active: Any) -> SurfacePoint:
-        """Return the point at barycentric coordinates (weights of the 2nd and 3rd corner)."""
-        first = self._group(triangle, 0, active)
-        edge1 = self._group(triangle, 1, active)
-        edge2 = self._group(triangle, 2, active)
+    def point(self, hit: Hit, active: Any) -> SurfacePoint:
+        """Return the point of a hit."""
+        first, edge1, edge2 = (self._group(hit.triangle, group, active) for group in range(3))
         edge1 = mi.Vector3f(edge1.xyz)
         edge2 = mi.Vector3f(edge2.xyz)
-        position = mi.Point3f(first.xyz) + edge1 * barycentric.x + edge2 * barycentric.y
+        position = mi.Point3f(first.xyz) + edge1 * hit.barycentric.x + edge2 * hit.barycentric.y
         return SurfacePoint(
             position=mi.Point3f(position), geometric_normal=dr.normalize(dr.cross(edge1, edge2))
         )
 
-    def shading(self, triangle: Any, barycentric: Any, active: Any) -> tuple[Any, KernelLobes]:
+    def shading(self, hit: Hit, active: Any) -> tuple[Any, KernelLobes]:
         """Return the interpolated unit normal (Vector3f, not yet turned) and the material."""
-        groups = [self._group(triangle, row, active) for row in range(_GROUPS)]
+        barycentric = hit.barycentric
+        groups = [self._group(hit.triangle, row, active) for row in range(_GROUPS)]
         normal0 = mi.Vector3f(groups[0].w, groups[1].w, groups[2].w)
         normal1 = mi.Vector3f(groups[3].x, groups[3].y, groups[3].z)
         normal2 = mi.Vector3f(groups[3].w, groups[4].x, groups[4].y)
@@ -98,14 +109,12 @@ class SurfaceTable:
         length_sq = dr.maximum(dr.squared_norm(normal), _TINY)
         normal = normal * dr.rsqrt(length_sq)
         if self._textures is not None:
-            lobes = self._textures.lobes(triangle, barycentric, lobes, active)
+            lobes = self._textures.lobes(hit, lobes, active)
         return normal, lobes
 
-    def mapped_normal(self, normal: Any, triangle: Any, barycentric: Any, active: Any) -> Any:
+    def mapped_normal(self, normal: Any, hit: Hit, active: Any) -> Any:
         """Return the normal (Vector3f) of `shading` by its map; None where the scene has no map."""
-        if self._textures is None:
-            return None
-        return self._textures.mapped_normal(normal, triangle, barycentric, active)
+        return self._textures and self._textures.mapped_normal(normal, hit, active)
 
     def _group(self, triangle: Any, group: int, active: Any) -> Any:
         return dr.gather(mi.Vector4f, self._rows, triangle * _GROUPS + group, active)
@@ -157,20 +166,19 @@ class KernelTextures:
         positions = scene.vertex_positions[scene.faces[order]]
         self._u_directions = own_floats(np.pad(u_directions(positions, corners), ((0, 0), (0, 1))))
 
-    def mapped_normal(self, normal: Any, triangle: Any, barycentric: Any, active: Any) -> Any:
+    def mapped_normal(self, normal: Any, hit: Hit, active: Any) -> Any:
         """Return the unit normal (Vector3f) of storage.records.lookup; None without any map.
 
         Args:
             normal: Vector3f, unit, unmapped.
-            triangle: UInt32.
-            barycentric: Point2f, the weights of the 2nd and 3rd corner.
+            hit: place on the surface.
             active: Bool.
         """
         if self._u_directions is None:
             return None
-        u, v, material = self._place(triangle, barycentric, active)
+        u, v, material = self._place(hit, active)
         texture = dr.gather(mi.Vector4u, self._maps, material, active)
-        row: Any = dr.gather(mi.Vector4f, self._u_directions, triangle, active)
+        row: Any = dr.gather(mi.Vector4f, self._u_directions, hit.triangle, active)
         along = mi.Vector3f(row.xyz)
         tangent = along - normal * dr.dot(along, normal)
         length_sq = dr.squared_norm(tangent)
@@ -182,8 +190,10 @@ class KernelTextures:
         mapped = dr.normalize(tangent * texel.x + bitangent * texel.y + normal * z)
         return dr.select(is_mapped, mapped, normal)
 
-    def _place(self, triangle: Any, barycentric: Any, active: Any) -> tuple[Any, Any, Any]:
+    def _place(self, hit: Hit, active: Any) -> tuple[Any, Any, Any]:
         """Return u and v in [0, 1] (Float), and the material (UInt32), of a place."""
+        triangle = hit.triangle
+        barycentric = hit.barycentric
         near = dr.gather(mi.Vector4f, self._corners, triangle * 2, active)
         far = dr.gather(mi.Vector4f, self._corners, triangle * 2 + 1, active)
         weight = 1 - barycentric.x - barycentric.y
@@ -192,20 +202,17 @@ class KernelTextures:
         material = dr.gather(mi.UInt32, self._material, triangle, active)
         return u - dr.floor(u), v - dr.floor(v), material
 
-    def lobes(
-        self, triangle: Any, barycentric: Any, constant: KernelLobes, active: Any
-    ) -> KernelLobes:
+    def lobes(self, hit: Hit, constant: KernelLobes, active: Any) -> KernelLobes:
         """Return the material of a place.
 
         The shares of the lobes and their multiple scattering follow the values of the textures.
 
         Args:
-            triangle: UInt32.
-            barycentric: Point2f, the weights of the 2nd and 3rd corner.
+            hit: place on the surface.
             constant: what the material is where no texture stands for it.
             active: Bool.
         """
-        u, v, material = self._place(triangle, barycentric, active)
+        u, v, material = self._place(hit, active)
         columns = constant.diffuse, constant.specular, dr.sqrt(constant.alpha)
         kinds = (mi.Color3f, mi.Color3f, mi.Float)
         values = []

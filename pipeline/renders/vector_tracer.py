@@ -11,7 +11,7 @@ import copy
 import functools
 import math
 from collections.abc import Callable, Hashable, Sequence
-from typing import Any
+from typing import Any, TypeVar
 
 import drjit as dr
 import mitsuba as mi
@@ -22,8 +22,8 @@ from pipeline.renders.device_memory import KernelInputs, own_integers, read_back
 from pipeline.renders.emitter_table import EmitterTable
 from pipeline.renders.film import Film, Splats, SplatUnit
 from pipeline.renders.guide_table import GuideCells, GuideTable, learn
-from pipeline.renders.kernel_scene import KernelParts, KernelScene
-from pipeline.renders.light_kernel import PhotonRecords, trace_light, trace_photons
+from pipeline.renders.kernel_scene import KernelParts, KernelScene, hit_of
+from pipeline.renders.light_kernel import CameraJoin, PhotonRecords, trace_light
 from pipeline.renders.path_kernel import trace
 from pipeline.renders.sky_table import SkyTable
 from pipeline.renders.tracer import Chosen, PixelCamera, split_triangles
@@ -101,8 +101,17 @@ _GOLDEN = 1.1673039782614187
 """The root of x^5 = x + 1, for points that fill four dimensions."""
 
 
+_Loaded = TypeVar("_Loaded", "VectorTracer", KernelScene)
+
+
 class VectorTracer:
-    """A scene on the LLVM or CUDA backend; see `Tracer` for the meaning of its methods."""
+    """One loaded scene, on the LLVM or CUDA backend.
+
+    Emitters are hidden from camera rays in everything that it returns.
+    """
+
+    _light_paths = LIGHT_PATHS
+    """Light paths for each camera path, as weights have it."""
 
     def __init__(self, scene: Scene, *, max_depth: int, rr_depth: int, scale: float = 1) -> None:
         """Load a scene that is `scale` times as large as cameras take it for."""
@@ -117,26 +126,37 @@ class VectorTracer:
         self._landed = LandedLight()
 
     def only_light(self, row: int | None) -> "VectorTracer":
+        """Return the same loaded scene in which only the emitter `objects[row]` is switched on.
+
+        The others stay where they are, black, and an environment is off; None leaves only that on.
+        Equal seeds give equal camera rays in both.
+
+        Raises:
+            Rejected: "unlit_scene" where it has no area.
+        """
         _, emitters = split_triangles(self._record)
         lit = self._record.object_index[emitters] == (-1 if row is None else row)
         sky = shining_sky(self._record) if row is None else None
-        tracer = copy.copy(self)
-        tracer._scene = copy.copy(self._scene)
-        tracer._scene.emitters = EmitterTable(
-            self._record, emitters, lit, may_be_dark=sky is not None
-        )
-        tracer._scene.sky = None if sky is None else SkyTable(sky, 1.0)
-        return tracer
+        table = EmitterTable(self._record, emitters, lit, may_be_dark=sky is not None)
+        light = {"emitters": table, "sky": None if sky is None else SkyTable(sky, 1.0)}
+        return _with_fields(self, _scene=_with_fields(self._scene, **light))
 
     def split_lights(self, *, bounces: bool, lobes: bool) -> "VectorTracer":
-        tracer = copy.copy(self)
-        tracer._parts = KernelParts(bounces=bounces, lobes=lobes)
-        return tracer
+        """Return the same loaded scene, whose sums of passes are by part.
+
+        Args:
+            bounces: keep direct and indirect light apart.
+            lobes: keep the diffuse and the specular lobe of the visible surface apart.
+        """
+        return _with_fields(self, _parts=KernelParts(bounces=bounces, lobes=lobes))
 
     def for_views(self, cameras: Sequence[PixelCamera]) -> "VectorTracer":
-        tracer = copy.copy(self)
-        tracer._landed = LandedLight(cameras)
-        return tracer
+        """Return the same loaded scene, which traces light paths of one seed once for all views.
+
+        Args:
+            cameras: of the views, in the order in which they will be asked for.
+        """
+        return _with_fields(self, _landed=LandedLight(cameras))
 
     def with_guide(self) -> "VectorTracer":
         """Return the same tracer with a guide where a mirror lights rough surfaces.
@@ -144,14 +164,22 @@ class VectorTracer:
         The first call learns the scene, always the same whatever was traced before. The tracers of
         single lights use the table that was learnt with all of them.
         """
-        tracer = copy.copy(self)
-        tracer._scene = copy.copy(self._scene)
-        tracer._scene.guide = self._guide()
-        return tracer
+        return _with_fields(self, _scene=_with_fields(self._scene, guide=self._guide()))
 
     def radiance(
         self, camera: PixelCamera, *, seed: int, spp: int, chosen: Chosen = None
     ) -> NDArray[np.float32]:
+        """Return the mean of one pass of samples, linear radiance [R, R, 3]; 0 if not chosen.
+
+        Equal arguments give equal bits, whatever the number of threads. With other pixels chosen,
+        a pixel's samples may be others.
+
+        Args:
+            camera: the view.
+            seed: 31 bits; passes with different seeds are independent.
+            spp: samples per pixel, a square of a power of two.
+            chosen: the pixels that are wanted. A tracer may trace the others too.
+        """
         pixels = _pixels(camera, chosen)
         picture = dr.zeros(mi.Color3f, camera.resolution**2)
         means = _means(*self._pass(camera, self._film(camera), pixels, seed, spp))
@@ -165,16 +193,6 @@ class VectorTracer:
     def _film(self, camera: PixelCamera) -> Film:
         return Film(camera.at_scale(self._scale))
 
-    @property
-    def _light_paths(self) -> float:
-        """Light paths for each camera path, as weights have it."""
-        return LIGHT_PATHS
-
-    @property
-    def _traced(self) -> Any:
-        """What traces a pass."""
-        return trace_pass
-
     def _pass(
         self,
         camera: PixelCamera,
@@ -184,39 +202,36 @@ class VectorTracer:
         spp: int,
         light_seed: int | None = None,
     ) -> tuple[Any, ...]:
-        """Return the arguments of `_means` and `_sums` for a pass.
+        """Return the arguments of `_trace_pass` for a pass.
 
         Light paths are as many as for the whole picture, so that the weights of the strategies stay
         the same; what lands in other pixels is dropped. In proportion to the chosen pixels they
         saved 10 to 25 % of the time and lost 0.7 to 1.0 dB in hard views.
         """
-        numbers, count = self._numbers(camera, seed, spp)
-        light: Any = self._unit
-        traced = self._traced
-        if light_seed is not None:
-            light = self._light_of_views(camera, light_seed, spp)
-            traced = trace_beside_landed
+        numbers = _PassNumbers(camera, seed, spp, self._light_paths)
+        light = self._light(camera, light_seed, spp)
         inputs = KernelInputs(self._scene, film, self._parts, light, numbers)
-        return inputs, pixels, traced, camera.resolution, spp, count
+        return inputs, pixels, camera.resolution, spp
 
-    def _light_of_views(self, camera: PixelCamera, seed: int, spp: int) -> Any:
-        """Return the light (Color3f) of each lobe that paths of a seed throw on a whole picture."""
+    def _light(self, camera: PixelCamera, seed: int | None, spp: int) -> Any:
+        """Return the light (Color3f) of each lobe that paths of a seed throw on a whole picture.
+
+        Without a seed it is the unit of the light that is to be traced with the camera paths.
+        """
+        if seed is None:
+            return self._unit
 
         def land_on(cameras: Sequence[PixelCamera]) -> list[list[Any]]:
-            numbers, count = self._numbers(camera, seed, spp)
+            numbers = _PassNumbers(camera, seed, spp, self._light_paths)
             films = [self._film(each) for each in cameras]
             inputs = KernelInputs(self._scene, films, self._parts, self._unit, numbers)
-            landed: list[list[Any]] = _land(inputs, camera.resolution, count)
+            landed: list[list[Any]] = _land(inputs, camera.resolution)
             return landed
 
         return self._landed.take(camera, (seed, spp, self._scene.guide is not None), land_on)
 
-    def _numbers(self, camera: PixelCamera, seed: int, spp: int) -> tuple["_PassNumbers", int]:
-        """Return the numbers of a pass, and how many light paths it has."""
-        count = int(LIGHT_PATHS * camera.resolution**2 * spp)
-        return _PassNumbers(seed, self._light_paths * camera.resolution**2, count), count
-
     def features(self, camera: PixelCamera, *, spp: int) -> Features:
+        """Return the albedo and normal pictures, of `spp` evenly spread rays in each pixel."""
         named = self.feature_arrays(camera, spp=spp)
         return Features(
             albedo=_picture(camera, named.pop("albedo")),
@@ -231,6 +246,7 @@ class VectorTracer:
         return arrays
 
     def hits(self, camera: PixelCamera) -> NDArray[np.bool_]:
+        """Return whether the ray through each pixel's centre hits a surface, [R, R]."""
         return read_back(self.hit_array(camera)).reshape(camera.resolution, camera.resolution)
 
     def hit_array(self, camera: PixelCamera) -> Any:
@@ -238,39 +254,33 @@ class VectorTracer:
         return _hits(KernelInputs(self._scene, self._film(camera)), camera.resolution)
 
 
+def _with_fields(loaded: _Loaded, **fields: Any) -> _Loaded:
+    """Return a shallow copy with other values of some fields."""
+    copied = copy.copy(loaded)
+    vars(copied).update(fields)
+    return copied
+
+
 class _PassNumbers:
     """The numbers of a pass, as kernels read them: seeds, and how many light paths there are."""
 
-    def __init__(self, seed: int, light_paths: float, count: int) -> None:
+    def __init__(self, camera: PixelCamera, seed: int, spp: int, light_paths: float) -> None:
+        """Take the numbers of a seed; weights have `light_paths` for each camera path."""
+        light_paths *= camera.resolution**2
+        self.count = int(LIGHT_PATHS * camera.resolution**2 * spp)
         self.camera_seed = dr.opaque(mi.UInt32, seed)
         self.light_seed = dr.opaque(mi.UInt32, seed_for(seed, "light paths"))
         self.shifts = even_shifts(seed)
         self.light_paths = dr.opaque(mi.Float, light_paths)
-        self.share = dr.opaque(mi.Float64, light_paths / count)
+        self.share = dr.opaque(mi.Float64, light_paths / self.count)
 
 
-def trace_pass(objects: Any, pixels: Any, resolution: int, spp: int, count: int) -> list[Any]:
-    """Return the means of some pixels (Color3f) of each part."""
-    scene, film, parts, unit, numbers = objects
-    traced = trace_camera_paths(objects, pixels, resolution, spp, count)
-    (landed,) = land((scene, [film], parts, unit, numbers), resolution, count)
-    return _with_landed(parts, traced, landed, pixels)
+def _trace_pass(objects: Any, pixels: Any, resolution: int, spp: int) -> list[Any]:
+    """Return the means of some pixels (Color3f) of each part.
 
-
-def trace_beside_landed(
-    objects: Any, pixels: Any, resolution: int, spp: int, count: int
-) -> list[Any]:
-    """Do what `trace_pass` does, with light (Color3f) of whole pictures that was traced before."""
-    _, _, parts, landed, _ = objects
-    traced = trace_camera_paths(objects, pixels, resolution, spp, count)
-    return _with_landed(parts, traced, landed, pixels)
-
-
-def trace_camera_paths(
-    objects: Any, pixels: Any, resolution: int, spp: int, count: int
-) -> list[Any]:
-    """Return the camera paths' share of the light of some pixels (Color3f), of each part."""
-    scene, film, parts, _, numbers = objects
+    Light of whole pictures that was traced before (Color3f) is added to what camera paths find.
+    """
+    scene, film, parts, light, numbers = objects
     pixel = dr.gather(mi.UInt32, pixels, dr.arange(mi.UInt32, len(pixels) * spp) // spp)
     dr.eval(pixel)  # from its size a replay reads how many lanes there are
     sampler = mi.load_dict({"type": "multijitter", "sample_count": spp})
@@ -281,50 +291,41 @@ def trace_camera_paths(
     ray = film.rays(column + jitter.x, row + jitter.y)
     traced = trace(scene, film, parts, numbers.light_paths, sampler, ray)
     dr.eval(traced)  # all parts in one kernel
-    return [_pixel_means(spp, part) for part in traced]
+    means = [_pixel_means(spp, part) for part in traced]
+    if not isinstance(light, list):
+        (light,) = land((scene, [film], parts, light, numbers), resolution)
+    gathered = [dr.gather(mi.Color3f, each, pixels) for each in light]
+    return [part + each for part, each in zip(means, parts.of_indirect(gathered), strict=True)]
 
 
-def _with_landed(parts: KernelParts, traced: list[Any], landed: list[Any], pixels: Any) -> Any:
-    """Return the light of some pixels (Color3f) with that of light paths, of whole pictures."""
-    gathered = [dr.gather(mi.Color3f, light, pixels) for light in landed]
-    return [part + light for part, light in zip(traced, parts.of_indirect(gathered), strict=True)]
-
-
-def land(objects: Any, resolution: int, count: int) -> list[list[Any]]:
-    """Return the light (Color3f) of each lobe that `count` light paths throw on each picture."""
+def land(objects: Any, resolution: int) -> list[list[Any]]:
+    """Return the light (Color3f) of each lobe that light paths throw on each picture."""
     scene, films, parts, unit, numbers = objects
     splats = [[Splats(resolution, unit) for _ in range(parts.num_lobes)] for _ in films]
-    u = even_numbers(count, numbers.shifts)
-    emitter = scene.emitters.sample(mi.Point2f(u[0], u[1]), mi.Bool(True))
-    sampler = mi.load_dict({"type": "independent"})
-    sampler.seed(numbers.light_seed, count)
-    to = mi.Point2f(u[2], u[3])
-    trace_light(scene, films, parts, numbers.light_paths, emitter, to, sampler, splats)
+    record = CameraJoin(films, parts, numbers.light_paths, splats)
+    _trace_light_paths(scene, numbers.light_seed, numbers.shifts, numbers.count, record)
     return [
         [mi.Color3f(total.picture() * numbers.share) for total in of_film] for of_film in splats
     ]
 
 
-@record_launches
-def _land(objects: Any, resolution: int, count: int) -> list[list[Any]]:
-    landed = land(objects, resolution, count)
-    dr.eval(landed)
-    return landed
+def _trace_light_paths(scene: Any, seed: Any, shifts: list[Any], count: int, record: Any) -> None:
+    """Trace light paths of a seed, which begin evenly on all emitters (`trace_light`)."""
+    u = even_numbers(count, shifts)
+    emitter = scene.emitters.sample(mi.Point2f(u[0], u[1]), mi.Bool(True))
+    sampler = mi.load_dict({"type": "independent"})
+    sampler.seed(seed, count)
+    trace_light(scene, emitter, mi.Point2f(u[2], u[3]), sampler, record)
+
+
+_land = record_launches(land)
+_means = record_launches(_trace_pass)
 
 
 @record_launches
-def _means(objects: Any, pixels: Any, traced: Any, resolution: int, spp: int, count: int) -> Any:
-    return traced(objects, pixels, resolution, spp, count)
-
-
-@record_launches
-def _sums(
-    objects: Any, pixels: Any, traced: Any, resolution: int, spp: int, count: int, sums: list[Any]
-) -> list[Any]:
+def _sums(objects: Any, pixels: Any, resolution: int, spp: int, sums: list[Any]) -> list[Any]:
     """Return the sums with those of a pass."""
-    means: list[Any] = [
-        mi.Color3d(part) for part in traced(objects, pixels, resolution, spp, count)
-    ]
+    means: list[Any] = [mi.Color3d(part) for part in _trace_pass(objects, pixels, resolution, spp)]
     mean: Any = sum(means)
     square = dr.square((mean.x + mean.y + mean.z) / 3)
     new = [*(part * spp for part in means), square * spp, mi.Float64(spp), mi.Float64(1)]
@@ -342,10 +343,9 @@ def _settle(objects: Any) -> Any:
 @record_launches
 def _features(objects: Any, resolution: int, spp: int) -> dict[str, Any]:
     scene, film, parts = objects
-    hit = _first_hit(scene, film, resolution, spp)
-    active = hit.is_valid()
-    normal, lobes = scene.table.shading(hit.prim_index, hit.prim_uv, active)
-    mapped = scene.table.mapped_normal(normal, hit.prim_index, hit.prim_uv, active)
+    hit, active = _first_hit(scene, film, resolution, spp)
+    normal, lobes = scene.table.shading(hit, active)
+    mapped = scene.table.mapped_normal(normal, hit, active)
     normal = normal if mapped is None else mapped
     named = {"albedo": lobes.diffuse + lobes.specular, "normal": normal}
     if parts.num_lobes == 2:
@@ -356,11 +356,12 @@ def _features(objects: Any, resolution: int, spp: int) -> dict[str, Any]:
 @record_launches
 def _hits(objects: Any, resolution: int) -> Any:
     scene, film = objects
-    return _first_hit(scene, film, resolution, 1).is_valid()
+    _, is_met = _first_hit(scene, film, resolution, 1)
+    return is_met
 
 
 def _first_hit(scene: Any, film: Film, resolution: int, spp: int) -> Any:
-    """Return the hits of camera rays on a regular grid in every pixel."""
+    """Return `hit_of` camera rays on a regular grid in every pixel."""
     across = math.isqrt(spp)
     lane = dr.arange(mi.UInt32, resolution**2 * spp)
     sample = lane % spp
@@ -369,11 +370,14 @@ def _first_hit(scene: Any, film: Film, resolution: int, spp: int) -> Any:
     within = mi.Float(sample - grid_row * across), mi.Float(grid_row)
     cell = 1 / across  # a power of two
     ray = film.rays(column + (within[0] + 0.5) * cell, row + (within[1] + 0.5) * cell)
-    return scene.surfaces.ray_intersect_preliminary(ray, coherent=True)
+    return hit_of(scene.surfaces.ray_intersect_preliminary(ray, coherent=True))
 
 
 class DeviceSum:
-    """A `PassSum` in float64 in the memory of the device, so that no pass waits for Python."""
+    """The growing sum of the passes of one view, in float64 in the memory of the device.
+
+    So no pass waits for Python.
+    """
 
     def __init__(self, tracer: VectorTracer, camera: PixelCamera) -> None:
         self._tracer = tracer
@@ -386,17 +390,35 @@ class DeviceSum:
     def add(
         self, *, seed: int, spp: int, chosen: Chosen = None, light_seed: int | None = None
     ) -> None:
+        """Add all samples of one pass: `VectorTracer.radiance` times `spp`.
+
+        It may return before they are traced. With `light_seed` its light paths have that seed.
+        """
         pixels = _pixels(self._camera, chosen)
         arguments = self._tracer._pass(self._camera, self._film, pixels, seed, spp, light_seed)
         self.sums = _sums(*arguments, self.sums)
 
     def guide(self) -> None:
+        """Let the passes from now on be guided (pipeline.renders.guide_table), if they can be.
+
+        Their expected value stays the same. The first call for a scene learns it.
+        """
         self._tracer = self._tracer.with_guide()
 
     def read(self) -> NDArray[np.float64]:
+        """Return the sum over all samples of each part (`split_lights`), [Q, R, R, 3]; else Q = 1.
+
+        It is not finite where any sample was not. It waits until they are traced, and equals the
+        sum in float64 of the passes, one by one.
+        """
         return np.stack([_picture(self._camera, total) for total in self.sums[:-3]])
 
     def read_squares(self) -> NDArray[np.float64]:
+        """Return the sum over the passes of samples times squared grey mean, [R, R].
+
+        Grey is the mean of the three channels of all parts together. With `read` it gives the
+        spread between passes.
+        """
         return read_back(self.sums[-3]).reshape(self._camera.resolution, self._camera.resolution)
 
 
@@ -405,12 +427,9 @@ def _learn_guide(record: Scene, scene: KernelScene) -> GuideTable | None:
     order = np.concatenate(split_triangles(record))
     corners = record.vertex_positions[record.faces[order]]
     cells = GuideCells(corners.astype(np.float64))
-    records = PhotonRecords(PHOTON_PATHS)
-    u = even_numbers(PHOTON_PATHS, even_shifts(_PHOTON_SEED))
-    emitter = scene.emitters.sample(mi.Point2f(u[0], u[1]), mi.Bool(True))
-    sampler = mi.load_dict({"type": "independent"})
-    sampler.seed(seed_for(_PHOTON_SEED, "photons"), PHOTON_PATHS)
-    trace_photons(scene, cells, emitter, mi.Point2f(u[2], u[3]), sampler, records)
+    records = PhotonRecords(cells, PHOTON_PATHS)
+    seed = seed_for(_PHOTON_SEED, "photons")
+    _trace_light_paths(scene, seed, even_shifts(_PHOTON_SEED), PHOTON_PATHS, records)
     return learn(cells, records.photons())
 
 

@@ -1,4 +1,4 @@
-"""`ViewPictures`: means, errors and denoised pictures of a view, in numpy or on the device.
+"""Rules of pictures: which pixels the denoiser may not change, what it filters, and sums of that.
 
 The denoiser may not change converged pixels, nor the mean brightness of a picture. It takes single
 bright pixels for noise. A glint that many passes agree on is none: where the raw mean stands out of
@@ -16,14 +16,13 @@ import functools
 import operator
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
-from typing import Any, Protocol
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from pipeline.renders.noise_floor import MeasuredFloor
-from pipeline.renders.samples import DualBuffer
-from pipeline.renders.settings import Filtered
+from storage.conventions import HALF_FLOAT_MAX
 from storage.errors import Rejected
 
 LEAST_PASSES = 10
@@ -74,32 +73,6 @@ class MeasuredLook:
     for each half; the first look has none that means anything."""
 
 
-class ViewPictures(Protocol):
-    """The pictures of one view, of samples that grow.
-
-    There are P of them, of lights and of their parts: all parts of the first light come first.
-    """
-
-    hits: NDArray[np.bool_]
-    """[R, R] true where `Tracer.hits` is."""
-    visible: NDArray[np.bool_]
-    """[R, R] pixels with a first surface, anywhere within the pixel; all of them if none has."""
-
-    @staticmethod
-    def mean_radiance(samples: DualBuffer) -> float:
-        """Return the mean radiance of all pixels so far; raises as `look`."""
-
-    def look(self, quality: Filtered) -> MeasuredLook:
-        """Return what is measured now, with halves denoised by a filter of this quality.
-
-        Raises:
-            Rejected: "nonfinite_radiance" where a raw sample is not finite, "radiance_overflow".
-        """
-
-    def finish(self) -> NDArray[np.float32]:
-        """Return the pictures of all samples of the last look, [P, R, R, 3]."""
-
-
 def require_finite(num_broken: int) -> None:
     """Raise Rejected("nonfinite_radiance") where so many pixels have raw samples without end."""
     if num_broken:
@@ -110,6 +83,20 @@ def require_bounded(brightest: float) -> None:
     """Raise Rejected("radiance_overflow") where the denoiser would hide what is too bright."""
     if brightest >= MAX_RAW:
         raise Rejected("radiance_overflow", f"a raw pixel of radiance {brightest:.3g}")
+
+
+def representable(radiance_rgb: NDArray[np.float32]) -> NDArray[np.float32]:
+    """Return radiance that half floats can hold; raises Rejected("radiance_overflow") else."""
+    if radiance_rgb.max() >= HALF_FLOAT_MAX:
+        raise Rejected("radiance_overflow", f"a pixel of radiance {radiance_rgb.max():.3g}")
+    return radiance_rgb
+
+
+def stands_out(denoised: Any, raw: Any, standard_error: Any, error_around: Any) -> Any:
+    """Return where the raw grey values are right, by their standard errors and the neighbours'."""
+    bright = (raw - denoised > STANDARD_ERRORS * standard_error) & (raw > STANDS_OUT * denoised)
+    dark = (denoised - raw > STANDARD_ERRORS * error_around) & (denoised > DARKER * raw)
+    return bright | dark
 
 
 def to_filter(pictures: Sequence[Any], names: Sequence[str]) -> Iterator[tuple[Any, str]]:

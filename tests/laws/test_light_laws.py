@@ -12,7 +12,6 @@ from storage.conventions import camera_rays
 from storage.records.lookup import environment_values
 from storage.records.passes.pictures import view_passes
 from storage.records.scene import Scene
-from tests.oracle.plugin_tracer import PluginTracer
 from tests.pipeline.renders.sampling import (
     SIGMAS,
     Estimate,
@@ -65,17 +64,12 @@ def test_a_lit_plane_is_as_bright_as_lamberts_formula_says() -> None:
         assert_agree(shown, closed_form, slack=5e-4)
 
 
-@pytest.mark.parametrize(
-    ("tracer", "count"),
-    [(load_tracer, 32), pytest.param(PluginTracer, 4, marks=pytest.mark.slow("statistics"))],
-)
-def test_unequal_lights_add_up_as_lamberts_formula_says(tracer: Any, count: int) -> None:
-    """Picked by power from 4 or 32 of them, of areas 1 : 100, brightness 1 : 1000, either way up.
+def test_unequal_lights_add_up_as_lamberts_formula_says() -> None:
+    """Picked by power from 32 of them, of areas 1 : 100, brightness 1 : 1000, either way up.
 
-    They lie side by side in one plane, so that none shades another. Stock emitters are 4 only: a
-    kernel for 32 takes a minute to compile.
+    They lie side by side in one plane, so that none shades another.
     """
-    rng = np.random.default_rng(count)
+    count, rng = 32, np.random.default_rng(32)
     cells = rng.permutation([[x, y, 2.0] for x in range(-3, 3) for y in range(-2, 4)])[:count]
     shape = rng.uniform(-0.4, 0.4, (count, 3, 2)) * 10 ** rng.uniform(-1, 0, (count, 1, 1))
     lights = cells[:, None] + np.concatenate([shape, np.zeros((count, 3, 1))], axis=2)
@@ -91,7 +85,7 @@ def test_unequal_lights_add_up_as_lamberts_formula_says(tracer: Any, count: int)
     )
     blocks = (expected * DIFFUSE / np.pi).reshape(8, 16, 8, 16, 3).mean(axis=(1, 3))
     # As below, with coarser midpoints, and the stock emitters' twins stand 1e-4 off.
-    estimate = render_blocks(scene, max_depth=2, tracer=tracer(scene, max_depth=2, rr_depth=5))
+    estimate = render_blocks(scene, max_depth=2)
     assert_agree(estimate, exact(blocks), slack=2e-3)
 
 
@@ -123,6 +117,7 @@ def test_an_emitter_is_hidden_from_the_camera_but_seen_in_a_mirror() -> None:
     direct, mirrored = pixel([0, 1, 0.9]), pixel([0, 1, -0.9])
     np.testing.assert_array_equal(picture[direct], 0)
     assert not tracer.hits(camera)[direct]
+    np.testing.assert_array_equal(tracer.features(camera, spp=16).albedo[direct], 0)
     # A mirror of roughness 0.01 loses nothing and blurs by 1e-4: the panel shows as it is.
     np.testing.assert_allclose(picture[mirrored], radiance, rtol=5e-3)
 
@@ -191,19 +186,13 @@ def _bowl(albedo: float) -> Part:
 
 pytestmark = pytest.mark.usefixtures("llvm")
 
-TRACERS = [load_tracer, pytest.param(PluginTracer, marks=pytest.mark.slow("statistics"))]
 
-
-@pytest.mark.parametrize(
-    ("tracer", "shape"),
-    [(load_tracer, sphere), (load_tracer, box),
-     pytest.param(PluginTracer, sphere, marks=pytest.mark.slow("statistics"))],
-)  # fmt: skip
-def test_white_and_convex_things_vanish_in_a_white_sky(shape: Any, tracer: Any) -> None:
+@pytest.mark.parametrize("shape", [sphere, box])
+def test_white_and_convex_things_vanish_in_a_white_sky(shape: Any) -> None:
     """The furnace: radiance 1 from everywhere, and a Lambert surface of albedo 1 sends out 1."""
     thing = shape([0, 0, 0], 0.5, material(diffuse=1.0))
     scene = join([thing], eye=(0.4, -2, 0.7), fov_deg=30, sky=constant(1.0))
-    loaded = tracer(scene, max_depth=6, rr_depth=5)
+    loaded = load_tracer(scene, max_depth=6, rr_depth=5)
     camera = camera_of(scene, 16)
     covered = loaded.features(camera, spp=64).albedo
     inside = covered.min(axis=-1) > 0.999
@@ -215,14 +204,13 @@ def test_white_and_convex_things_vanish_in_a_white_sky(shape: Any, tracer: Any) 
     assert abs(found.mean() - 1) < 0.005
     assert (abs(found - 1) < 5 * error + 0.01).all()
     seen = dataclasses.replace(scene, environment=constant(1.0, is_seen=True))
-    picture = tracer(seen, max_depth=6, rr_depth=5).radiance(camera, seed=9, spp=64)
+    picture = load_tracer(seen, max_depth=6, rr_depth=5).radiance(camera, seed=9, spp=64)
     assert abs(picture.mean() - 1) < 0.005
     # Samples are jittered: some meet a rim that the even rays have missed.
     assert np.abs(picture[covered.max(axis=-1) == 0] - 1).max() < 0.05
 
 
-@pytest.mark.parametrize("tracer", TRACERS)
-def test_a_mirror_shows_each_pole_in_its_place(tracer: Any) -> None:
+def test_a_mirror_shows_each_pole_in_its_place() -> None:
     """A ball, seen along each axis from outside, shows in its middle what is behind the viewer."""
     rotation = np.array([[0, 0, 1], [1, 0, 0], [0, 1, 0]], np.float32)
     sky = six_poles(rotation=rotation)
@@ -230,7 +218,7 @@ def test_a_mirror_shows_each_pole_in_its_place(tracer: Any) -> None:
     for name, pole in POLES.items():
         eye = 3 * (rotation @ np.array(pole, np.float64)) + np.array([1e-3, 2e-3, 3e-3])
         scene = join([ball], eye=eye, fov_deg=0.5, sky=sky)
-        picture = tracer(scene, max_depth=3, rr_depth=5).radiance(
+        picture = load_tracer(scene, max_depth=3, rr_depth=5).radiance(
             camera_of(scene, 8), seed=1, spp=16
         )
         # The albedo tables of energy compensation are right to 0.1 %, and 1024 samples find all.
@@ -248,11 +236,10 @@ def test_a_black_sky_is_none() -> None:
     np.testing.assert_array_equal(pictures[2], pictures[0])
 
 
-@pytest.mark.parametrize("tracer", TRACERS)
-def test_a_seen_sky_stands_behind_everything(tracer: Any) -> None:
+def test_a_seen_sky_stands_behind_everything() -> None:
     hidden, seen = (open_scene(smooth(64, is_seen=flag)) for flag in (False, True))
     camera = camera_of(hidden, 64)
-    loaded = [tracer(scene, max_depth=3, rr_depth=5) for scene in (hidden, seen)]
+    loaded = [load_tracer(scene, max_depth=3, rr_depth=5) for scene in (hidden, seen)]
     # where surfaces cover nothing of a pixel, nor of its neighbours
     covered = loaded[0].features(camera, spp=64).albedo.any(axis=-1)
     wide = np.pad(covered, 1)

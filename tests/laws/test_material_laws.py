@@ -8,14 +8,12 @@ import pytest
 from numpy.typing import NDArray
 
 from pipeline.renders import surface_table
-from pipeline.renders.tracer import Tracer, load_tracer
+from pipeline.renders.tracer import load_tracer
 from storage.conventions import alpha_ggx
 from storage.optics.bsdf import MIN_ALPHA, bsdf_lobes
 from storage.optics.multiscatter import scattered_again
 from storage.records.scene import Scene
-from tests.oracle import plugin_scene
 from tests.oracle.plugin_scene import scaled_albedos
-from tests.oracle.plugin_tracer import PluginTracer
 from tests.pipeline.renders.sampling import (
     assert_agree,
     camera_of,
@@ -162,32 +160,24 @@ def test_lobes_add_up_to_the_material_and_never_exceed_one() -> None:
     )
 
 
-TRACERS = [load_tracer, pytest.param(PluginTracer, marks=pytest.mark.slow("statistics"))]
-EAVG: dict[Any, float] = {load_tracer: 0.409, PluginTracer: 0.377}
-
-
 def ball(roughness: float) -> Scene:
     """A smooth white mirror of many facets in a furnace, alone in the picture."""
     mirror = sphere([0, 0, 0], 0.5, material(specular=1.0, roughness=roughness), rings=48)
     return join([mirror, furnace()], eye=(0, -3, 0), fov_deg=20)
 
 
-def mean_radiance(scene: Scene, tracer: Tracer) -> float:
+def mean_radiance(scene: Scene) -> float:
     """Return the mean over what the surface, whose albedo is 1, covers of the picture."""
-    camera = camera_of(scene, 32)
+    tracer, camera = load_tracer(scene, max_depth=2, rr_depth=5), camera_of(scene, 32)
     pictures = [tracer.radiance(camera, seed=k, spp=64) for k in range(4)]
     covered = tracer.features(camera, spp=64).albedo.mean()
     return float(np.mean(pictures) / covered)
 
 
 @pytest.mark.usefixtures("llvm")
-@pytest.mark.parametrize("tracer", TRACERS)
-def test_single_scattering_would_lose_most_of_it(
-    tracer: Any, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    """A ball returns all; without the scale a ball of roughness 1 shows Eavg of either table."""
-    scene = ball(1.0)
-    mean = mean_radiance(scene, tracer(scene, max_depth=2, rr_depth=5))
+def test_single_scattering_would_lose_most_of_it(monkeypatch: pytest.MonkeyPatch) -> None:
+    """A ball returns all; without the scale a ball of roughness 1 shows Eavg of the table."""
+    mean = mean_radiance(ball(1.0))
     # The rims of facets reflect to below themselves: another 0.1 %.
     assert abs(mean - 1) < 0.003
 
@@ -195,7 +185,6 @@ def test_single_scattering_would_lose_most_of_it(
         return np.zeros_like(specular)
 
     monkeypatch.setattr(surface_table, "scattered_again", nothing)
-    monkeypatch.setattr(plugin_scene, "scattered_again", nothing)
-    mean = mean_radiance(scene, tracer(scene, max_depth=2, rr_depth=5))
+    mean = mean_radiance(ball(1.0))
     # 96 facets around are a little off the sphere.
-    assert mean == pytest.approx(EAVG[tracer], abs=0.004)
+    assert mean == pytest.approx(0.409, abs=0.004)

@@ -15,7 +15,6 @@ from numpy.typing import NDArray
 
 from pipeline.renders.sky_table import lamp_power, sky_share
 from pipeline.renders.tracer import split_triangles
-from storage.errors import Rejected
 from storage.optics.bsdf import Lobes, bsdf_lobes
 from storage.optics.multiscatter import Smith, scattered_again
 from storage.records.lights import shining_sky
@@ -26,7 +25,6 @@ from tests.oracle.plugin_textures import (
     normal_mapped,
     plugin_sky,
     register_plugin,
-    textured_albedo,
     textured_slots,
 )
 
@@ -75,31 +73,24 @@ def _material(scene: Scene, row: int) -> Any:
     return _two_sided(_blend({name: _face(name) for name in _SLOTS}))
 
 
-def plugin_scene(scene: Scene, *, only_light: int | None = None) -> Any:
-    """Return the mi.Scene of everything, with one emitter object switched on or all light."""
+def plugin_scene(scene: Scene) -> Any:
+    """Return the mi.Scene of everything."""
     register_plugin()
     surfaces, emitters = split_triangles(scene)
     shapes = {
         f"surfaces_{row}": _surfaces(scene, triangles, row)
         for row, triangles in _meshes(scene, surfaces)
     }
-    is_on = np.ones(len(emitters), bool)
-    if only_light is not None:
-        is_on = scene.object_index[emitters] == only_light
-    sky = shining_sky(scene) if only_light is None else None
+    sky = shining_sky(scene)
     if sky is not None:
         share = sky_share(scene, sky)
         weight = lamp_power(scene) * share / (1 - share) if share < 1 else 1.0
         # Its lamps are two-sided twins, each of which has the power of the lamp.
         shapes["sky"] = plugin_sky(sky, 2 * weight)
-    if not is_on.any() and sky is None:
-        raise Rejected("unlit_scene", "0 emitting triangles have no area")
-    for on in (True, False):
-        kept = emitters[is_on == on]
-        for row in np.unique(scene.material_index[kept]):
-            triangles = kept[scene.material_index[kept] == row]
-            for side in (1, -1):
-                shapes[f"emitter_{on}_{row}_{side}"] = _emitter(scene, triangles, side, on=on)
+    for row in np.unique(scene.material_index[emitters]):
+        triangles = emitters[scene.material_index[emitters] == row]
+        for side in (1, -1):
+            shapes[f"emitter_{row}_{side}"] = _emitter(scene, triangles, side)
     return mi.load_dict({"type": "scene", **shapes})
 
 
@@ -107,7 +98,7 @@ def plugin_feature_scene(scene: Scene) -> Any:
     """Return the mi.Scene of the surfaces alone, with diffuse + specular as its albedo."""
     surfaces, _ = split_triangles(scene)
     shapes = {
-        f"surfaces_{row}": _feature_surfaces(scene, triangles, row)
+        f"surfaces_{row}": _feature_surfaces(scene, triangles)
         for row, triangles in _meshes(scene, surfaces)
     }
     return mi.load_dict({"type": "scene", **shapes})
@@ -121,26 +112,13 @@ def _meshes(scene: Scene, triangles: NDArray[np.intp]) -> list[tuple[int, NDArra
     return [(int(row), triangles[rows == row]) for row in np.unique(rows)]
 
 
-def plugin_background(scene: Scene) -> Any:
-    """Return the mi.Scene of black surfaces before the sky; None where cameras see none."""
-    sky = shining_sky(scene)
-    if sky is None or not sky.is_seen:
-        return None
-    surfaces, _ = split_triangles(scene)
-    black = {"type": "diffuse", "reflectance": {"type": "rgb", "value": 0.0}}
-    mesh = _mesh(scene, surfaces, _two_sided(black))
-    return mi.load_dict({"type": "scene", "surfaces": mesh, "sky": plugin_sky(sky, 1.0)})
-
-
 def _surfaces(scene: Scene, triangles: NDArray[np.intp], row: int) -> Any:
     mesh = _mesh(scene, triangles, _material(scene, row))
     _add_material(mesh, scene, triangles)
     return mesh
 
 
-def _feature_surfaces(scene: Scene, triangles: NDArray[np.intp], row: int) -> Any:
-    if scene.textures:
-        return _mesh(scene, triangles, _two_sided(textured_albedo(scene, row)))
+def _feature_surfaces(scene: Scene, triangles: NDArray[np.intp]) -> Any:
     lobes = bsdf_lobes(scene.materials[scene.material_index[triangles]])
     mesh = _mesh(scene, triangles, _two_sided({"type": "diffuse", "reflectance": _face("albedo")}))
     _add_attribute(mesh, "albedo", lobes.diffuse + lobes.specular)
@@ -160,21 +138,14 @@ def _add_material(mesh: Any, scene: Scene, triangles: NDArray[np.intp]) -> None:
     _add_attribute(mesh, "again", scattered_again(lobes.specular, lobes.alpha, _SMITH))
 
 
-def _emitter(scene: Scene, triangles: NDArray[np.intp], side: int, *, on: bool) -> Any:
-    """Return the shape of emitting triangles of one material row, lit on one side.
-
-    One that is off stays an emitter, of no radiance: only emitters are hidden from the camera.
-    """
+def _emitter(scene: Scene, triangles: NDArray[np.intp], side: int) -> Any:
+    """Return the shape of emitting triangles of one material row, lit on one side."""
     corners = scene.vertex_positions[scene.faces[triangles]].astype(np.float64)
     cross = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
     doubled_area = np.linalg.norm(cross, axis=1, keepdims=True)
     normal = np.divide(cross, doubled_area, out=np.zeros_like(cross), where=doubled_area > 0)
     radiance = scene.materials[scene.material_index[triangles[0]], EMISSION].astype(np.float64)
     power = 0.5 * float(doubled_area.sum()) * float(radiance.mean())
-    if not on:
-        radiance, power = np.zeros(3), 0.0
-    elif not power > 0:
-        raise Rejected("unlit_scene", f"{len(triangles)} emitting triangles have no area")
     properties = mi.Properties()
     properties["bsdf"] = _material(scene, int(scene.material_index[triangles[0]]))
     colour = {"type": "rgb", "value": radiance.tolist()}
@@ -205,14 +176,14 @@ def _mesh(scene: Scene, triangles: NDArray[np.intp], material: Any) -> Any:
 
 
 def _build_mesh(name: str, faces: NDArray[Any], properties: Any, **rows: NDArray[Any]) -> Any:
-    # its types are those of the variant
-    from pipeline.renders.kernel_scene import build_mitsuba_mesh
-
-    flat: dict[str, Any] = {
-        f"vertex_{field}": each.astype(np.float32).ravel() for field, each in rows.items()
-    }
-    flat["faces"] = faces.astype(np.uint32).ravel()
-    return build_mitsuba_mesh(name, (len(rows["positions"]), len(faces)), properties, **flat)
+    has = {f"has_vertex_{field}": field in rows for field in ("normals", "texcoords")}
+    mesh = mi.Mesh(name, len(rows["positions"]), len(faces), props=properties, **has)
+    parameters = mi.traverse(mesh)
+    for field, each in rows.items():
+        parameters[f"vertex_{field}"] = each.astype(np.float32).ravel()
+    parameters["faces"] = faces.astype(np.uint32).ravel()
+    parameters.update()
+    return mesh
 
 
 def _two_sided(material: dict[str, Any]) -> Any:

@@ -56,13 +56,6 @@ def textured_slots(scene: Scene, row: int, smith: Smith) -> dict[str, Any]:
     }
 
 
-def textured_albedo(scene: Scene, row: int) -> dict[str, Any]:
-    """Return a BSDF whose reflectance is the sum of both albedos of a material row."""
-    parts = (_bitmap(2 * _texels(scene, row, name)) for name in ("diffuse", "specular"))
-    first, second = ({"type": "diffuse", "reflectance": part} for part in parts)
-    return {"type": "blendbsdf", "weight": 0.5, "first": first, "second": second}
-
-
 def normal_mapped(scene: Scene, row: int, material: dict[str, Any]) -> dict[str, Any]:
     """Return a material below Mitsuba's `normalmap`, where its row has a normal map.
 

@@ -6,24 +6,21 @@ lobes, and silhouettes of smooth low-poly mirrors, where Mitsuba turns a shading
 faces away. Its sums of passes are in numpy's memory: those of the kernel are compared with them.
 """
 
-import copy
-from collections.abc import Sequence
 from typing import Any
 
 import mitsuba as mi
 import numpy as np
 from numpy.typing import NDArray
 
-from pipeline.renders.tracer import Chosen, PixelCamera, Tracer
-from storage.denoiser import Features
+from pipeline.renders.tracer import Chosen, PixelCamera
 from storage.records.scene import Scene
-from tests.oracle.plugin_scene import plugin_background, plugin_feature_scene, plugin_scene
+from tests.oracle.plugin_scene import plugin_feature_scene, plugin_scene
 
 
 class HostSum:
-    """A `PassSum` in numpy's memory, for a tracer that returns its passes there anyway."""
+    """A `DeviceSum` in numpy's memory, for a tracer that returns its passes there anyway."""
 
-    def __init__(self, tracer: Tracer, camera: PixelCamera) -> None:
+    def __init__(self, tracer: Any, camera: PixelCamera) -> None:
         self._tracer, self._camera = tracer, camera
         self._total = np.zeros((camera.resolution, camera.resolution, 3))
         self._squares = np.zeros((camera.resolution, camera.resolution))
@@ -54,50 +51,21 @@ _NEAR_CLIP, _FAR_CLIP = 1e-4, 1e4
 
 
 class PluginTracer:
-    """A scene on any backend; see `Tracer` for the meaning of its methods."""
+    """A scene on any backend, whose sky no camera sees; see `VectorTracer` for its methods."""
 
     def __init__(self, scene: Scene, *, max_depth: int, rr_depth: int) -> None:
-        self._record = scene
         self._scene = plugin_scene(scene)
         self._feature_scene = plugin_feature_scene(scene)
         self._path = _integrator(
             type="path", max_depth=max_depth, rr_depth=rr_depth, hide_emitters=True
         )
-        self._background = plugin_background(scene)
-        self._seen = _integrator(type="path", max_depth=1)
-        self._features = _integrator(type="aov", aovs="albedo:albedo,normal:sh_normal")
         self._depth = _integrator(type="aov", aovs="depth:depth")
-
-    def only_light(self, row: int | None) -> "PluginTracer":
-        if row is None:
-            raise NotImplementedError("the stock scene has no sky without lamps")
-        tracer = copy.copy(self)
-        tracer._scene = plugin_scene(self._record, only_light=row)
-        tracer._background = None
-        return tracer
-
-    def split_lights(self, *, bounces: bool, lobes: bool) -> "PluginTracer":
-        raise NotImplementedError("the stock integrator returns all light together")
-
-    def for_views(self, cameras: Sequence[PixelCamera]) -> "PluginTracer":
-        return self
 
     def radiance(
         self, camera: PixelCamera, *, seed: int, spp: int, chosen: Chosen = None
     ) -> NDArray[np.float32]:
         picture = _render(self._scene, self._path, camera, seed=seed, spp=spp)
-        if self._background is not None:  # emitters are hidden from the camera all or none
-            picture += _render(self._background, self._seen, camera, seed=seed, spp=spp)
         return picture if chosen is None else picture * chosen[..., None]
-
-    def pass_sum(self, camera: PixelCamera) -> HostSum:
-        return HostSum(self, camera)
-
-    def features(self, camera: PixelCamera, *, spp: int) -> Features:
-        channels = _render(
-            self._feature_scene, self._features, camera, seed=0, spp=spp, jitter=False
-        )
-        return Features(albedo=channels[..., 0:3].copy(), normal=channels[..., 3:6].copy())
 
     def hits(self, camera: PixelCamera) -> NDArray[np.bool_]:
         depth = _render(self._feature_scene, self._depth, camera, seed=0, spp=1, jitter=False)

@@ -27,8 +27,8 @@ from pipeline.isolation import IsolatedChild
 from pipeline.objects.generated import BENCHMARK, PREFIX
 from pipeline.presets.training import smoke
 from pipeline.renders.calibrated_error import MEASURES, METRICS, versions_of_pictures
-from pipeline.renders.host_pictures import HostPictures, measure_errors
 from pipeline.renders.noise_floor import Curve, clamped_radiance
+from pipeline.renders.pictures import ViewPictures
 from pipeline.renders.renderer import SceneRenderer
 from pipeline.renders.settings import Filtered, RenderSettings
 from pipeline.renders.view_pictures import MeasuredLook
@@ -82,10 +82,10 @@ class _RecordingRenderer(SceneRenderer):
     ) -> None:
         super().__init__(scene, settings)
         self._arithmetic = functools.partial(_RecordingPictures, reference, looks)
-        self._arithmetic.mean_radiance = HostPictures.mean_radiance
+        self._arithmetic.mean_radiance = ViewPictures.mean_radiance
 
 
-class _RecordingPictures(HostPictures):
+class _RecordingPictures(ViewPictures):
     """Pictures in numpy that append the figures of each look to a list."""
 
     def __init__(self, reference: RawReference, looks: list[dict[str, float]], *rest: Any) -> None:
@@ -96,8 +96,8 @@ class _RecordingPictures(HostPictures):
     def look(self, quality: Filtered) -> MeasuredLook:
         """Measure, and record what was measured."""
         look = super().look(quality)
-        (picture,) = self.finish()
-        a, b = self._halves
+        (picture,) = pictures = self.finish()
+        measured = self._measures(self._numbers(pictures))
         row = {
             "spp": float(self._samples.spp),
             "hits": float(self.hits.mean()),
@@ -109,7 +109,7 @@ class _RecordingPictures(HostPictures):
         for metric in METRICS:
             curve = CURVES[metric]
             objects = metric == "object"
-            measures = measure_errors(a, b, picture, curve, self.hits, objects=objects)
+            measures = measured[metric]
             pixels = self.hits if objects and self.hits.any() else everywhere
             true, open_error = true_error(picture, self._reference, curve, pixels)
             errors = {name: getattr(measures, name) for name in _MEASURED}

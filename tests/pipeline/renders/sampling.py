@@ -3,15 +3,26 @@
 import subprocess
 import sys
 from dataclasses import dataclass
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 from scipy import stats
 
+from pipeline.renders.noise_floor import MeasuredFloor
+from pipeline.renders.pictures import (
+    NUMPY,
+    Halves,
+    add_numbers,
+    estimates,
+    floors_of,
+    join_halves,
+    metric_counts,
+)
 from pipeline.renders.renderer import SceneRenderer
 from pipeline.renders.results import RenderedView
 from pipeline.renders.settings import RenderSettings
-from pipeline.renders.tracer import PixelCamera, Tracer, load_tracer, pixel_camera
+from pipeline.renders.tracer import PixelCamera, load_tracer, pixel_camera
 from storage.records.scene import Scene
 from tests.conftest import ROOT
 
@@ -49,7 +60,7 @@ def render_blocks(
     max_depth: int = 10,
     rr_depth: int = 5,
     first_seed: int = 0,
-    tracer: Tracer | None = None,
+    tracer: Any = None,
 ) -> Estimate:
     """Return the means of `block` x `block` pixels, [R / block, R / block, 3]."""
     traced = tracer or load_tracer(scene, max_depth=max_depth, rr_depth=rr_depth)
@@ -60,7 +71,7 @@ def render_blocks(
 
 
 def render_passes(
-    tracer: Tracer, scene: Scene, *, resolution: int = 32, passes: int, first_seed: int = 0
+    tracer: Any, scene: Scene, *, resolution: int = 32, passes: int, first_seed: int = 0
 ) -> NDArray[np.float64]:
     """Return independent pictures of 64 samples, [passes, R, R, 3]."""
     camera, seeds = camera_of(scene, resolution), range(first_seed, first_seed + passes)
@@ -120,6 +131,27 @@ def scores(ours: Estimate, theirs: Estimate) -> NDArray[np.float64]:
     """Return the differences of what is lit, in standard errors."""
     lit = ours.mean > 0.01 * ours.mean.max()
     return (ours.mean - theirs.mean)[lit] / np.hypot(ours.error, theirs.error)[lit]
+
+
+class Half(NamedTuple):
+    """One half of the samples of a view, [R, R, 3], raw and denoised."""
+
+    raw_rgb: NDArray[np.float32]
+    denoised_rgb: NDArray[np.float32]
+
+
+def halves_of(a: Half, b: Half) -> Halves:
+    return join_halves(a.raw_rgb, b.raw_rgb, a.denoised_rgb, b.denoised_rgb, NUMPY)
+
+
+def floor_of(a: Half, b: Half, hits: NDArray[np.bool_]) -> MeasuredFloor:
+    """Return the floor of the picture made from both halves."""
+    is_filtered = not np.array_equal(*a)
+    rows, nothing = estimates(halves_of(a, b), hits, NUMPY, is_filtered), np.zeros(hits.shape)
+    errors, surprises = zip(*rows, strict=True)
+    numbers = add_numbers([], [nothing] * 3 + list(errors), [*surprises, nothing], [])
+    (floor,) = floors_of(numbers, metric_counts(hits))
+    return floor
 
 
 def exact(mean: NDArray[np.float64]) -> Estimate:

@@ -19,19 +19,20 @@ from pipeline.renders.calibrated_error import (
     MetricStatement,
     first_spp,
     load_statement,
+    measures_of_totals,
     versions_of_pictures,
 )
-from pipeline.renders.host_pictures import (
-    Half,
-    HostMeans,
-    Pictures,
-    estimate_error,
-    keep_converged,
+from pipeline.renders.noise_floor import ErrorMeasures
+from pipeline.renders.pictures import (
+    NUMPY,
+    converged_mask,
+    error_measures,
+    keep,
     keep_in_halves,
-    measure_errors,
-    with_mean_of,
+    read_sums,
+    squared_error,
 )
-from pipeline.renders.noise_floor import ErrorMeasures, clamped_radiance
+from pipeline.renders.pixels import with_mean_of
 from pipeline.renders.samples import DualBuffer, TileChoice
 from pipeline.renders.settings import Arithmetic, RenderSettings
 from pipeline.renders.tracer import load_tracer
@@ -40,7 +41,7 @@ from storage import denoiser
 from storage.denoiser import Features, denoise, load_oidn, set_denoiser_device
 from storage.errors import TrilightError
 from tests.for_each import for_each
-from tests.pipeline.renders.sampling import camera_of, render_view
+from tests.pipeline.renders.sampling import Half, camera_of, floor_of, halves_of, render_view
 from tests.pipeline.renders.scene_kit import sampled_like_scene
 from tests.pipeline.renders.test_renderer import lit_scene
 
@@ -182,14 +183,18 @@ def test_a_pixel_is_kept_where_it_stands_out_by_its_own_error() -> None:
         raw = denoised.copy()
         raw[1, 2] = value
         standard_error = np.full((4, 4), abs(value - 1) / errors)
-        (picture,) = keep_converged(denoised[None], raw[None], standard_error)
+        picture = _kept(denoised, raw, standard_error)
         np.testing.assert_array_equal(picture, raw if kept else denoised, err_msg=name)
     # a dark pixel beside one that is still noisy is not kept
     raw[1, 2] = 0.1
     standard_error = np.full((4, 4), 0.01)
     standard_error[2, 3] = 1.0  # a third of it, in the mean square of nine pixels, is 0.33
-    (picture,) = keep_converged(denoised[None], raw[None], standard_error)
-    np.testing.assert_array_equal(picture, denoised)
+    np.testing.assert_array_equal(_kept(denoised, raw, standard_error), denoised)
+
+
+def _kept(denoised: NDArray, raw: NDArray, standard_error: NDArray) -> NDArray:
+    mask = converged_mask([denoised], [raw], standard_error**2, NUMPY)
+    return np.asarray(keep(mask, [raw], [denoised], NUMPY)[0])
 
 
 def test_the_mean_is_that_of_the_samples_and_glints_get_back_what_they_lost() -> None:
@@ -214,19 +219,19 @@ def test_the_floor_of_a_kept_glint_is_its_noise() -> None:
     denoised = truth.copy()
     truth[5, 9] = 50
     noise = np.where(truth > 1, rng.normal(0, 0.1, (2, *truth.shape)), 0).astype(np.float32)
-    halves = [((truth + of_half)[None], denoised[None]) for of_half in noise]
-    hits = np.ones((32, 32), bool)
-    lost = _floor_db(halves, hits)
-    kept = _floor_db(keep_in_halves(halves, np.full((32, 32), 0.05)), hits)
+    raws = [[truth + of_half] for of_half in noise]
+    filtered = [[denoised], [denoised]]
+    lost = _floor_db(raws, filtered)
+    kept = _floor_db(raws, keep_in_halves(raws, filtered, np.full((32, 32), 0.05**2), NUMPY))
     # log10(51 / 2) in one of 1024 pixels, counted as error, surprise and standard error: 3 dB each.
     assert lost < 27.2
     # What is left, 0.1 / sqrt(2) of 51 and 2, is some 40 dB lower.
     assert kept > 55
 
 
-def _floor_db(halves: Sequence[tuple[Pictures, Pictures]], hits: NDArray[np.bool_]) -> float:
-    a, b = (Half(raw_rgb=raw[0], denoised_rgb=denoised[0]) for raw, denoised in halves)
-    return estimate_error(a, b, hits).log_db
+def _floor_db(raws: Sequence[Sequence[NDArray]], denoised: Sequence[Sequence[NDArray]]) -> float:
+    a, b = (Half(*raw, *each) for raw, each in zip(raws, denoised, strict=True))
+    return floor_of(a, b, np.ones((32, 32), bool)).log_db
 
 
 def test_the_standard_error_is_that_between_passes() -> None:
@@ -244,8 +249,8 @@ def test_the_standard_error_is_that_between_passes() -> None:
         total.add = remembered  # type: ignore[method-assign]
     for _ in samples.passes_to(128):
         pass
-    few = HostMeans(samples).standard_error()
-    assert few is not None and np.isinf(few).all(), "8 passes are too few"
+    few = squared_error(read_sums(samples, squares=True), NUMPY)
+    assert np.isinf(few).all(), "8 passes are too few"
     for _ in samples.passes_to(256):
         pass
     assert len(asked) == LEAST_PASSES
@@ -255,8 +260,7 @@ def test_the_standard_error_is_that_between_passes() -> None:
     weights = np.array([spp for _, spp in asked], np.float64)
     mean = np.tensordot(weights / weights.sum(), greys, 1)
     variance = np.tensordot(weights, np.square(greys - mean), 1) / (len(asked) - 1) / weights.sum()
-    found = HostMeans(samples).standard_error()
-    assert found is not None
+    found = np.sqrt(squared_error(read_sums(samples, squares=True), NUMPY))
     # Differences of sums lose 7 of 16 digits: 1e-4 of the pixel's value is far below its noise.
     np.testing.assert_allclose(found, np.sqrt(variance), rtol=1e-3, atol=1e-4 * mean.max())
 
@@ -440,7 +444,11 @@ def test_the_unbiased_measures_are_the_true_errors() -> None:
         for raw in raws
     )
     picture = denoise((raws[0] + raws[1]) / 2).astype(np.float32)
-    found = measure_errors(a, b, picture, clamped_radiance, np.ones((px, px), bool))
+    everywhere = np.ones((px, px), bool)
+    totals, surprises = error_measures(
+        halves_of(a, b), picture.astype(np.float64), everywhere, NUMPY
+    )
+    found = measures_of_totals(totals.reshape(3, 6)[1], surprises[1].max(), px * px, 1.0)
     noise = 0.25 * 0.05**2 / 2
     assert found.agreement == pytest.approx(noise, rel=0.02)
     assert found.estimate == pytest.approx(0.02**2 + noise, rel=0.05)

@@ -23,7 +23,7 @@ from pipeline.renders.ggx import AlbedoLookup, KernelLobes
 from pipeline.renders.renderer import SceneRenderer
 from pipeline.renders.results import RenderedView
 from pipeline.renders.settings import Filtered, RenderSettings
-from pipeline.renders.tracer import Tracer, load_tracer
+from pipeline.renders.tracer import load_tracer
 from pipeline.renders.vector_tracer import VectorTracer
 from pipeline.renders.view_pictures import MeasuredLook
 from storage.optics.bsdf import bsdf_lobes
@@ -227,9 +227,8 @@ def _floors_db(view: RenderedView) -> list[float]:
     return [*of_picture, *(db for floor in floors for db in dataclasses.astuple(floor))]
 
 
-def _sums(tracer: Tracer, scene: Scene, first_seed: int) -> list[NDArray]:
+def _sums(tracer: VectorTracer, scene: Scene, first_seed: int) -> list[NDArray]:
     """Return the sums of passes of other seeds, samples and pixels, some of them guided."""
-    assert isinstance(tracer, VectorTracer)
     total, rng = tracer.pass_sum(camera_of(scene, PX)), np.random.default_rng(first_seed)
     for number, (spp, fraction) in enumerate(itertools.product((4, 16, 64), (1, 0.5, 0.1))):
         chosen = None if fraction == 1 else rng.random((PX, PX)) < fraction

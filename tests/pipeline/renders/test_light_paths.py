@@ -33,7 +33,6 @@ from pipeline.renders.vector_tracer import (
     VectorTracer,
     even_numbers,
     even_shifts,
-    trace_camera_paths,
 )
 from storage.conventions import camera_rays
 from storage.metrics import psnr_log_db
@@ -76,7 +75,9 @@ class CameraPathsOnly(VectorTracer):
     """The path tracer as it is without light paths."""
 
     _light_paths = 0.0
-    _traced = staticmethod(trace_camera_paths)
+
+    def _light(self, camera: PixelCamera, seed: int | None, spp: int) -> Any:
+        return [dr.zeros(mi.Color3f, camera.resolution**2)]
 
 
 class CameraPathsLeft(CameraPathsOnly):
@@ -143,6 +144,7 @@ def test_any_number_of_light_paths_gives_the_same_light(monkeypatch: pytest.Monk
     alone = _means(CameraPathsOnly, scene, passes=12)
     for light_paths in (1e-3, 4.0):
         monkeypatch.setattr(vector_tracer, "LIGHT_PATHS", light_paths)
+        monkeypatch.setattr(VectorTracer, "_light_paths", light_paths)
         assert_agree(_means(VectorTracer, scene, first_seed=300, passes=12), alone)
 
 
@@ -477,8 +479,8 @@ def _table(peaks: NDArray[np.int64]) -> Any:
     return GuideTable(cells, rows, apportion_entries(shares))
 
 
-def _guidance() -> Any:
-    return Guidance(row=dr.opaque(mi.UInt32, 1), share=mi.Float(0.5))
+def _guidance(peaks: NDArray[np.int64]) -> Guidance:
+    return Guidance(row=dr.opaque(mi.UInt32, 1), share=mi.Float(0.5), table=_table(peaks))
 
 
 def _twin(directions: NDArray[np.float64], peaks: NDArray[np.int64]) -> NDArray[np.float64]:
@@ -498,7 +500,7 @@ def test_the_density_is_that_of_a_slow_twin_and_integrates_to_one() -> None:
     directions = rng.normal(size=(1 << 18, 3))
     directions /= np.linalg.norm(directions, axis=1, keepdims=True)
     directions = directions.astype(np.float32)
-    pdf = np.array(_table(peaks).pdf(_guidance(), mi.Vector3f(*directions.T.copy()), mi.Bool(True)))
+    pdf = np.array(_guidance(peaks).pdf(mi.Vector3f(*directions.T.copy()), mi.Bool(True)))
     expected = _twin(directions.astype(np.float64), peaks)
     # Directions within roundings of a bin's rim may fall on either side: one in ten thousand.
     assert np.isclose(pdf, expected, rtol=1e-4).mean() > 0.9999
@@ -511,8 +513,8 @@ def test_directions_are_drawn_by_the_density() -> None:
     rng = np.random.default_rng(2)
     peaks, count = rng.integers(0, 1024, 256), 1 << 18
     u = mi.Point2f(*(rng.random((2, count)).astype(np.float32)))
-    table = _table(peaks)
-    drawn = table.sample(_guidance(), u, mi.Bool(True))
+    guidance = _guidance(peaks)
+    drawn = guidance.sample(u, mi.Bool(True))
     found = np.bincount(np.array(bin_of(drawn)[0]), minlength=1024)
     expected = np.bincount(peaks, minlength=1024) / 256 * count
     there = expected > 0
@@ -522,7 +524,7 @@ def test_directions_are_drawn_by_the_density() -> None:
     assert chi_sq < freedom + 5 * np.sqrt(2 * freedom)
     directions = np.array(drawn).T.astype(np.float64)
     # The mean of g / density is the integral of g over the bins that are there.
-    pdf = np.array(table.pdf(_guidance(), drawn, mi.Bool(True)), np.float64)
+    pdf = np.array(guidance.pdf(drawn, mi.Bool(True)), np.float64)
     uniform = rng.normal(size=(count, 3))
     uniform /= np.linalg.norm(uniform, axis=1, keepdims=True)
     inside = _twin(uniform, peaks) > 0
@@ -542,10 +544,10 @@ def test_what_is_no_direction_still_has_a_bin() -> None:
 
 
 def test_a_cell_that_learnt_nothing_is_not_guided() -> None:
-    nothing = Guidance(row=mi.UInt32(0), share=mi.Float(0))
+    nothing = Guidance(row=mi.UInt32(0), share=mi.Float(0), table=_table(np.arange(4)))
     unguided = mi.Float(0.1, 0.3, 1e9)
     direction = mi.Vector3f(0, 0, 1)
-    mixed = _table(np.arange(4)).mixture(nothing, unguided, direction, mi.Bool(True))
+    mixed = nothing.mixture(unguided, direction, mi.Bool(True))
     np.testing.assert_array_equal(np.array(mixed), np.array(unguided))
 
 
@@ -566,7 +568,7 @@ def test_a_table_is_bounded_however_many_cells_have_photons(
     )
     table = guide_table.learn(cells, photons)
     assert table is not None
-    assert len(table._densities) <= (1 + 4 * 200) * BINS
+    assert len(table.densities) <= (1 + 4 * 200) * BINS
 
 
 def test_shares_become_whole_numbers_that_add_up() -> None:

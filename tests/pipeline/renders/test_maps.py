@@ -2,7 +2,6 @@
 
 import dataclasses
 import tracemalloc
-from pathlib import Path
 from typing import Any
 
 import mitsuba as mi
@@ -14,14 +13,9 @@ from pipeline.renders import kernel_scene
 from pipeline.renders.emitter_table import alias_table
 from pipeline.renders.sky_table import SkyTable, alias_rows, peaked_radiance, sky_share
 from pipeline.renders.surface_table import KernelTextures
-from pipeline.renders.tracer import Tracer, load_tracer
-from pipeline.scenes.pieces import apply_skin, concatenate_pieces, emitter_piece, object_piece
-from pipeline.scenes.source_materials import source_skins
-from pipeline.scenes.triangle_budget import PooledAsset
-from scene_templates.layout import Emitter
+from pipeline.renders.tracer import load_tracer
+from pipeline.renders.vector_tracer import VectorTracer
 from scene_templates.rotations import uniform_rotation
-from scene_templates.sample_material import MaterialSettings
-from storage.conventions import look_at_c2w
 from storage.errors import TrilightError
 from storage.raycast.first_hits import first_hits
 from storage.records.environment import Environment, row_solid_angles
@@ -35,20 +29,8 @@ from storage.records.lookup import (
     u_directions,
 )
 from storage.records.passes.pictures import view_passes
-from storage.records.retextured import without_constant_textures
-from storage.records.scene import Scene, SceneObject
+from storage.records.scene import Scene
 from storage.records.texture import MAX_SIDE, Texture
-from storage.seeds import SceneKey
-from tests.oracle.plugin_tracer import PluginTracer
-from tests.pipeline.assets.meshes_by_hand import prepare
-from tests.pipeline.assets.source_materials.textured_kit import CORNERS as PICTURE_CORNERS
-from tests.pipeline.assets.source_materials.textured_kit import (
-    KEEP,
-    QUARTERS,
-    picture_bytes,
-    textured_glb,
-    textured_obj,
-)
 from tests.pipeline.renders.sampling import (
     assert_same_light,
     camera_of,
@@ -69,7 +51,6 @@ from tests.pipeline.renders.scene_kit import (
     textured,
     textured_floor,
 )
-from tests.pipeline.scenes.small_pool import LOOK, small_pool
 from tests.rigid_motion import moved
 from tests.sky_maps import as_sky, constant, night, one_sun, six_poles, smooth
 from tests.textured_by_hand import bumps
@@ -77,17 +58,16 @@ from trilight import render
 
 pytestmark = pytest.mark.usefixtures("llvm")
 
-TRACERS = [load_tracer, pytest.param(PluginTracer, marks=pytest.mark.slow("statistics"))]
 
-
-@pytest.mark.parametrize("tracer", TRACERS)
-def test_guides_are_the_lookup_of_the_records(tracer: Any) -> None:
+def test_guides_are_the_lookup_of_the_records() -> None:
     """Coordinates from -1.75 to 1.25 wrap; a diffuse and a specular map of unlike sizes add up."""
     corners = np.array([[(0.8, 0.1, 0.1), (0.1, 0.8, 0.1)], [(0.1, 0.1, 0.8), (0.7, 0.7, 0.1)]])
     maps = noise_map(1, 3, 0, 0.6), Texture(texels=(0.3 * corners).astype(np.float32))
     scene = textured([textured_floor(material(roughness=0.4)), SKY_LAMP], maps, [0, 1, -1])
     scene = _moved(scene, 3.0, np.array([-1.75, -1.75]))
-    albedo = tracer(scene, max_depth=2, rr_depth=5).features(camera_of(scene, 32), spp=1).albedo
+    albedo = (
+        load_tracer(scene, max_depth=2, rr_depth=5).features(camera_of(scene, 32), spp=1).albedo
+    )
     rows = np.nan_to_num(first_hits(scene, resolution=32).material)
     wanted = rows[..., 0:3] + rows[..., 3:6]
     # Float32 places of hits: 1e-6 of a coordinate is 7e-6 texels, whose values differ by up to .6.
@@ -95,7 +75,7 @@ def test_guides_are_the_lookup_of_the_records(tracer: Any) -> None:
     assert np.mean(np.abs(albedo - wanted).max(axis=-1) > 2e-5) < 0.01
     assert np.ptp(wanted, axis=(0, 1)).min() > 0.5
     far = _moved(scene, 1.0, np.array([1000.0, -512.0]))
-    moved = tracer(far, max_depth=2, rr_depth=5).features(camera_of(far, 32), spp=1).albedo
+    moved = load_tracer(far, max_depth=2, rr_depth=5).features(camera_of(far, 32), spp=1).albedo
     # The stored coordinates know 1000 to 3e-5: two ten-thousandths of a texel.
     assert np.abs(albedo - moved).max() < 5e-4
 
@@ -181,50 +161,7 @@ def test_maps_that_break_a_law_never_reach_a_kernel() -> None:
                 render(scene, resolution=16, max_spp=8)
 
 
-def test_a_traced_picture_has_the_colours_in_their_corners(tmp_path: Path) -> None:
-    """From a file to a picture: red at the lower left, as its picture has it."""
-    data = picture_bytes(PICTURE_CORNERS)
-    for path in (
-        textured_glb(tmp_path / "a.glb", data),
-        textured_obj(tmp_path / "o" / "a.obj", data),
-    ):
-        _require_colours_in_corners(path)
-
-
-def _require_colours_in_corners(path: Path) -> None:
-    entry = PooledAsset(locked=small_pool()[0].locked, asset=prepare(path, KEEP))
-    (level, *_) = entry.asset.levels
-    (skin,) = source_skins([entry], [level], MaterialSettings(source="object"), SceneKey(0, 0))
-    assert skin is not None
-    named, rng = SceneObject(name="square", kind="object"), np.random.default_rng(0)
-    square = object_piece(named, level.positions, level.faces, LOOK, rng, 30.0)
-    square = apply_skin(square, level.positions, level.faces, skin)
-    triangle = np.array([[-1, -3, 2], [1, -3, 2], [0, -3, 3.0]])
-    lamp = emitter_piece(
-        Emitter(triangle=triangle, radiance_rgb=(9.0, 9.0, 9.0), reflectance=0.0), 0
-    )
-    pose = look_at_c2w(eye=[0, -2, 0], target=[0, 0, 0], up=[0, 0, 1])
-    scene = without_constant_textures(
-        Scene(
-            **concatenate_pieces([square, lamp]),
-            c2w=pose[None].astype(np.float32),
-            fov_deg=np.array([30], np.float32),
-            objects=(square.entry, lamp.entry),
-            provenance={"template": "none"},
-        )
-    )
-    scene.check()
-    assert len(scene.textures) == 1  # specular and roughness are constants
-    tracer = load_tracer(scene, max_depth=2, rr_depth=5)
-    picture = tracer.radiance(camera_of(scene, 32), spp=64, seed=0)
-    centre, width = 16, 32 / (2 * 2 * np.tan(np.radians(15)))  # pixels for each metre
-    for (right, up), colour in QUARTERS.items():
-        seen = picture[int(centre - up * width), int(centre + right * width)]
-        lit = np.array(colour) > 0
-        assert seen[lit].min() > 4 * seen[~lit].max(initial=0), (right, up, seen)
-
-
-def _tracer(scene: Scene) -> Tracer:
+def _tracer(scene: Scene) -> VectorTracer:
     return load_tracer(scene, max_depth=10, rr_depth=5)
 
 
@@ -298,12 +235,13 @@ def test_directions_come_with_the_density_that_is_stated(number: int) -> None:
     """The mean of L / density over drawn directions is the flux of the map, and so by octants."""
     sky, count = MAPS[number], 1 << 15
     table, rng = SkyTable(sky, 0.7), np.random.default_rng(5)
-    drawn = table.sample(mi.Point2f(rng.random((2, count)).astype(np.float32)), mi.Bool(True))
-    directions = np.array(drawn.direction).T
+    u = mi.Point2f(rng.random((2, count)).astype(np.float32))
+    direction, pdf, radiance = table.sample(u, mi.Bool(True))
+    directions = np.array(direction).T
     assert np.abs(np.linalg.norm(directions, axis=1) - 1).max() < 1e-6
-    again = table.radiance_and_density(drawn.direction, mi.Bool(True))[1]
-    np.testing.assert_array_equal(np.array(again), np.array(drawn.pdf))
-    weighed = np.array(drawn.radiance).T / (np.array(drawn.pdf)[:, None] / np.float32(0.7))
+    again = table.radiance_and_density(direction, mi.Bool(True))[1]
+    np.testing.assert_array_equal(np.array(again), np.array(pdf))
+    weighed = np.array(radiance).T / (np.array(pdf)[:, None] / np.float32(0.7))
     octant = (directions > 0) @ np.array([1, 2, 4])
     uniform = rng.normal(size=(1 << 16, 3))
     uniform /= np.linalg.norm(uniform, axis=1, keepdims=True)
@@ -320,8 +258,9 @@ def test_a_sun_of_one_texel_is_drawn_by_what_its_neighbours_have_of_it() -> None
     """Estimates of its flux by one draw differ by the slope within texels, not by 10,000 times."""
     sky = one_sun()
     table, rng = SkyTable(sky, 1.0), np.random.default_rng(6)
-    drawn = table.sample(mi.Point2f(rng.random((2, 1 << 16)).astype(np.float32)), mi.Bool(True))
-    weighed = np.array(drawn.radiance)[0] / np.array(drawn.pdf)
+    u = mi.Point2f(rng.random((2, 1 << 16)).astype(np.float32))
+    _, pdf, radiance = table.sample(u, mi.Bool(True))
+    weighed = np.array(radiance)[0] / np.array(pdf)
     # A tent that is drawn by its means over texels: measured 1.05.
     assert weighed.std() < 1.2 * weighed.mean()
 

@@ -137,6 +137,7 @@ def test_a_probe_without_an_answer_is_tried_again_and_leads_to_no_other_library(
 
 
 CPU, GPU = "llvm_ad_rgb", "cuda_ad_rgb"
+MISSING = "and no NVIDIA GPU is visible here; expected a GPU with CUDA and OptiX"
 ON_CPU = Variant(name="llvm_ad_rgb", libllvm="libLLVM.so", note="")
 
 
@@ -148,7 +149,16 @@ ON_CPU = Variant(name="llvm_ad_rgb", libllvm="libLLVM.so", note="")
         ("", "auto", None, "0", "no OptiX", CPU),
         ("", "auto", None, "", "must not be probed", CPU),
         ("", "cpu", "gpu", "0", "", GPU),
-        ("", "cpu", "gpu", "", "must not be probed", "no NVIDIA GPU is visible here"),
+        (
+            "",
+            "cpu",
+            "gpu",
+            "",
+            "must not be probed",
+            f"--device is gpu, {MISSING}. Choose --device",
+        ),
+        ("", "gpu", None, "", "must not be probed", f"begun on a GPU, {MISSING}. Choose"),
+        (GPU, "cpu", None, "", "must not be probed", f"cuda_ad_rgb, {MISSING}. Unset TRILIGHT_VAR"),
         ("", "cpu", "gpu", "0", "no OptiX", "no OptiX.*Choose --device cpu"),
         (GPU, "cpu", None, "0", "", GPU),
         (GPU, "cpu", "cpu", "0", "", CPU),
@@ -239,26 +249,6 @@ def test_a_gpu_is_used_by_what_its_probe_says(
     assert chosen.denoiser == ("CPU" if printed else "CUDA")
     assert bool(chosen.note) == bool(note) and chosen.note.startswith(note)
     assert ("denoiser_device" in environment(chosen)) == (not printed)
-
-
-def test_a_gpu_that_is_asked_for_and_missing_is_one_sentence(
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:
-    monkeypatch.setenv("CUDA_VISIBLE_DEVICES", "")  # hides the GPUs of a machine that has some
-    monkeypatch.delenv("TRILIGHT_VARIANT", raising=False)
-    expected = "{}, and no NVIDIA GPU is visible here; expected a GPU with CUDA and OptiX. {}."
-
-    def refused(default: Device, device: Device | None = None) -> str:
-        with pytest.raises(TrilightError) as caught:
-            choose_variant(default, device=device)
-        return str(caught.value)
-
-    cpu = "Choose --device cpu"
-    assert refused("cpu", "gpu") == expected.format("--device is gpu", cpu)
-    assert refused("gpu") == expected.format("the dataset was begun on a GPU", cpu)
-    monkeypatch.setenv("TRILIGHT_VARIANT", "cuda_ad_rgb")
-    unset = expected.format("TRILIGHT_VARIANT is cuda_ad_rgb", "Unset TRILIGHT_VARIANT")
-    assert refused("cpu") == unset
 
 
 def test_a_process_denoises_where_its_variant_says(variant: Variant) -> None:

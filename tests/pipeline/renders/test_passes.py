@@ -11,13 +11,12 @@ import pytest
 from numpy.typing import NDArray
 
 from pipeline.renders.tracer import load_tracer
-from storage.raycast.first_hits import first_hits
 from storage.records.passes.pictures import view_passes
 from storage.records.scene import Scene
 from tests.oracle import plugin_scene, plugin_tracer
 from tests.oracle.plugin_tracer import _NEAR_CLIP
 from tests.pipeline.renders.sampling import camera_of
-from tests.pipeline.renders.scene_kit import flat, join, light, material, quad, sampled_like_scene
+from tests.pipeline.renders.scene_kit import join, light, material, quad, sampled_like_scene
 
 RESOLUTION = 32
 CHANNELS = {
@@ -97,46 +96,3 @@ def test_a_lit_square_covers_the_pixels_that_it_should() -> None:
     np.testing.assert_allclose(features.normal, expected[..., None] * [0, -1, 0], atol=0.02)
     assert (picture[expected] > 0.2).all()
     assert (picture[~expected] < 0.02).all()
-
-
-def test_emitters_are_invisible_to_the_auxiliary_pictures() -> None:
-    floor = quad([[-1, -1, 0], [1, -1, 0], [1, 1, 0], [-1, 1, 0]], material(diffuse=0.5))
-    in_front = flat([[[-1, -1, 0.5], [1, -1, 0.5], [0, 1, 0.5]]], material(emission=1), "emitter")
-    lamp = light([[-1, -1, 3], [1, -1, 3], [0, 1, 3]], 1.0)
-    pictures = [
-        load_tracer(join(parts, eye=(0, -0.1, 2)), max_depth=2, rr_depth=5)
-        for parts in ([floor, lamp], [floor, lamp, in_front])
-    ]
-    camera = camera_of(join([floor, lamp], eye=(0, -0.1, 2)), 16)
-    without, with_emitter = (tracer.features(camera, spp=16) for tracer in pictures)
-    np.testing.assert_array_equal(without.albedo, with_emitter.albedo)
-    np.testing.assert_array_equal(without.normal, with_emitter.normal)
-    np.testing.assert_array_equal(pictures[0].hits(camera), pictures[1].hits(camera))
-
-
-@pytest.mark.parametrize("seed", [0, 1])
-def test_the_renderer_meets_surfaces_at_the_same_pixels(seed: int) -> None:
-    scene = sampled_like_scene(np.random.default_rng(seed), num_views=2)
-    tracer = load_tracer(scene, max_depth=4, rr_depth=5)
-    for view in range(scene.num_views):
-        seen = first_hits(scene, view=view, resolution=32)
-        assert 0 < seen.met.sum()
-        # a ray along a rim may go either way: two builds of Embree round differently
-        assert (tracer.hits(camera_of(scene, 32, view)) != seen.met).sum() <= 1
-        features = tracer.features(camera_of(scene, 32, view), spp=64)
-        _same_normals(seen.shading_normal, features.normal)
-
-
-def _same_normals(exact: np.ndarray, averaged: np.ndarray) -> None:
-    """Where a pixel's average is a unit vector, all of the pixel has one normal: that one.
-
-    Up to its sign: the renderer turns the normals of surfaces that are seen from behind.
-    """
-    even = np.linalg.norm(averaged, axis=-1) > 0.9999
-    even &= np.isfinite(exact[..., 0])
-    assert even.sum() > 50
-    cosine = abs(np.sum(exact * averaged, axis=-1))[even]
-    # unit vectors whose average is as long as 0.9999 lie within 0.8 degrees of it on average;
-    # the centre of a pixel may lie at the edge of that
-    assert np.median(cosine) > 0.9999
-    assert cosine.min() > 0.99

@@ -13,7 +13,6 @@ from pipeline.renders.preview import (
     Preview,
     PreviewRenderer,
     PreviewSettings,
-    ProgressiveRenderer,
     all_parts,
     preview_parts,
     seconds_of,
@@ -142,7 +141,7 @@ GROWING = RenderSettings(
 def test_the_first_looks_are_previews_and_the_last_picture_is_the_measured_one() -> None:
     scene = tiny_scene()
     view = run_to_end(SceneRenderer(scene, GROWING).view_steps(scene.c2w[0], 45.0, 7))
-    *steps, last = ProgressiveRenderer(scene, GROWING).view_steps(scene.c2w[0], 45.0, 7)
+    *steps, last = SceneRenderer(scene, GROWING, shows_looks=True).view_steps(scene.c2w[0], 45.0, 7)
     assert isinstance(last, RenderedView) and last.noise_floor_db == view.noise_floor_db
     np.testing.assert_array_equal(last.radiance_rgb, view.radiance_rgb)
     seen = [step for step in steps if isinstance(step, GrowingPicture)]

@@ -11,14 +11,8 @@ from hypothesis.extra import numpy as hnp
 from numpy.typing import NDArray
 
 from infra.render.quality import ToStatedError
-from pipeline.renders.host_pictures import (
-    Half,
-    HostMeans,
-    LogChanges,
-    estimate_error,
-    squared_error,
-    surprises,
-)
+from pipeline.renders.noise_floor import Curve
+from pipeline.renders.pictures import NUMPY, means, pixel_errors, read_sums
 from pipeline.renders.renderer import SceneRenderer
 from pipeline.renders.samples import (
     TILE_PX,
@@ -30,6 +24,7 @@ from pipeline.renders.samples import (
     next_spp,
     passes_of_tiles,
     slope_db,
+    tile_means,
 )
 from pipeline.renders.settings import NoiseTargets, RenderSettings
 from pipeline.renders.tracer import Chosen, PixelCamera, load_tracer
@@ -38,7 +33,7 @@ from storage.errors import TrilightError
 from storage.metrics import MAX_DB, psnr_linear_db, psnr_log_db
 from storage.records.scene import Scene
 from tests.oracle.plugin_tracer import HostSum
-from tests.pipeline.renders.sampling import camera_of
+from tests.pipeline.renders.sampling import Half, camera_of, floor_of, halves_of
 from tests.pipeline.renders.scene_kit import lit_by_a_mirror, sampled_like_scene
 
 CAMERA = PixelCamera(c2w=np.eye(4), fov_deg=40.0, resolution=32)
@@ -54,7 +49,7 @@ class Recorder:
         self.asked: list[tuple[int, int]] = []
 
     def pass_sum(self, camera: PixelCamera) -> HostSum:
-        return HostSum(self, camera)  # type: ignore[arg-type]
+        return HostSum(self, camera)
 
     def radiance(
         self, camera: PixelCamera, *, seed: int, spp: int, chosen: Chosen = None
@@ -80,10 +75,19 @@ def test_passes_are_the_largest_that_fit_and_weigh_by_their_samples() -> None:
         assert samples.spp == spp
         assert [size for size, _ in tracer.asked] == [size for size in of_a_half for _ in range(2)]
         assert len({seed for _, seed in tracer.asked}) == len(tracer.asked), "no two are equal"
-    means = HostMeans(samples)
     expected = (4 * 16 * 16 + 64 * 64) / 128
-    assert means.mean().max() == means.mean().min() == expected
-    assert [float(half.mean()) for half in means.half_means()] == [expected, expected]
+    both, halves = mean_of(samples), half_means_of(samples)
+    assert both.max() == both.min() == expected
+    assert [float(half.mean()) for half in halves] == [expected, expected]
+
+
+def mean_of(samples: DualBuffer) -> NDArray[np.float32]:
+    ((picture,),) = means(read_sums(samples), NUMPY, of_both=True)
+    return np.asarray(picture)
+
+
+def half_means_of(samples: DualBuffer) -> list[NDArray[np.float32]]:
+    return [picture for (picture,) in means(read_sums(samples), NUMPY, of_both=False)]
 
 
 def test_light_paths_are_those_of_other_views_and_of_no_other_half_or_pass(
@@ -235,15 +239,19 @@ def half(rng: np.random.Generator) -> Half:
     return Half(raw_rgb=raw, denoised_rgb=blurred(raw))
 
 
+def errors(a: Half, b: Half, curve: Curve) -> tuple[Any, Any]:
+    return pixel_errors(halves_of(a, b), curve, NUMPY, is_filtered=True)
+
+
 def test_on_average_the_estimate_is_the_error_of_the_mean_of_both_halves() -> None:
     """In linear light the law is exact: stripes lose two thirds, of the noise a sixth remains."""
     rng = np.random.default_rng(0)
     pairs = [(half(rng), half(rng)) for _ in range(200)]
-    estimates = [squared_error(a, b, lambda radiance: radiance).mean() for a, b in pairs]
+    estimates = [errors(a, b, lambda radiance: radiance)[0].mean() for a, b in pairs]
     exact = (2 / 3 * 0.3) ** 2 + NOISE**2 / 6
     spread = np.std(estimates) / np.sqrt(len(estimates))
     assert abs(np.mean(estimates) - exact) < 4 * spread < 0.01 * exact
-    found = np.mean([squared_error(a, b, log10_radiance).mean() for a, b in pairs[:50]])
+    found = np.mean([errors(a, b, log10_radiance)[0].mean() for a, b in pairs[:50]])
     means = [0.5 * (a.denoised_rgb + b.denoised_rgb) for a, b in pairs[:50]]
     wanted = np.mean([10 ** (-psnr_log_db(mean, truth()) / 10) for mean in means])
     # The secant goes through the raw mean, whose noise of 0.035 bends it by some per cent.
@@ -255,7 +263,7 @@ def test_a_bias_that_both_halves_share_is_stated() -> None:
     flat = np.full((PX, PX, 3), truth().mean(), np.float32)
     a, b = (Half(raw_rgb=half(rng).raw_rgb, denoised_rgb=flat) for _ in range(2))
     assert psnr_log_db(a.denoised_rgb, b.denoised_rgb) == MAX_DB, "the halves agree exactly"
-    floor = estimate_error(a, b, EVERYWHERE)
+    floor = floor_of(a, b, EVERYWHERE)
     # The allowances take off what one standard error and one pixel's surprise are: under 1 dB here.
     assert psnr_log_db(flat, truth()) - 1 < floor.log_db < psnr_log_db(flat, truth())
     assert psnr_linear_db(flat, truth()) - 1 < floor.linear_db < psnr_linear_db(flat, truth())
@@ -268,11 +276,11 @@ def test_rare_light_that_one_half_found_is_allowed_for() -> None:
     found, missed = (Half(raw_rgb=picture, denoised_rgb=calm) for picture in (raw, calm))
     mean = 0.5 * (raw[3, 4] + calm[3, 4])
     surprise = np.square(log10_radiance(mean) - log10_radiance(calm[3, 4])).mean()
-    assert surprises(found, missed, log10_radiance).max() == pytest.approx(surprise)
-    floor = estimate_error(found, missed, EVERYWHERE)
+    assert errors(found, missed, log10_radiance)[1].max() == pytest.approx(surprise)
+    floor = floor_of(found, missed, EVERYWHERE)
     # What one half alone has cancels in the estimate: the allowance is all that is stated.
     assert floor.log_db == pytest.approx(-10 * np.log10(surprise / PX**2), abs=0.1)
-    both = estimate_error(found, found, EVERYWHERE)
+    both = floor_of(found, found, EVERYWHERE)
     assert both.log_db < floor.log_db - 3, "light that both found is an error, and still a surprise"
 
 
@@ -282,16 +290,16 @@ def test_raw_halves_state_the_error_of_one() -> None:
     halves = [Half(raw_rgb=picture, denoised_rgb=picture) for picture in raw]
     exact = psnr_log_db(raw[0], truth())
     # One standard error of 64 blocks more: 0.2 dB.
-    assert estimate_error(halves[0], halves[1], EVERYWHERE).log_db == pytest.approx(exact, abs=0.4)
+    assert floor_of(halves[0], halves[1], EVERYWHERE).log_db == pytest.approx(exact, abs=0.4)
 
 
 def test_pictures_without_error_or_without_geometry_state_the_cap() -> None:
     calm = Half(raw_rgb=truth(), denoised_rgb=truth())
-    assert estimate_error(calm, calm, EVERYWHERE).log_db == MAX_DB
+    assert floor_of(calm, calm, EVERYWHERE).log_db == MAX_DB
     rng = np.random.default_rng(4)
     a, b = half(rng), half(rng)
-    assert estimate_error(a, b, ~EVERYWHERE).object_log_db == MAX_DB
-    assert estimate_error(a, b, EVERYWHERE) == estimate_error(b, a, EVERYWHERE)
+    assert floor_of(a, b, ~EVERYWHERE).object_log_db == MAX_DB
+    assert floor_of(a, b, EVERYWHERE) == floor_of(b, a, EVERYWHERE)
 
 
 def test_an_empty_background_earns_nothing() -> None:
@@ -303,7 +311,7 @@ def test_an_empty_background_earns_nothing() -> None:
         Half(raw_rgb=np.pad(each.raw_rgb, wide), denoised_rgb=np.pad(each.denoised_rgb, wide))
         for each in inner
     )
-    alone, floor = estimate_error(*inner, EVERYWHERE), estimate_error(framed, other, hits)
+    alone, floor = floor_of(*inner, EVERYWHERE), floor_of(framed, other, hits)
     assert floor.object_log_db == pytest.approx(alone.log_db, abs=1e-9)
     assert floor.log_db > alone.log_db + 3, "three quarters of the pixels are exact"
 
@@ -318,7 +326,7 @@ class RareLight:
         self.dim = np.repeat(np.linspace(0.1, 1, 32 // TILE_PX), TILE_PX)
 
     def pass_sum(self, camera: PixelCamera) -> HostSum:
-        return HostSum(self, camera)  # type: ignore[arg-type]
+        return HostSum(self, camera)
 
     def radiance(
         self, camera: PixelCamera, *, seed: int, spp: int, chosen: Chosen = None
@@ -336,14 +344,15 @@ def _adapted(
 ) -> DualBuffer:
     samples = DualBuffer([tracer], CAMERA, seed, first_spp=32, max_spp=4096)  # type: ignore[list-item]
     samples.count_over(counted)
-    tiles, changes = TileChoice(counted), LogChanges()
+    tiles, before = TileChoice(counted), np.zeros((2, 1, 1, 1))
     for spp in measured_at:
         more = tiles.passes(samples, spp) if samples.spp else None
         for _ in samples.passes_to(spp) if more is None else samples.passes_over(more):
             pass
-        raws = [raw[0] for raw in HostMeans(samples).half_means()]
-        halves = [Half(raw_rgb=raw, denoised_rgb=raw) for raw in raws]
-        tiles.learn(changes.since(halves), samples, "off")
+        logs = log10_radiance(np.array(half_means_of(samples), np.float64))
+        changes = [tile_means(each.mean(axis=-1)) for each in np.square(logs - before)]
+        tiles.learn(changes, samples, "off")
+        before = logs
     return samples
 
 
@@ -357,7 +366,7 @@ def test_the_mean_stays_unbiased_where_tiles_are_chosen_by_rare_light() -> None:
     means, spread = [], []
     for seed in range(1000):
         samples = _adapted(RareLight(), seed, [32, 128, 512])
-        means.append(HostMeans(samples).mean().mean())
+        means.append(mean_of(samples).mean())
         spread.append(samples.spp_of(0).max() > samples.spp_of(0).min())
     assert np.mean(spread) > 0.9, "the samples are spread unevenly"
     error = np.std(means, ddof=1) / np.sqrt(len(means))
