@@ -71,6 +71,18 @@ class Selection:
         """Return the parsed `where`, or None; raises TrilightError if it is malformed."""
         return None if self.where is None else condition(self.where)
 
+    @property
+    def words(self) -> list[str]:
+        """Options of `trilight shards select` that state the conditions."""
+        options = {
+            "--split": self.split,
+            "--template": self.template,
+            "--min-noise-floor": self.min_noise_floor_db,
+            "--where": self.where,
+        }
+        stated = [(name, str(value)) for name, value in options.items() if value is not None]
+        return [word for pair in stated for word in pair]
+
     def takes(self, facts: SceneFacts) -> bool:
         return (
             self.split in (None, facts.shard.split)
@@ -238,7 +250,7 @@ def list_scenes(
     selection: Selection,
     *,
     progress: Callable[[int, int], None] = lambda done, total: None,
-) -> list[dict[str, object]]:
+) -> list[dict[str, Any]]:
     """Return a row for each scene that a selection takes, in the order of the shards.
 
     Args:
@@ -256,11 +268,12 @@ def list_scenes(
         value_names=(*_TEXTS, *_COLUMNS),
         shard_done=lambda: progress(next(done), total),
     )
-    return [{"key": entry.key, **_row(entry.facts.values)} for entry in selected]
+    return [{"key": entry.key, **columns_of(entry.facts.values)} for entry in selected]
 
 
-def _row(values: Mapping[str, Any]) -> dict[str, object]:
-    row: dict[str, object] = {name: values[name] for name in _TEXTS}
+def columns_of(values: Mapping[str, Any]) -> dict[str, Any]:
+    """Return the columns of a listed scene from its values by name."""
+    row: dict[str, Any] = {name: values[name] for name in _TEXTS}
     for name, (column, of_several) in _COLUMNS.items():
         number = round(float(of_several(values[name])), QUANTITIES[name].digits)
         row[column] = number if QUANTITIES[name].digits else int(number)
