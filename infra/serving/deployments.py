@@ -101,13 +101,14 @@ def limits(environment: Mapping[str, str]) -> dict[str, int]:
 
 def _cards(environment: Mapping[str, str]) -> int:
     """Return the number of GPUs, at least 1, because a limit of 0 would block every flow."""
-    text = environment.get("TRILIGHT_CARDS")
-    if text is None:
-        return len(visible_gpus()) or 1
-    if not (text.isascii() and text.isdecimal()) or not 1 <= int(text) <= _MOST_CARDS:
-        raise TrilightError(
-            f"TRILIGHT_CARDS is {text!r}; expected a whole number from 1 to {_MOST_CARDS}."
-        )
+    return whole_number(environment, "TRILIGHT_CARDS", len(visible_gpus()) or 1, _MOST_CARDS)
+
+
+def whole_number(environment: Mapping[str, str], name: str, default: int, most: int) -> int:
+    """Return the number of an environment variable; raises TrilightError for other text."""
+    text = environment.get(name, str(default))
+    if not (text.isascii() and text.isdecimal()) or not 1 <= int(text) <= most:
+        raise TrilightError(f"{name} is {text!r}; expected a whole number from 1 to {most}.")
     return int(text)
 
 

@@ -39,6 +39,7 @@ import uuid
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 
+from infra.serving.deployments import whole_number
 from pipeline.flows.guarded_server import NAMES
 from pipeline.flows.prefect_server import (
     CLIENT_PASSWORD,
@@ -124,8 +125,6 @@ _FLOWS = {
 _MARK = "TRILIGHT_SERVED"
 _END_S = 20.0
 _RELEASE_S = 5.0
-_DEFAULT_PORT = 4200
-_MOST = {"TRILIGHT_PORT": 65535, "TRILIGHT_WORKERS": 1024}
 
 
 def start(*, host: str, port: int, workers: int) -> str:
@@ -313,16 +312,6 @@ def _say(text: str) -> None:
     print(text, flush=True)  # noqa: T201
 
 
-def _number(variable: str, default: int) -> int:
-    text = os.environ.get(variable, str(default))
-    most = _MOST[variable]
-    if not (text.isascii() and text.isdecimal()) or not 1 <= int(text) <= most:
-        raise TrilightError(
-            f"make serve: {variable} is {text!r}; expected a whole number from 1 to {most}."
-        )
-    return int(text)
-
-
 def main(arguments: list[str]) -> None:
     """Start the server, or with `stop` end it; reads TRILIGHT_HOST, _PORT and _WORKERS."""
     try:
@@ -330,8 +319,8 @@ def main(arguments: list[str]) -> None:
             _say(f"ended: {stop()} processes")
             return
         host = os.environ.get("TRILIGHT_HOST", "127.0.0.1")
-        port = _number("TRILIGHT_PORT", _DEFAULT_PORT)
-        workers = _number("TRILIGHT_WORKERS", 1)
+        port = whole_number(os.environ, "TRILIGHT_PORT", 4200, 65535)
+        workers = whole_number(os.environ, "TRILIGHT_WORKERS", 1, 1024)
         url = start(host=host, port=port, workers=workers)
         _say(f"Prefect: {url.removesuffix('/api')}; logs: {state_folder()}")
         # not the password itself, because output gets into recordings and logs

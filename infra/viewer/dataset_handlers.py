@@ -63,7 +63,7 @@ class SceneRow(NamedTuple):
 
 
 class DatasetIndex:
-    """Growing index of a dataset's scenes."""
+    """Growing index of a dataset's scenes, which a thread reads."""
 
     def __init__(self, dataset: Dataset) -> None:
         self._dataset = dataset
@@ -74,9 +74,6 @@ class DatasetIndex:
         self.problems: list[str] = []
         """Messages on shards that could not be read."""
         self._thread = threading.Thread(target=self._read_all, daemon=True)
-
-    def begin(self) -> None:
-        """Start the reading thread."""
         self._thread.start()
 
     def wait(self) -> None:
@@ -221,7 +218,6 @@ class DatasetHandlers(SceneListHandlers):
         self._source = source
         self._png = functools.lru_cache(MOST_THUMBNAILS)(self._small_png)
         self.index = DatasetIndex(dataset)
-        self.index.begin()
 
     def routes(self) -> Routes:
         """Return the routes of the page's requests."""

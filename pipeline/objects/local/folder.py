@@ -125,7 +125,7 @@ def jsonl_rows(path: Path) -> Iterator[tuple[int, dict[str, Any]]]:
     Raises:
         TrilightError: the file is not UTF-8 text, or a line is not a JSON object.
     """
-    for number, line in enumerate(_file_text(path).split("\n"), start=1):
+    for number, line in enumerate(file_text(path).split("\n"), start=1):
         if not line.strip():
             continue
         try:
@@ -178,7 +178,7 @@ def _header(cells: list[str], location: str) -> list[str]:
 
 def _csv_lines(path: Path) -> Iterator[tuple[int, list[str]]]:
     # newline="" leaves line breaks inside of quotes as they are
-    reader = csv.reader(io.StringIO(_file_text(path), newline=""), strict=True)
+    reader = csv.reader(io.StringIO(file_text(path), newline=""), strict=True)
     while True:
         start = reader.line_num + 1
         try:
@@ -194,14 +194,15 @@ def _csv_lines(path: Path) -> Iterator[tuple[int, list[str]]]:
             yield start, cells
 
 
-def _file_text(path: Path) -> str:
+def file_text(path: Path) -> str:
+    """Return the text of a file; raises TrilightError if it is not UTF-8 or cannot be read."""
     try:
         return read_plain(path).decode("utf-8-sig")
     except (OSError, UnicodeDecodeError) as error:
         reason = error.strerror if isinstance(error, OSError) else error
         raise TrilightError(
-            f"{path.name}: cannot be read ({reason}); expected a file of UTF-8 text. Fix or "
-            "remove it."
+            f"{printable(path.name)}: cannot be read ({reason}); expected a file of UTF-8 text. "
+            "Fix or remove it."
         ) from error
 
 

@@ -17,16 +17,14 @@ from scipy.spatial.distance import pdist
 
 from pipeline.presets.registry import preset_settings
 from pipeline.presets.settings import differences
-from pipeline.scenes.compose import MeshShape
 from pipeline.scenes.pieces import object_piece, shell_piece
 from pipeline.scenes.triangle_budget import PooledAsset
 from scene_templates.layout import ShellPart, SurfaceLook
 from scene_templates.out_of_range import median_settings
 from scene_templates.rooms import PATCH_FACES, SIDES, patch
-from scene_templates.sample_layout import sample_layout, scene_plan
+from scene_templates.sample_layout import scene_plan
 from storage.records.material import DIFFUSE, EMISSION, ROUGHNESS, SPECULAR
 from storage.records.scene import Scene, SceneObject
-from storage.seeds import rng_for
 from tests.pipeline.scenes.small_pool import (
     LOOK,
     first_scene,
@@ -77,31 +75,6 @@ def test_composed_scenes_are_as_planned(scenes: list[Scene], pool: list[PooledAs
     # A pool that is not drawn evenly is noticed: here the first object is never drawn.
     fewer = [scene for scene in published if "made/ball" not in {o.uid for o in scene.objects}]
     assert "objects" in implausible(_composed_table(fewer, pool, STAGE_1))
-
-
-def test_how_far_meshes_shift_sizes(pool: list[PooledAsset]) -> None:
-    """Sizes are drawn again where meshes meet; they claim far less than their spheres.
-
-    The greatest distance of the distribution functions stays below 0.12 for two and 0.17 for three
-    objects of a pool without walls of triangles (measured: 0.07 and 0.10), and a single object
-    that fits hardly deviates (0.08; measured 0.05). For solid balls see tests/scene_templates.
-    """
-    settings = preset_settings("pretrain-256").scenes
-    coarse = [MeshShape(entry.locked.uid, entry.asset.levels[-1], "box") for entry in pool]
-    sizes: dict[int, list[float]] = {1: [], 2: [], 3: []}
-    for index in range(200):
-        plan = scene_plan(settings, seed=0, scene_index=index)
-        rng = rng_for(0, "scene", index, 0)
-        shapes = [coarse[row] for row in rng.integers(len(coarse), size=plan.num_objects)]
-        layout = sample_layout(rng, settings, plan, shapes)
-        low, high = plan.family.object_scale
-        sizes[plan.num_objects] += [
-            (4 * placement.pose.radius - low) / (high - low) for placement in layout.objects
-        ]
-    # Samples of 70, 130 and 200 add up to 0.16, 0.12 and 0.10 of chance, with odds of 1 in 20.
-    for count, most in enumerate((0.24, 0.24, 0.27), start=1):
-        values = np.sort(sizes[count])
-        assert np.abs(values - np.arange(len(values)) / len(values)).max() < most
 
 
 def _surface(colours: Any) -> SurfaceLook:
