@@ -202,8 +202,7 @@ def _folder_with_sample(context: BenchContext) -> Path:
     """Return a folder with the files of one rendered scene, which the shards repeat."""
     root = context.folder()
     (root / "sample").mkdir()
-    _, members = context.rendered
-    for name, data in members[0].items():
+    for name, data in context.rendered[0].items():
         (root / "sample" / name).write_bytes(data)
     return root
 

@@ -48,8 +48,7 @@ def _points(scale: BenchScale, options: BenchOptions) -> list[Point]:
 
 
 def _unpack(layout: str, context: BenchContext, trial: str) -> Figures:
-    _, members = context.rendered
-    samples = [decode_sample(str(row), files) for row, files in enumerate(members)]
+    samples = [decode_sample(str(row), files) for row, files in enumerate(context.rendered)]
     return unpacking_figures(samples, layout, context.folder())
 
 

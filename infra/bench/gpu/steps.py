@@ -132,27 +132,6 @@ VGG16_WIDTHS = (64, 128, 256, 512, 512)
 REPEATS = 5
 
 
-def count_kernels(work: Callable[[], object], device: torch.device) -> int:
-    """Return the number of kernels of a call; on a processor, of its operators."""
-    from torch.profiler import ProfilerActivity, profile
-
-    on_gpu = device.type == "cuda"
-    activities = [ProfilerActivity.CPU, *([ProfilerActivity.CUDA] if on_gpu else [])]
-    with profile(activities=activities) as trace:
-        work()
-        if on_gpu:
-            torch.cuda.synchronize(device)
-    return sum(_is_kernel(event, on_gpu=on_gpu) for event in trace.events() or [])
-
-
-def _is_kernel(event: Any, *, on_gpu: bool) -> bool:
-    if getattr(event, "is_user_annotation", False):
-        return False
-    if on_gpu:
-        return str(event.device_type).endswith("CUDA")
-    return event.name.startswith("aten::") and event.self_cpu_time_total > 0
-
-
 def step_settings(run: str, device: torch.device) -> TrainSettings:
     """Return a preset with random initial weights; without a GPU a small one of its form."""
     settings = dataclasses.replace(training_preset(run), from_weights=False)
@@ -232,7 +211,7 @@ def _measure_steps(
     }
     if device.type == "cuda":
         figures["peak_gib"] = torch.cuda.max_memory_allocated(device) / 2**30
-    return {**figures, "kernels": float(count_kernels(step, device))}
+    return figures
 
 
 def workloads(settings: TrainSettings, scenes: int) -> list[Workload]:

@@ -11,7 +11,6 @@ from typing import TYPE_CHECKING, TypeVar
 import h5py
 import numpy as np
 
-from infra.bench.workloads.rendering_speed import Members
 from pipeline.exchange.renderformer_h5 import write_renderformer_h5
 from storage.dataset.layout import DatasetFolder
 from storage.dataset.manifest import Manifest, index_shard, write_manifest
@@ -23,6 +22,9 @@ from storage.records.scene import ARRAY_FIELDS
 
 if TYPE_CHECKING:
     from train.settings import TrainSettings
+
+Members = Mapping[str, bytes]
+"""Files of a sample by name."""
 
 _DECODED_AHEAD = 16
 """Number of samples that are read before any is timed: what is decoded ahead would count twice."""
@@ -56,8 +58,7 @@ def time_reading(
     settings: "TrainSettings",
     threads: int,
     *,
-    least_count: int = 1,
-    least_s: float = 0.0,
+    least_count: int,
 ) -> tuple[float, float]:
     """Return wall-clock and CPU seconds of reading a sample as training does, without a network.
 
@@ -82,7 +83,7 @@ def time_reading(
         began = time.perf_counter()
         core_began = time.process_time()
         count = 0
-        while count < least_count or time.perf_counter() - began < least_s:
+        while count < least_count:
             next(batches)
             count += settings.scenes_per_step
         seconds = time.perf_counter() - began

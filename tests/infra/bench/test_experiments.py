@@ -148,7 +148,7 @@ def test_steps_are_timed() -> None:
     for run in ("smoke", "finetune", "hits"):
         with case(run):
             figures = step_figures(run, 1, CPU)
-            assert figures["ms"] > 0 and figures["kernels"] > 100
+            assert figures["ms"] > 0 and figures["views_per_s"] > 0
 
 
 def test_sizes_grow_fourfold_up_to_the_most() -> None:
