@@ -89,6 +89,5 @@ EXPERIMENT = Experiment(
     "those of our exporter, read without any check.",
     points=_points,
     trials=rounds,
-    warm_up=True,
     needs=("torch",),
 )
