@@ -259,18 +259,6 @@ def _launch(
         )
 
 
-def _refusal(host: str, port: int) -> str | None:
-    """Return why the address cannot be bound, or None if it can."""
-    try:
-        with socket.socket() as probe:
-            # as servers do, so that the connections of a server stopped just now do not matter
-            probe.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
-            probe.bind((host, port))
-    except OSError as error:
-        return error.strerror or str(error)
-    return None
-
-
 def _require_free(host: str, port: int) -> None:
     """Refuse an address of another machine, or one at which a server listens already."""
     if ":" in host:
@@ -280,14 +268,21 @@ def _require_free(host: str, port: int) -> None:
         )
     # a process that ends loses its environment, by which it is known, before its sockets
     deadline = time.monotonic() + _RELEASE_S
-    while (refused := _refusal(host, port)) and time.monotonic() < deadline:
+    while True:
+        try:
+            with socket.socket() as probe:
+                # as servers do, so that the connections of a server stopped just now do not matter
+                probe.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
+                probe.bind((host, port))
+            return
+        except OSError as error:
+            if time.monotonic() >= deadline:
+                raise TrilightError(
+                    f"make serve: {host}:{port} cannot be opened ({error.strerror or error}); "
+                    "expected an address of this machine and a free port. Set TRILIGHT_PORT to "
+                    "another port, or fix TRILIGHT_HOST."
+                ) from error
         time.sleep(0.1)
-    if refused:
-        raise TrilightError(
-            f"make serve: {host}:{port} cannot be opened ({refused}); expected an address "
-            "of this machine and a free port. Set TRILIGHT_PORT to another port, "
-            "or fix TRILIGHT_HOST."
-        )
 
 
 def _worker_environment(number: int, workers: int) -> dict[str, str]:

@@ -118,7 +118,6 @@ THIN = (4, 8, 16, 16, 16)
 """Channels of LPIPS for shrunk presets."""
 
 _WARM_STEPS = 3
-_LIGHTS = 4
 UNSTATED_TRIANGLES = 1024
 """Triangles of the longest scene if a preset sets no limit."""
 
@@ -229,7 +228,7 @@ def workloads(settings: TrainSettings, scenes: int) -> list[Workload]:
 
 def scene_of(workload: Workload) -> SceneTensors:
     """Return two objects in a room with an exact number of triangles, and cameras around them."""
-    scene = cost_scene(math.ceil(1.3 * workload.triangles) + 32, _LIGHTS)
+    scene = cost_scene(math.ceil(1.3 * workload.triangles) + 32, LIGHTS)
     poses = [
         look_at_c2w(
             eye=(1.4 + math.cos(6 * angle), math.sin(6 * angle) - 2.2, 1.3),

@@ -150,14 +150,29 @@ def csv_rows(path: Path) -> Iterator[tuple[int, dict[str, Any]]]:
         TrilightError: the file is not UTF-8 text or breaks the rules of CSV, the first row lacks
             `uid` or `path` or has a name twice, or a row has another number of cells.
     """
+    # newline="" leaves line breaks inside of quotes as they are
+    reader = csv.reader(io.StringIO(file_text(path), newline=""), strict=True)
     names: list[str] = []
-    for number, cells in _csv_lines(path):
+    while True:
+        number = reader.line_num + 1
+        location = f"{path.name}:{number}"
+        try:
+            cells = next(reader, None)
+        except csv.Error as error:
+            raise TrilightError(
+                f"{location}: not CSV ({error}); expected cells with commas between "
+                "them, and double quotes around text that holds commas, quotes or line breaks."
+            ) from error
+        if cells is None:
+            return
+        if not any(cell.strip() for cell in cells):
+            continue
         if not names:
-            names = _header(cells, f"{path.name}:{number}")
+            names = _header(cells, location)
             continue
         if len(cells) != len(names):
             raise TrilightError(
-                f"{path.name}:{number}: has {len(cells)} cells; expected {len(names)}, as in the "
+                f"{location}: has {len(cells)} cells; expected {len(names)}, as in the "
                 "first row. Put text with commas or line breaks in quotes."
             )
         yield number, {name: cell for name, cell in zip(names, cells, strict=True) if cell.strip()}
@@ -174,24 +189,6 @@ def _header(cells: list[str], location: str) -> list[str]:
     if len(set(names)) < len(names):
         raise TrilightError(f"{location}: the columns are {columns!r}; expected each name once.")
     return names
-
-
-def _csv_lines(path: Path) -> Iterator[tuple[int, list[str]]]:
-    # newline="" leaves line breaks inside of quotes as they are
-    reader = csv.reader(io.StringIO(file_text(path), newline=""), strict=True)
-    while True:
-        start = reader.line_num + 1
-        try:
-            cells = next(reader)
-        except StopIteration:
-            return
-        except csv.Error as error:
-            raise TrilightError(
-                f"{path.name}:{start}: not CSV ({error}); expected cells with commas between "
-                "them, and double quotes around text that holds commas, quotes or line breaks."
-            ) from error
-        if any(cell.strip() for cell in cells):
-            yield start, cells
 
 
 def file_text(path: Path) -> str:
