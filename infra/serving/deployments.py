@@ -87,7 +87,7 @@ def _deploy_flow(row: dict[str, Any]) -> None:
 
 
 def limits(environment: Mapping[str, str]) -> dict[str, int]:
-    """Return the number of slots by limit.
+    """Return the number of slots by limit, at least 1: a limit of 0 would block every flow.
 
     Args:
         environment: TRILIGHT_CARDS is the number of GPUs of all workers, if these have others than
@@ -96,12 +96,8 @@ def limits(environment: Mapping[str, str]) -> dict[str, int]:
     Raises:
         TrilightError: TRILIGHT_CARDS is no number of GPUs.
     """
-    return {DISK_LIMIT: _DISK_SLOTS, GPU_LIMIT: _cards(environment)}
-
-
-def _cards(environment: Mapping[str, str]) -> int:
-    """Return the number of GPUs, at least 1, because a limit of 0 would block every flow."""
-    return whole_number(environment, "TRILIGHT_CARDS", len(visible_gpus()) or 1, _MOST_CARDS)
+    cards = whole_number(environment, "TRILIGHT_CARDS", len(visible_gpus()) or 1, _MOST_CARDS)
+    return {DISK_LIMIT: _DISK_SLOTS, GPU_LIMIT: cards}
 
 
 def whole_number(environment: Mapping[str, str], name: str, default: int, most: int) -> int:
