@@ -6,7 +6,6 @@ The builder collects the content of a RenderFormer scene file, and the reader of
 
 import dataclasses
 import os
-from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated, Self
 
@@ -53,20 +52,6 @@ class Material:
     def __post_init__(self) -> None:
         for name in ("diffuse", "specular", "emission"):
             vector(f"material: {name}", getattr(self, name))
-
-
-def described_material(material: Material) -> DescribedMaterial:
-    """Return a material in the form of a scene file."""
-    return DescribedMaterial(
-        diffuse=vector("diffuse", material.diffuse),
-        specular=vector("specular", material.specular),
-        roughness=material.roughness,
-        emissive=vector("emission", material.emission),
-        smooth_shading=material.smooth,
-        random_diffuse_max=1.0,
-        random_diffuse_type="per-triangle",
-        rand_tri_diffuse_seed=None,
-    )
 
 
 def vector(name: str, values: ArrayLike) -> Vector:
@@ -127,12 +112,8 @@ _STAYS = DescribedTransform(
 )
 
 
-@dataclass(frozen=True, kw_only=True)
-class _MeshFile:
-    """A mesh file that `SceneBuilder.scene` reads."""
-
-    path: Path
-    licence: str
+_Mesh = LoadedMesh | tuple[Path, str]
+"""A mesh, or the file and the licence of a mesh that `SceneBuilder.scene` reads."""
 
 
 class SceneBuilder:
@@ -142,7 +123,7 @@ class SceneBuilder:
         """Begin an empty scene; messages and its provenance hold `name`."""
         self._name = name
         self._objects: list[DescribedObject] = []
-        self._meshes: list[LoadedMesh | _MeshFile] = []
+        self._meshes: list[_Mesh] = []
         self._cameras: list[DescribedCamera] = []
 
     def add_mesh(
@@ -174,12 +155,13 @@ class SceneBuilder:
         """
         if isinstance(mesh, tuple):
             name = name or f"object{len(self._objects)}"
-            loaded: LoadedMesh | _MeshFile = mesh_of_arrays(*mesh, uid=name, licence=licence)
+            loaded: _Mesh = mesh_of_arrays(*mesh, uid=name, licence=licence)
         else:
-            loaded = _MeshFile(path=Path(mesh), licence=licence)
-            if not loaded.path.is_file():
-                raise TrilightError(f"{loaded.path}: no such file; expected a mesh.")
-            name = name or self._unique_name(loaded.path.stem)
+            path = Path(mesh)
+            if not path.is_file():
+                raise TrilightError(f"{path}: no such file; expected a mesh.")
+            name = name or self._unique_name(path.stem)
+            loaded = (path, licence)
         if size is not None and not 0 < size < np.inf:
             raise TrilightError(f"{name}: size is {size}; expected meters above 0.")
         if size is not None and isinstance(loaded, LoadedMesh) and loaded.reach == 0:
@@ -338,22 +320,30 @@ class SceneBuilder:
     def _read(self) -> list[LoadedMesh]:
         with SceneReader() as reader:  # starts a child process only for mesh files
             return [
-                reader.mesh(mesh.path, mesh.licence) if isinstance(mesh, _MeshFile) else mesh
-                for mesh in self._meshes
+                reader.mesh(*mesh) if isinstance(mesh, tuple) else mesh for mesh in self._meshes
             ]
 
     def _add(
         self,
         name: str,
-        mesh: LoadedMesh | _MeshFile,
+        mesh: _Mesh,
         transform: DescribedTransform,
         material: Material,
     ) -> Self:
         described = DescribedObject(
             name=name,
-            mesh_path=str(mesh.path) if isinstance(mesh, _MeshFile) else mesh.uid,
+            mesh_path=str(mesh[0]) if isinstance(mesh, tuple) else mesh.uid,
             transform=transform,
-            material=described_material(material),
+            material=DescribedMaterial(
+                diffuse=vector("diffuse", material.diffuse),
+                specular=vector("specular", material.specular),
+                roughness=material.roughness,
+                emissive=vector("emission", material.emission),
+                smooth_shading=material.smooth,
+                random_diffuse_max=1.0,
+                random_diffuse_type="per-triangle",
+                rand_tri_diffuse_seed=None,
+            ),
             remesh=False,
             remesh_target_face_num=0,
         )

@@ -12,19 +12,26 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any, TypeVar
 
-from infra.bench.experiment import BenchScale, Figures
+from infra.bench.experiment import BenchScale
 from infra.bench.workloads.named_scenes import given_scenes, preset_scene, read_given
-from infra.bench.workloads.reading import write_copies
-from infra.bench.workloads.rendering_speed import Members, render_scenes
+from infra.bench.workloads.reading import Members, write_copies
 from infra.bench_options import BenchOptions
+from infra.planning import measure_scenes
 from infra.render.held_out_scenes import composing_child
 from infra.render.path_tracer import RenderChild
+from pipeline.generation.generate_options import GenerateOptions
 from pipeline.generation.prepare_isolated import preload_mesh_libraries
 from pipeline.isolation import ChildLimits, IsolatedChild
 from pipeline.presets.settings import DatasetSettings
 from pipeline.presets.training import smoke
+from storage.dataset.layout import DatasetFolder
+from storage.dataset.splits import shard_name
+from storage.dataset.staging import read_staged_scene
 from storage.dataset.training_data import TrainingData, open_training_data
 from storage.records.scene import Scene
+
+_RENDERED = 3
+"""Number of rendered scenes, fewer than a shard of the preset."""
 
 Result = TypeVar("Result")
 Closable = TypeVar("Closable", IsolatedChild, RenderChild)
@@ -98,9 +105,16 @@ class BenchContext:
         return self.get_or_make(("scene", trial), make)
 
     @functools.cached_property
-    def rendered(self) -> tuple[Figures, list[Members]]:
-        """Costs and files of some scenes of the preset `smoke`, at the scale's width."""
-        return render_scenes(self.scale.picture_px, self.folder())
+    def rendered(self) -> list[Members]:
+        """Files of some scenes of the preset `smoke`, at the scale's width."""
+        folder = DatasetFolder(self.folder())
+        splits = smoke().splits
+        options = GenerateOptions(
+            build="smoke", resolution=self.scale.picture_px, scenes=splits.scenes_per_shard
+        )
+        measure_scenes(options, _RENDERED, folder.root, lambda: None)
+        staged = folder.staged_shard(shard_name(0, splits))
+        return [read_staged_scene(staged, row).members for row in range(_RENDERED)]
 
     @functools.cached_property
     def data(self) -> TrainingData:
@@ -108,5 +122,5 @@ class BenchContext:
         if self.options.data:
             return open_training_data([self.options.data])
         root = self.folder()
-        write_copies(root, self.rendered[1])
+        write_copies(root, self.rendered)
         return open_training_data([str(root)])

@@ -29,7 +29,7 @@ if TYPE_CHECKING:
 Figures = Mapping[str, float]
 """Measured numbers of one point in one trial, by name."""
 
-Over = Literal["median", "mean", "least", "most", "p5", "p95", "low", "high", "pair"]
+Over = Literal["median", "mean", "least", "most", "p5", "low", "high", "pair"]
 """Reduction of the figures of all trials to one number. `low` and `high` are the ends of the mean's
 95 % interval, bootstrapped over clusters of trials. `pair` is the mean of the differences to the
 point's rival, trial by trial, with its interval."""
@@ -154,8 +154,6 @@ class Experiment:
     """Meaning of the figures, for the reader of the table."""
     cluster: Callable[[str], str] = str
     """Name of a trial's cluster: trials of one cluster are alike; by default none is."""
-    warm_up: bool = False
-    """True for an additional first trial that is not counted, if all trials are repeats."""
     figures: tuple[str, ...] = ()
     """Names of the figures, where rows hold their values alone; a trial may lack all of them."""
     versions: Callable[[BenchOptions], Mapping[str, str]] | None = None

@@ -22,7 +22,6 @@ _OVER: Mapping[str, Callable[[Sequence[float]], Any]] = {
     "least": np.min,
     "most": np.max,
     "p5": lambda values: np.percentile(values, 5),
-    "p95": lambda values: np.percentile(values, 95),
 }
 _WIDE = 7.0
 _HIGH = 5.2

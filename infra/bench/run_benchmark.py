@@ -82,7 +82,7 @@ def run(
     current = store.begin(plan)
     began = time.perf_counter()
     with contextlib.closing(BenchContext(scale, options)) as context:
-        _measure_missing(experiment, points, current, store, context, trial_done)
+        _measure_missing(points, current, store, context, trial_done)
         notes = list(context.notes)
     if not current.whole_trials():
         reasons = "; ".join(sorted(set(current.left_out.values())))
@@ -117,7 +117,6 @@ def _points_of(experiment: Experiment, scale: BenchScale, options: BenchOptions)
 
 
 def _measure_missing(
-    experiment: Experiment,
     points: Sequence[Point],
     current: Run,
     store: Store,
@@ -128,9 +127,6 @@ def _measure_missing(
     missing = current.missing_trials()
     measures = [(point.name, point.measure) for point in points if point.measure]
     total = len(current.plan["trials"])
-    if experiment.warm_up and missing:
-        for _, measure in measures:
-            measure(context, missing[0])
     for number, trial in enumerate(missing, total - len(missing) + 1):
         try:
             for name, measure in measures:

@@ -123,14 +123,7 @@ def list_scenes(chosen: SelectOptions) -> None:
         note(f"the first {_MOST_LISTED} are shown; --json lists all")
     if rows:
         words = ["shards", "select", str(chosen.dataset), "--out", f"{chosen.dataset}-selected"]
-        options = {
-            "--split": chosen.split,
-            "--template": chosen.template,
-            "--min-noise-floor": chosen.min_noise_floor_db,
-            "--where": chosen.where,
-        }
-        stated = [(name, str(value)) for name, value in options.items() if value is not None]
-        next_step([*words, *(word for pair in stated for word in pair)])
+        next_step([*words, *chosen.selection.words])
 
 
 @app.command(help="Repack the scenes of every split into shards of another size.")

@@ -109,9 +109,11 @@ def true_error_db(
     picture_rgb: NDArray[np.float32],
     reference: RawReference,
     curve: Curve,
-    pixels: NDArray[np.bool_],
+    pixels: NDArray[np.bool_] | None = None,
 ) -> tuple[float, float]:
-    """Return `true_error` and its standard deviation in dB; the same arguments."""
+    """Return `true_error` and its standard deviation in dB; by default all pixels count."""
+    if pixels is None:
+        pixels = np.ones(picture_rgb.shape[:2], np.bool_)
     error, spread = true_error(picture_rgb, reference, curve, pixels)
     error = max(error, LEAST_ERROR)
     return -10 * np.log10(error), 10 * np.log10(1 + spread / error)

@@ -87,7 +87,7 @@ def _deploy_flow(row: dict[str, Any]) -> None:
 
 
 def limits(environment: Mapping[str, str]) -> dict[str, int]:
-    """Return the number of slots by limit.
+    """Return the number of slots by limit, at least 1: a limit of 0 would block every flow.
 
     Args:
         environment: TRILIGHT_CARDS is the number of GPUs of all workers, if these have others than
@@ -96,18 +96,15 @@ def limits(environment: Mapping[str, str]) -> dict[str, int]:
     Raises:
         TrilightError: TRILIGHT_CARDS is no number of GPUs.
     """
-    return {DISK_LIMIT: _DISK_SLOTS, GPU_LIMIT: _cards(environment)}
+    cards = whole_number(environment, "TRILIGHT_CARDS", len(visible_gpus()) or 1, _MOST_CARDS)
+    return {DISK_LIMIT: _DISK_SLOTS, GPU_LIMIT: cards}
 
 
-def _cards(environment: Mapping[str, str]) -> int:
-    """Return the number of GPUs, at least 1, because a limit of 0 would block every flow."""
-    text = environment.get("TRILIGHT_CARDS")
-    if text is None:
-        return len(visible_gpus()) or 1
-    if not (text.isascii() and text.isdecimal()) or not 1 <= int(text) <= _MOST_CARDS:
-        raise TrilightError(
-            f"TRILIGHT_CARDS is {text!r}; expected a whole number from 1 to {_MOST_CARDS}."
-        )
+def whole_number(environment: Mapping[str, str], name: str, default: int, most: int) -> int:
+    """Return the number of an environment variable; raises TrilightError for other text."""
+    text = environment.get(name, str(default))
+    if not (text.isascii() and text.isdecimal()) or not 1 <= int(text) <= most:
+        raise TrilightError(f"{name} is {text!r}; expected a whole number from 1 to {most}.")
     return int(text)
 
 

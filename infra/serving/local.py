@@ -39,6 +39,7 @@ import uuid
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 
+from infra.serving.deployments import whole_number
 from pipeline.flows.guarded_server import NAMES
 from pipeline.flows.prefect_server import (
     CLIENT_PASSWORD,
@@ -124,8 +125,6 @@ _FLOWS = {
 _MARK = "TRILIGHT_SERVED"
 _END_S = 20.0
 _RELEASE_S = 5.0
-_DEFAULT_PORT = 4200
-_MOST = {"TRILIGHT_PORT": 65535, "TRILIGHT_WORKERS": 1024}
 
 
 def start(*, host: str, port: int, workers: int) -> str:
@@ -260,18 +259,6 @@ def _launch(
         )
 
 
-def _refusal(host: str, port: int) -> str | None:
-    """Return why the address cannot be bound, or None if it can."""
-    try:
-        with socket.socket() as probe:
-            # as servers do, so that the connections of a server stopped just now do not matter
-            probe.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
-            probe.bind((host, port))
-    except OSError as error:
-        return error.strerror or str(error)
-    return None
-
-
 def _require_free(host: str, port: int) -> None:
     """Refuse an address of another machine, or one at which a server listens already."""
     if ":" in host:
@@ -281,14 +268,21 @@ def _require_free(host: str, port: int) -> None:
         )
     # a process that ends loses its environment, by which it is known, before its sockets
     deadline = time.monotonic() + _RELEASE_S
-    while (refused := _refusal(host, port)) and time.monotonic() < deadline:
+    while True:
+        try:
+            with socket.socket() as probe:
+                # as servers do, so that the connections of a server stopped just now do not matter
+                probe.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
+                probe.bind((host, port))
+            return
+        except OSError as error:
+            if time.monotonic() >= deadline:
+                raise TrilightError(
+                    f"make serve: {host}:{port} cannot be opened ({error.strerror or error}); "
+                    "expected an address of this machine and a free port. Set TRILIGHT_PORT to "
+                    "another port, or fix TRILIGHT_HOST."
+                ) from error
         time.sleep(0.1)
-    if refused:
-        raise TrilightError(
-            f"make serve: {host}:{port} cannot be opened ({refused}); expected an address "
-            "of this machine and a free port. Set TRILIGHT_PORT to another port, "
-            "or fix TRILIGHT_HOST."
-        )
 
 
 def _worker_environment(number: int, workers: int) -> dict[str, str]:
@@ -313,16 +307,6 @@ def _say(text: str) -> None:
     print(text, flush=True)  # noqa: T201
 
 
-def _number(variable: str, default: int) -> int:
-    text = os.environ.get(variable, str(default))
-    most = _MOST[variable]
-    if not (text.isascii() and text.isdecimal()) or not 1 <= int(text) <= most:
-        raise TrilightError(
-            f"make serve: {variable} is {text!r}; expected a whole number from 1 to {most}."
-        )
-    return int(text)
-
-
 def main(arguments: list[str]) -> None:
     """Start the server, or with `stop` end it; reads TRILIGHT_HOST, _PORT and _WORKERS."""
     try:
@@ -330,8 +314,8 @@ def main(arguments: list[str]) -> None:
             _say(f"ended: {stop()} processes")
             return
         host = os.environ.get("TRILIGHT_HOST", "127.0.0.1")
-        port = _number("TRILIGHT_PORT", _DEFAULT_PORT)
-        workers = _number("TRILIGHT_WORKERS", 1)
+        port = whole_number(os.environ, "TRILIGHT_PORT", 4200, 65535)
+        workers = whole_number(os.environ, "TRILIGHT_WORKERS", 1, 1024)
         url = start(host=host, port=port, workers=workers)
         _say(f"Prefect: {url.removesuffix('/api')}; logs: {state_folder()}")
         # not the password itself, because output gets into recordings and logs

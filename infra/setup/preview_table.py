@@ -145,11 +145,10 @@ def _errors_of(
     renderers: Mapping[Method, Renderer], child: IsolatedChild, scene: Scene, px: int
 ) -> dict[Method, float]:
     reference = child.call(raw_reference, scene, first_camera(scene, px), WIDTHS[px][1])
-    everywhere = np.ones((px, px), np.bool_)
     errors = {}
     for method, renderer in renderers.items():
         image = renderer.load(scene, "scene").render(Camera.of_scene(scene, 0))
-        error_db, _ = true_error_db(image.radiance_rgb, reference, log10_radiance, everywhere)
+        error_db, _ = true_error_db(image.radiance_rgb, reference, log10_radiance)
         errors[method] = error_db
     return errors
 

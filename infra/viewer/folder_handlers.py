@@ -13,8 +13,8 @@ from infra.render.quality import FixedSamples
 from infra.viewer.open_source import scene_list
 from infra.viewer.scene_handlers import (
     MOST_THUMBNAILS,
-    OpenScenes,
     SceneHandlers,
+    SceneListHandlers,
     handlers_of_scene,
     thumbnail_png,
 )
@@ -30,38 +30,33 @@ THUMBNAIL_PX = 128
 
 _THUMBNAIL = FixedSamples(spp=4, denoiser="fast")
 
-_NUMBER = re.compile(r"\d{1,5}", re.ASCII)
 
-
-class FolderHandlers:
+class FolderHandlers(SceneListHandlers):
     """Handlers of a folder, and of its scenes that are open."""
+
+    key = re.compile(r"\d{1,5}", re.ASCII)
 
     def __init__(self, root: Path, child: RenderChild, checkpoint: str | None) -> None:
         """List the files; render child and checkpoint are for the pages of the scenes."""
+        super().__init__(child, checkpoint)
         self._root = root
         self._names, self._is_cut = scene_list(root)
-        self._child = child
-        self._checkpoint = checkpoint
         self._reader = SceneReader()
         self._reading = threading.Lock()
         self._last: tuple[int, LoadedScene] | None = None
         self._png = functools.lru_cache(MOST_THUMBNAILS)(self._small_png)
-        self._scenes = OpenScenes(_NUMBER, self._open_scene)
 
     def routes(self) -> Routes:
         """Return the routes of the page's requests."""
         return {
+            **super().routes(),
             "GET api/folder": self._facts,
             "GET api/about/": self._about,
-            "GET api/thumbnail/": self._thumbnail,
-            "GET scene/": self._scenes.respond,
-            "POST scene/": self._scenes.respond,
         }
 
     def close(self) -> None:
         """Stop reading and rendering."""
-        self._scenes.close()
-        self._child.close()
+        super().close()
         self._reader.close()
 
     def _facts(self, _: Request) -> Response:
@@ -76,7 +71,7 @@ class FolderHandlers:
         )
 
     def _about(self, request: Request) -> Response:
-        loaded = self._load(self._number(request, "api/about/"))
+        loaded = self._load(self._row(request.path.removeprefix("api/about/")))
         scene = loaded.scene
         return json_response(
             {
@@ -89,8 +84,8 @@ class FolderHandlers:
         )
 
     def _thumbnail(self, request: Request) -> Response:
-        png = self._png(self._number(request, "api/thumbnail/"))
-        return Response(body=png, kind="image/png")
+        row = self._row(request.path.removeprefix("api/thumbnail/"))
+        return Response(body=self._png(row), kind="image/png")
 
     def _small_png(self, number: int) -> bytes:
         loaded = self._load(number)
@@ -101,11 +96,10 @@ class FolderHandlers:
         image = traced.render(Camera.of_scene(loaded.scene, 0))
         return thumbnail_png(image.radiance_rgb, THUMBNAIL_PX)
 
-    def _number(self, request: Request, prefix: str) -> int:
-        text = request.path.removeprefix(prefix)
-        if not _NUMBER.fullmatch(text) or int(text) >= len(self._names):
+    def _row(self, key: str) -> int:
+        if not self.key.fullmatch(key) or int(key) >= len(self._names):
             raise NotFound("the folder has no such file.")
-        return int(text)
+        return int(key)
 
     def _load(self, number: int) -> LoadedScene:
         """Return a scene; the last one is kept, since the page requests it several times."""
@@ -116,9 +110,7 @@ class FolderHandlers:
             return self._last[1]
 
     def _open_scene(self, key: str) -> SceneHandlers:
-        number = int(key)
-        if number >= len(self._names):
-            raise NotFound("the folder has no such file.")
+        number = self._row(key)
         name = self._names[number]
         loaded = self._load(number)
         place = str(self._root / name)

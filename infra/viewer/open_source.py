@@ -1,7 +1,6 @@
 """Opens the source of `trilight view`; its page is served before, and its requests wait."""
 
-import os
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from concurrent.futures import Future
 from pathlib import Path
 from typing import Protocol
@@ -75,26 +74,15 @@ def scene_list(root: Path) -> tuple[Sequence[str], bool]:
     from pipeline.exchange.formats import readable_suffixes  # slow
 
     suffixes = frozenset(readable_suffixes())
-    names = list[str]()
-    for name in _files(root):
-        if Path(name).suffix.lower() in suffixes:
-            names.append(name)
-        if len(names) > MOST_FILES:
-            break
+    below = (path.relative_to(root) for path in root.rglob("*") if path.suffix.lower() in suffixes)
+    visible = (path for path in below if not any(part.startswith(".") for part in path.parts))
+    names = sorted(path.as_posix() for path in visible if (root / path).is_file())
     if not names:
         raise TrilightError(
             f"{root}: no dataset, and holds no scene; expected a folder that `trilight generate` "
             f"wrote, or files {' '.join(readable_suffixes())} in it."
         )
     return names[:MOST_FILES], len(names) > MOST_FILES
-
-
-def _files(root: Path) -> Iterator[str]:
-    for folder, below, files in os.walk(root):
-        below[:] = sorted(name for name in below if not name.startswith("."))
-        for name in sorted(files):
-            if not name.startswith("."):
-                yield Path(folder, name).relative_to(root).as_posix()
 
 
 def open_handlers(source: str, *, checkpoint: str | None, threads: int | None) -> PageHandlers:

@@ -77,14 +77,12 @@ class PassRenderer(RendererHere):
             scene.with_cameras(camera.c2w[None], angle), [name], view=0, resolution=self.resolution
         )[name]
         core_s = time.process_time() - began_s
-        has_hits = (np.isfinite(values) if values.dtype.kind == "f" else values >= 0).any()
-        caption = self.pass_view.caption(values).partition(", in the")[0] if has_hits else ""
-        pixels = self.pass_view.pixels(values)
+        pixels, caption = self.pass_view.show(values)
         return PassImage(
             radiance_rgb=np.zeros((*pixels.shape[:2], 3), np.float32),
             pixels=pixels,
             cpu_seconds=core_s,
-            remark=caption or "nothing is met",
+            remark=caption.partition(", in the")[0],
         )
 
 

@@ -13,8 +13,9 @@ import re
 import shlex
 import tempfile
 import threading
+from abc import ABC, abstractmethod
 from collections import OrderedDict
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, Literal
@@ -69,7 +70,7 @@ State = Literal["waiting", "working", "done", "failed", "cancelled"]
 
 
 class _Superseded(Exception):
-    """Ends the current picture, which another request or `cancel_all` has replaced."""
+    """Ends the current picture, which is cancelled."""
 
 
 @dataclass(kw_only=True, eq=False)
@@ -93,26 +94,23 @@ class RenderJob:
 
 
 class RenderQueue:
-    """Render queue of one scene, with a thread of its own.
+    """Render queue of one scene: each picture has a thread, and one of them works at a time.
 
-    `_changed` guards all fields but `_edited`, which the rendering thread and exports use, and
-    `_loaded`, the last scene of each renderer, which the rendering thread alone uses: `_jobs`
-    (every kept job, oldest first), `_next` (the job that waits), and the state of each job. Its
-    waiters are the rendering thread, for `_next` and `_closed`, and `wait_for_update`, for a newer
-    version of a job.
+    `_changed` guards `_jobs` (every kept job, oldest first) and the state of each job.
+    `wait_for_update` waits for a newer version of a job. The working thread holds `_rendering`,
+    which guards `_loaded`, the last scene of each renderer. It and exports use `_edited`.
     """
 
     def __init__(self, scene: Scene, renderers: Mapping[str, PageRenderer]) -> None:
         self._scene = scene
         self._renderers = renderers
         self._changed = threading.Condition()
+        self._rendering = threading.Lock()
         self._jobs = OrderedDict[str, RenderJob]()
-        self._next: RenderJob | None = None
         self._thread: threading.Thread | None = None
         self._numbers = itertools.count(1)
         self._edited: tuple[str, Scene] | None = None
         self._loaded: dict[str, tuple[object, ReadyScene, Sequence[str]]] = {}
-        self._closed = False
 
     def submit(self, options: PictureOptions) -> RenderJob:
         """Queue a picture, or return an equal job; the current picture is cancelled."""
@@ -121,23 +119,20 @@ class RenderQueue:
             if same:
                 self._jobs.move_to_end(same[-1].id)
                 return same[-1]
+            self.cancel_all()
             job = RenderJob(id=str(next(self._numbers)), options=options)
             self._jobs[job.id] = job
-            self._cancel(self._next)
-            self._next = job
-            if self._thread is None:
-                self._thread = threading.Thread(target=self._work, daemon=True)
-                self._thread.start()
-            self._changed.notify_all()
+            while len(self._jobs) > MOST_KEPT:
+                self._jobs.popitem(last=False)
+            self._thread = threading.Thread(target=self._render, args=(job,), daemon=True)
+            self._thread.start()
             return job
 
     def cancel_all(self) -> None:
-        """Cancel the current and the waiting picture."""
+        """Cancel the current and the waiting picture; the current one ends at its next step."""
         with self._changed:
-            self._cancel(self._next)
-            self._next = None
             for job in self._jobs.values():
-                if job.state == "working":
+                if not _is_over(job):
                     self._update(job, state="cancelled")
 
     def job(self, number: str) -> RenderJob:
@@ -169,35 +164,18 @@ class RenderQueue:
             self._edited = (scene_key, apply_edits(self._scene, edits))
         return self._edited[1]
 
-    def close(self) -> None:
-        """Stop the thread at the next step of the current picture."""
-        with self._changed:
-            self._closed = True
-            self._changed.notify_all()
-
     def join(self) -> None:
-        """Wait for the current picture, which `close` ends at its next step.
+        """Wait for the current picture, which `cancel_all` ends at its next step.
 
         Libraries abort a process that ends while they work in one of its threads.
         """
         if self._thread is not None:
             self._thread.join(LAST_PICTURE_S)
 
-    def _work(self) -> None:
-        while True:
-            with self._changed:
-                self._changed.wait_for(lambda: self._next is not None or self._closed)
-                job = self._next
-                self._next = None
-                if job is None or self._closed:
-                    return
-                self._update(job, state="working")
-            self._render(job)
-
     def _render(self, job: RenderJob) -> None:
         def show(step: Image | Sampling) -> None:
             with self._changed:
-                if self._next is not None or self._closed or job.state != "working":
+                if job.state != "working":
                     raise _Superseded
                 if isinstance(step, Image):
                     job.image = step
@@ -213,25 +191,26 @@ class RenderQueue:
                     job.sampling = step
                 self._update(job)
 
-        state = "done"
-        error = ""
-        try:
-            loaded, job.notes = self._load(job.options)
-            job.scene_core_s = loaded.cpu_seconds
-            show(loaded.render(job.options.camera, show))
-        except _Superseded:
-            state = "cancelled"
-        except TrilightError as mistake:
-            state = "failed"
-            error = str(mistake)
-        except Exception as defect:  # of any library: the page shows it, and the queue goes on
-            state = "failed"
-            error = f"{type(defect).__name__}: {defect}"
-        with self._changed:
-            job.error = error
-            self._update(job, state=state)
-            while len(self._jobs) > MOST_KEPT:
-                self._jobs.popitem(last=False)
+        with self._rendering:
+            with self._changed:
+                if job.state == "cancelled":
+                    return
+                self._update(job, state="working")
+            state: State = "done"
+            try:
+                loaded, job.notes = self._load(job.options)
+                job.scene_core_s = loaded.cpu_seconds
+                show(loaded.render(job.options.camera, show))
+            except _Superseded:
+                state = "cancelled"
+            except TrilightError as mistake:
+                state = "failed"
+                job.error = str(mistake)
+            except Exception as defect:  # of any library: the page shows it, the queue goes on
+                state = "failed"
+                job.error = f"{type(defect).__name__}: {defect}"
+            with self._changed:
+                self._update(job, state=state)
 
     def _load(self, options: PictureOptions) -> tuple[ReadyScene, Sequence[str]]:
         """Return the edited scene in the renderer of a request, and the notes on its pictures."""
@@ -243,12 +222,8 @@ class RenderQueue:
             self._loaded[options.engine] = (key, loaded, [*loaded.notes, *renderer.notes])
         return self._loaded[options.engine][1:]
 
-    def _cancel(self, job: RenderJob | None) -> None:
-        if job is not None:
-            self._update(job, state="cancelled")
-
-    def _update(self, job: RenderJob, *, state: State | str | None = None) -> None:
-        job.state = state or job.state  # type: ignore[assignment]
+    def _update(self, job: RenderJob, *, state: State | None = None) -> None:
+        job.state = state or job.state
         job.version += 1
         self._changed.notify_all()
 
@@ -352,7 +327,7 @@ class SceneHandlers:
 
     def close(self) -> None:
         """Stop rendering, and wait for its end."""
-        self.queue.close()
+        self.queue.cancel_all()
         self.queue.join()
         if self.child is not None:
             self.child.close()
@@ -537,31 +512,51 @@ def _tone_map(radiance_rgb: NDArray[np.float32], query: Mapping[str, str]) -> ND
     return tone_mapped(radiance_rgb * np.float32(2.0**exposure_ev), tone_map)
 
 
-class OpenScenes:
-    """Handlers of the most recent scenes by key, each at `scene/KEY/`."""
+class SceneListHandlers(ABC):
+    """Handlers of a page of many scenes: thumbnails, and the page of a scene at `scene/KEY/`."""
 
-    def __init__(self, key: re.Pattern[str], open_scene: Callable[[str], SceneHandlers]) -> None:
-        """Store the pattern of keys, and the function that opens a scene by its key."""
-        self._key = key
-        self._open_scene = open_scene
+    key: re.Pattern[str]
+    """Pattern of the keys of scenes."""
+
+    def __init__(self, child: RenderChild, checkpoint: str | None) -> None:
+        """Open no scene yet; render child and checkpoint are for the pages of the scenes."""
+        self._child = child
+        self._checkpoint = checkpoint
         self._opening = threading.Lock()
         self._open = OrderedDict[str, SceneHandlers]()
+
+    def routes(self) -> Routes:
+        """Return the routes of the page's requests."""
+        return {
+            "GET api/thumbnail/": self._thumbnail,
+            "GET scene/": self._below,
+            "POST scene/": self._below,
+        }
 
     def close(self) -> None:
         """Stop rendering, and wait for its end."""
         for room in self._open.values():
             room.close()
+        self._child.close()
 
-    def respond(self, request: Request) -> Response:
-        """Respond to a request below a scene's page."""
+    @abstractmethod
+    def _thumbnail(self, request: Request) -> Response:
+        """Respond with the small picture of a scene."""
+
+    @abstractmethod
+    def _open_scene(self, key: str) -> SceneHandlers:
+        """Return the handlers of a scene; raises TrilightError without such a scene."""
+
+    def _below(self, request: Request) -> Response:
+        """Respond to a request below a scene's page; the most recent scenes stay open."""
         match = _BELOW.fullmatch(request.path)
-        if match is None or not self._key.fullmatch(match[1]):
+        if match is None or not self.key.fullmatch(match[1]):
             raise NotFound("there is no such scene.")
         key = match[1]
         with self._opening:
             room = self._open.pop(key, None) or self._open_scene(key)
             self._open[key] = room
             while len(self._open) > MOST_OPEN:
-                self._open.popitem(last=False)[1].queue.close()
+                self._open.popitem(last=False)[1].queue.cancel_all()
         below = dataclasses.replace(request, path=match[2])
         return dispatch({**static_routes("scene.html"), **room.routes()}, below)

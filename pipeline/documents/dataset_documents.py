@@ -1,5 +1,6 @@
 """Writes the documents beside the shards of a finished dataset, for readers and hubs."""
 
+import bisect
 import dataclasses
 from collections import Counter
 from collections.abc import Collection, Mapping, Sequence
@@ -111,13 +112,8 @@ def _patterns(manifest: Manifest, split: str) -> list[str]:
 
 def _size_category(num_scenes: int) -> str:
     """Return Hugging Face's name for a number of samples."""
-    bounds = [(1_000, "1K"), (10_000, "10K"), (100_000, "100K"), (1_000_000, "1M"), (10**7, "10M")]
-    below = "n"
-    for bound, name in bounds:
-        if num_scenes < bound:
-            return f"n<{name}" if below == "n" else f"{below}<n<{name}"
-        below = name
-    return "n>10M"
+    names = ("n<1K", "1K<n<10K", "10K<n<100K", "100K<n<1M", "1M<n<10M", "n>10M")
+    return names[bisect.bisect_right([10**power for power in range(3, 8)], num_scenes)]
 
 
 def _by_split(manifest: Manifest, distributions: Distributions) -> list[Sequence[object]]:

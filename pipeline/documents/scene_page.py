@@ -94,6 +94,11 @@ class PassView(NamedTuple):
     caption: Callable[[NDArray], str]
     """Returns the meaning of the picture's colors; called only if a pixel meets a surface."""
 
+    def show(self, values: NDArray) -> tuple[NDArray[np.uint8], str]:
+        """Return the picture of the values, and its caption."""
+        is_hit = np.any(np.isfinite(values) if values.dtype.kind == "f" else values != MISS)
+        return self.pixels(values), self.caption(values) if is_hit else "nothing is met"
+
 
 def _range_caption(form: str) -> Callable[[NDArray], str]:
     return lambda values: form.format(*finite_range(values) or ())
@@ -138,11 +143,9 @@ def pass_figures(sample: Sample) -> list[list[Figure]]:
         passes = view_passes(sample.scene, names, view=view, resolution=PREVIEW_PX)
         figures = []
         for pass_view, name in zip(PASS_VIEWS, names, strict=True):
-            values = passes[name]
-            is_hit = np.any(values != MISS if values.dtype == np.int32 else np.isfinite(values))
-            means = pass_view.caption(values) if is_hit else "nothing is met"
+            pixels, means = pass_view.show(passes[name])
             title = f"view {view}, {pass_view.title}"
-            figures.append(Figure(png_uri(pass_view.pixels(values)), title, f"{title}: {means}"))
+            figures.append(Figure(png_uri(pixels), title, f"{title}: {means}"))
         rows.append(figures)
     return rows
 

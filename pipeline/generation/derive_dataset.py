@@ -71,6 +71,18 @@ class Selection:
         """Return the parsed `where`, or None; raises TrilightError if it is malformed."""
         return None if self.where is None else condition(self.where)
 
+    @property
+    def words(self) -> list[str]:
+        """Options of `trilight shards select` that state the conditions."""
+        options = {
+            "--split": self.split,
+            "--template": self.template,
+            "--min-noise-floor": self.min_noise_floor_db,
+            "--where": self.where,
+        }
+        stated = [(name, str(value)) for name, value in options.items() if value is not None]
+        return [word for pair in stated for word in pair]
+
     def takes(self, facts: SceneFacts) -> bool:
         return (
             self.split in (None, facts.shard.split)
@@ -226,7 +238,7 @@ def list_scenes(
     selection: Selection,
     *,
     progress: Callable[[int, int], None] = lambda done, total: None,
-) -> list[dict[str, object]]:
+) -> list[dict[str, Any]]:
     """Return a row for each scene that a selection takes, in the order of the shards.
 
     Args:
@@ -244,15 +256,16 @@ def list_scenes(
         value_names=(*_TEXTS, *_COLUMNS),
         shard_done=lambda: progress(next(done), total),
     )
-    rows = []
-    for entry in selected:
-        values = entry.facts.values
-        row: dict[str, object] = {"key": entry.key, **{name: values[name] for name in _TEXTS}}
-        for name, (column, of_several) in _COLUMNS.items():
-            number = round(float(of_several(values[name])), QUANTITIES[name].digits)
-            row[column] = number if QUANTITIES[name].digits else int(number)
-        rows.append(row)
-    return rows
+    return [{"key": entry.key, **columns_of(entry.facts.values)} for entry in selected]
+
+
+def columns_of(values: Mapping[str, Any]) -> dict[str, Any]:
+    """Return the columns of a listed scene from its values by name."""
+    row: dict[str, Any] = {name: values[name] for name in _TEXTS}
+    for name, (column, of_several) in _COLUMNS.items():
+        number = round(float(of_several(values[name])), QUANTITIES[name].digits)
+        row[column] = number if QUANTITIES[name].digits else int(number)
+    return row
 
 
 Operation = Literal["merge", "select", "reshard"]

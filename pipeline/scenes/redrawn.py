@@ -5,6 +5,7 @@ lamps are all emitters that belong to no object; new ones are appended in their 
 """
 
 import dataclasses
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -93,19 +94,16 @@ def with_new_lights(
         np.append(np.arange(count), np.full(len(more), NEW))
         for count, more in ((len(dark.faces), new["faces"]), (rows, new["materials"]))
     )
+    new["faces"] += np.uint32(vertices)
+    new["material_index"] += np.uint16(rows)
+    new["object_index"] += np.uint16(len(dark.objects))
+    arrays: dict[str, Any] = {
+        name: np.concatenate([getattr(dark, name), array]) for name, array in new.items()
+    }
     return dataclasses.replace(
         dark,
         **chosen_maps(dark, triangles, materials),
-        vertex_positions=np.concatenate([dark.vertex_positions, new["vertex_positions"]]),
-        vertex_normals=np.concatenate([dark.vertex_normals, new["vertex_normals"]]),
-        faces=np.concatenate([dark.faces, new["faces"] + np.uint32(vertices)]),
-        material_index=np.concatenate(
-            [dark.material_index, new["material_index"] + np.uint16(rows)]
-        ),
-        materials=np.concatenate([dark.materials, new["materials"]]),
-        object_index=np.concatenate(
-            [dark.object_index, new["object_index"] + np.uint16(len(dark.objects))]
-        ),
+        **arrays,
         objects=(*dark.objects, *(lamp.entry for lamp in lamps)),
     )
 

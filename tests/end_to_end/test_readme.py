@@ -214,6 +214,10 @@ def test_a_page_is_one_screen_and_names_what_exists(page: Path) -> None:
         if named.split("/")[0] in ("data", "runs"):
             continue
         assert (ROOT / named).exists(), named
+    for word in (word for line in _shell_lines(page) for word in shlex.split(line)):
+        path = word.rpartition(":")[0] if is_reference(word) else word
+        if path.startswith(("tests/", "examples/")):
+            assert (ROOT / path).exists(), word
 
 
 def test_every_example_has_a_page_and_every_page_a_command() -> None:
@@ -221,11 +225,3 @@ def test_every_example_has_a_page_and_every_page_a_command() -> None:
     for example in EXAMPLES:
         assert f"](../../examples/{example.name})" in texts, example.name
     assert all(_shell_lines(page) for page in OWN_PAGES)
-
-
-def test_files_that_are_named_exist() -> None:
-    for line in (line for page in OWN_PAGES for line in _shell_lines(page)):
-        for word in shlex.split(line):
-            path = word.rpartition(":")[0] if is_reference(word) else word
-            if path.startswith(("tests/", "examples/")):
-                assert (ROOT / path).exists(), word

@@ -21,15 +21,6 @@ pytestmark = [pytest.mark.slow("packaging"), pytest.mark.timeout(1800)]
 
 Run = Callable[..., str]
 
-PROGRAM = """
-import model, storage, trilight
-assert (model.WHOSE, storage.WHOSE) == ("mine", "mine")
-scene = trilight.read_scene("scene.safetensors")
-picture = trilight.render(scene, resolution=16, noise_floor_db=10, max_spp=8)
-assert picture.radiance_rgb.shape == (16, 16, 3)
-print(trilight.__file__)
-"""
-
 
 def _call(command: list[str], folder: Path) -> str:
     """Run a program outside of any checkout's environment; return what it says."""
@@ -70,7 +61,7 @@ def _lend(
 
 @pytest.fixture(scope="module")
 def place(wheel: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """A folder with a fresh environment, and with modules that are called as ours are."""
+    """A folder with a fresh environment."""
     folder = tmp_path_factory.mktemp("place")
     _call([sys.executable, "-m", "venv", "env"], folder)
     (site,) = (folder / "env/lib").glob("python3.*/site-packages")
@@ -78,9 +69,6 @@ def place(wheel: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
     _lend(ours, {"train"}, site, {"pip"})  # it has its own
     pip = [str(folder / "env/bin/python"), "-m", "pip", "install", "--quiet"]
     _call([*pip, "--no-index", f"{wheel}[train]"], folder)
-    (folder / "train").mkdir()
-    for name in ("model.py", "train/__init__.py", "storage.py", "pipeline.py"):
-        (folder / name).write_text('WHOSE = "mine"\n')
     (folder / "scene.safetensors").write_bytes(encode_scene(tiny_scene()))
     return folder
 
@@ -127,9 +115,3 @@ def test_it_makes_a_dataset_and_trains_on_it(place: Path, trilight: Run) -> None
     trilight("verify", "data/set")
     trilight("train", "smoke", "--data", "data/set", "--out", "runs/it", "--steps", "10")
     assert (place / "runs/it/model.safetensors").is_file()
-
-
-def test_a_program_of_a_user_keeps_its_modules(place: Path) -> None:
-    (place / "program.py").write_text(PROGRAM)
-    said = _call([str(place / "env/bin/python"), "program.py"], place)
-    assert Path(said.strip()).is_relative_to(place / "env")

@@ -9,7 +9,7 @@ import pytest
 
 from infra.leaderboard import _bytes_of
 from model.weights import read_metadata, read_tensors
-from pipeline.objects.local.folder import _file_text
+from pipeline.objects.local.folder import file_text
 from storage.dataset.manifest import index_shard, read_head, read_manifest
 from storage.errors import TrilightError
 from storage.records.objects import read_failures, read_objects_lock
@@ -19,7 +19,7 @@ from train.folder import read_rows
 from train.loop.checkpoints import read_checkpoint
 
 READERS: list[Callable[[Path], object]] = [
-    *(_bytes_of, _file_text, index_shard, read_checkpoint, read_failures, read_head),
+    *(_bytes_of, file_text, index_shard, read_checkpoint, read_failures, read_head),
     *(read_manifest, read_metadata, read_objects_lock, read_rows, read_scene_file, read_tensors),
 ]
 

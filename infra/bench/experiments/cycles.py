@@ -159,10 +159,9 @@ def _stated_figures(
     view: RenderedView, ours: RawReference, theirs: RawReference
 ) -> dict[str, float]:
     """Return a picture's stated error, and its true errors to Trilight's and Cycles' samples."""
-    everywhere = np.ones_like(view.hits)
     figures = {"stated_db": view.noise_floor_db}
     for name, reference in (("ours", ours), ("theirs", theirs)):
-        error_db, _ = true_error_db(view.radiance_rgb, reference, log10_radiance, everywhere)
+        error_db, _ = true_error_db(view.radiance_rgb, reference, log10_radiance)
         figures[f"to_{name}_db"] = error_db
     return figures
 

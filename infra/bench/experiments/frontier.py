@@ -193,9 +193,8 @@ def _plain_levels(sampler: str, context: BenchContext, trial: str) -> dict[int, 
 
 def plain_figures(level: Image, reference: RawReference) -> dict[str, float]:
     """Return cost and true errors of a picture of plain Mitsuba."""
-    everywhere = np.ones(level.radiance_rgb.shape[:2], np.bool_)
-    db, open_db = true_error_db(level.radiance_rgb, reference, log10_radiance, everywhere)
-    linear_db, _ = true_error_db(level.radiance_rgb, reference, clamped_radiance, everywhere)
+    db, open_db = true_error_db(level.radiance_rgb, reference, log10_radiance)
+    linear_db, _ = true_error_db(level.radiance_rgb, reference, clamped_radiance)
     return {
         "core_s": level.cpu_seconds or 0.0,
         "spp": float(level.samples or 0),

@@ -1,11 +1,8 @@
 """Experiment `gpu`: throughput, correct pictures, and steps of every training preset on a GPU."""
 
-import dataclasses
 import itertools
-import os
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from functools import partial
-from typing import TYPE_CHECKING
 
 from infra.bench.context import BenchContext
 from infra.bench.experiment import (
@@ -16,47 +13,29 @@ from infra.bench.experiment import (
     Point,
     device_of,
 )
-from infra.bench.workloads.reading import time_reading
 from infra.bench_options import BenchOptions
 from storage.errors import TrilightError
-from train.presets import TRAINING_PRESETS, training_preset
-
-if TYPE_CHECKING:
-    import torch
+from train.presets import TRAINING_PRESETS
 
 NETWORKS = ("builtin:tokens", "builtin:hits")
 _QUICK_RUNS = ("pretrain", "hits")
 _STEPS = {"full": 10, "quick": 3}
-READ_AS = "pretrain"
-"""Training preset whose augmentation is applied to samples that are read."""
-_BATCH = 8
-_READ_S = {"full": 10.0, "quick": 2.0}
 _PRODUCT_WIDTH = {"cuda": 8192, "cpu": 512}
 _COPIED_BYTES = {"cuda": 1 << 30, "cpu": 1 << 26}
-_THREADS = (1, 2, 4, 8, 16)
-
-Measured = Callable[[BenchContext, "torch.device"], Figures]
 
 
 def _points(scale: BenchScale, options: BenchOptions) -> list[Point]:
-    device = device_of(options)
-    on_gpu = device == "cuda"
+    on_gpu = device_of(options) == "cuda"
     kinds = ("float32", "tf32", "bfloat16", "float16") if on_gpu else ("float32",)
     copies = ("within", "to_pageable", "to_pinned") if on_gpu else ("within",)
     precisions = ("float32", "bfloat16") if on_gpu else ("float32",)
-    threads = [count for count in _THREADS if count <= (os.cpu_count() or 1)]
     works = [
         *itertools.product(["product"], kinds),
         *itertools.product(["copy"], copies),
         *itertools.product(["picture"], NETWORKS, precisions),
         *itertools.product(["step"], _runs(scale, options)),
     ]
-    named: dict[str, Measured] = {
-        **{", ".join(work): partial(_work, work[0], work[1:]) for work in works},
-        "rendering a view": lambda context, device: context.rendered[0],
-        **{f"reading a sample, {count} threads": partial(_reading, count) for count in threads},
-    }
-    return [Point(name=name, measure=partial(_measure, name, part)) for name, part in named.items()]
+    return [Point(name=", ".join(work), measure=partial(_measure, work)) for work in works]
 
 
 def _runs(scale: BenchScale, options: BenchOptions) -> Sequence[str]:
@@ -74,59 +53,38 @@ def _runs(scale: BenchScale, options: BenchOptions) -> Sequence[str]:
     )
 
 
-def _measure(name: str, part: Measured, context: BenchContext, trial: str) -> Figures:
-    """Measure a part; one that fails has no figures, and a note with the reason."""
+def _measure(work: Sequence[str], context: BenchContext, trial: str) -> Figures:
+    """Measure a work; one that fails has no figures, and a note with the reason."""
     import torch
 
-    from infra.bench.gpu.steps import device_facts
+    from infra.bench.gpu import steps
 
     device = torch.device(device_of(context.options))
-    context.note(device_facts(device))
+    context.note(steps.device_facts(device))
+    figures: Figures = {}
     try:
-        return part(context, device)
+        match work:
+            case "product", number_type:
+                figures = steps.product_figures(device, number_type, _PRODUCT_WIDTH[device.type])
+            case "copy", way:
+                figures = steps.copy_figures(device, way, _COPIED_BYTES[device.type])
+            case "picture", network, precision:
+                figures = steps.twin_figures(network, precision, device)
+            case "step", run:
+                figures = steps.step_figures(run, _STEPS[context.scale.name], device)
+                if not figures:
+                    context.note(f"{run}: too little memory, even for one scene a pass")
     except (RuntimeError, TrilightError) as error:  # those of CUDA and of torch's compiler too
-        context.note(f"{name} was not measured: {type(error).__name__}")
-        return {}
-
-
-def _work(
-    kind: str, words: Sequence[str], context: BenchContext, device: "torch.device"
-) -> Figures:
-    """Measure a product, a copy, a picture or a step."""
-    from infra.bench.gpu import steps  # imports torch
-
-    match kind, *words:
-        case "product", number_type:
-            return steps.product_figures(device, number_type, _PRODUCT_WIDTH[device.type])
-        case "copy", way:
-            return steps.copy_figures(device, way, _COPIED_BYTES[device.type])
-        case "picture", network, precision:
-            return steps.twin_figures(network, precision, device)
-    figures = steps.step_figures(words[0], _STEPS[context.scale.name], device)
-    if not figures:
-        context.note(f"{words[0]}: too little memory, even for one scene a pass")
+        context.note(f"{', '.join(work)} was not measured: {type(error).__name__}")
     return figures
-
-
-def _reading(threads: int, context: BenchContext, device: "torch.device") -> Figures:
-    """Decode and augment samples as a training preset does."""
-    run = training_preset(READ_AS)
-    settings = dataclasses.replace(
-        run, scenes_per_step=_BATCH, resolution=context.scale.picture_px, most_triangles=0
-    )
-    least_s = _READ_S[context.scale.name]
-    seconds, core_s = time_reading(context.data, settings, threads, least_s=least_s)
-    return {
-        "ms": 1e3 * seconds, "views_per_s": run.views_per_scene / seconds, "core_s": core_s
-    }  # fmt: skip
 
 
 EXPERIMENT = Experiment(
     name="gpu",
-    title="The GPU: products, copies, pictures, steps, and what feeds it",
-    about="Large products and copies, pictures of the built-in networks against stored ones, "
-    "steps of the training presets at their own sizes, rendering, and reading; without a GPU the "
-    "same at toy sizes, which shows that it works.",
+    title="The GPU: products, copies, pictures and steps",
+    about="Large products and copies, pictures of the built-in networks against stored ones, and "
+    "steps of the training presets at their own sizes; without a GPU the same at toy sizes, which "
+    "shows that it works.",
     cost=Column("ms", "ms"),
     columns=(
         Column("TFLOP/s", "teraflop_per_s"),
@@ -136,8 +94,6 @@ EXPERIMENT = Experiment(
         Column("scenes a pass", "scenes"),
         Column("not compiled, ms", "plain_ms"),
         Column("GiB", "peak_gib"),
-        Column("kernels", "kernels"),
-        Column("core-s", "core_s"),
     ),
     because="Pictures below 40 dB of the stored ones are wrong: believe no time then. The file "
     "names no host, user or folder; to send it, attach it to an issue.",

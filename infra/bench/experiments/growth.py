@@ -48,12 +48,6 @@ class SizedWork:
     """Function that does the work at a size, in an empty folder next to those of other sizes."""
 
 
-def sizes_of(work: SizedWork, count: int) -> list[int]:
-    """Return the sizes at which a kind of work is measured."""
-    sizes = [work.least * 4**step for step in range(count)]
-    return [size for size in sizes if size <= work.most]
-
-
 def measure_work(name: str, size: int, folder: Path) -> dict[str, float]:
     """Return seconds and peak bytes of a kind of WORK at a size, in a fresh process.
 
@@ -189,7 +183,8 @@ def _points(scale: BenchScale, options: BenchOptions) -> list[Point]:
             size=float(size),
         )
         for name, work in WORK.items()
-        for size in sizes_of(work, scale.growth)
+        for step in range(scale.growth)
+        if (size := work.least * 4**step) <= work.most
     ]
 
 
@@ -202,8 +197,7 @@ def _folder_with_sample(context: BenchContext) -> Path:
     """Return a folder with the files of one rendered scene, which the shards repeat."""
     root = context.folder()
     (root / "sample").mkdir()
-    _, members = context.rendered
-    for name, data in members[0].items():
+    for name, data in context.rendered[0].items():
         (root / "sample" / name).write_bytes(data)
     return root
 

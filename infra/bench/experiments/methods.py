@@ -102,14 +102,13 @@ def judged_figures(renderer: Renderer, scene: Scene, reference: RawReference) ->
     picture = time_scene(renderer, scene, "scene", ROUNDS)
     radiance_rgb = picture.radiance_rgb
     hits = first_hits(scene, resolution=len(radiance_rgb)).met
-    everywhere = np.ones_like(hits)
     mean = 0.5 * (reference.a_rgb + reference.b_rgb)
     return {
         "core_s": picture.price.first_s,
         "view_s": picture.price.further_s,
-        "db": true_error_db(radiance_rgb, reference, log10_radiance, everywhere)[0],
+        "db": true_error_db(radiance_rgb, reference, log10_radiance)[0],
         "object_db": true_error_db(radiance_rgb, reference, log10_radiance, hits)[0],
-        "linear_db": true_error_db(radiance_rgb, reference, clamped_radiance, everywhere)[0],
+        "linear_db": true_error_db(radiance_rgb, reference, clamped_radiance)[0],
         "ssim": float(
             picture_scores(radiance_rgb, mean.astype(np.float32), hits, None)["ssim"] or 0.0
         ),

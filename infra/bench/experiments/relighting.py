@@ -59,10 +59,9 @@ def _measure(target_db: float, context: BenchContext, trial: str) -> Figures:
     settings = dataclasses.replace(olat().renders, resolution=px, noise_floor_db=target_db)
     view = context.child.call(render_shot, scene, settings)
     assert view.light_floors is not None and view.lights_rgb is not None
-    everywhere = np.ones((px, px), np.bool_)
 
     def error_db(picture: NDArray[np.float32], reference: RawReference) -> float:
-        return true_error_db(picture, reference, log10_radiance, everywhere)[0]
+        return true_error_db(picture, reference, log10_radiance)[0]
 
     gains = MOST_GAIN ** rng_for(index, "gains").uniform(-1, 1, (len(references), 1, 1, 3))
     lights = zip(view.light_floors, view.lights_rgb, references, strict=True)

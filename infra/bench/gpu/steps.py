@@ -118,7 +118,6 @@ THIN = (4, 8, 16, 16, 16)
 """Channels of LPIPS for shrunk presets."""
 
 _WARM_STEPS = 3
-_LIGHTS = 4
 UNSTATED_TRIANGLES = 1024
 """Triangles of the longest scene if a preset sets no limit."""
 
@@ -130,27 +129,6 @@ VGG16_WIDTHS = (64, 128, 256, 512, 512)
 """Channels of VGG16's blocks, as in the published LPIPS."""
 
 REPEATS = 5
-
-
-def count_kernels(work: Callable[[], object], device: torch.device) -> int:
-    """Return the number of kernels of a call; on a processor, of its operators."""
-    from torch.profiler import ProfilerActivity, profile
-
-    on_gpu = device.type == "cuda"
-    activities = [ProfilerActivity.CPU, *([ProfilerActivity.CUDA] if on_gpu else [])]
-    with profile(activities=activities) as trace:
-        work()
-        if on_gpu:
-            torch.cuda.synchronize(device)
-    return sum(_is_kernel(event, on_gpu=on_gpu) for event in trace.events() or [])
-
-
-def _is_kernel(event: Any, *, on_gpu: bool) -> bool:
-    if getattr(event, "is_user_annotation", False):
-        return False
-    if on_gpu:
-        return str(event.device_type).endswith("CUDA")
-    return event.name.startswith("aten::") and event.self_cpu_time_total > 0
 
 
 def step_settings(run: str, device: torch.device) -> TrainSettings:
@@ -232,7 +210,7 @@ def _measure_steps(
     }
     if device.type == "cuda":
         figures["peak_gib"] = torch.cuda.max_memory_allocated(device) / 2**30
-    return {**figures, "kernels": float(count_kernels(step, device))}
+    return figures
 
 
 def workloads(settings: TrainSettings, scenes: int) -> list[Workload]:
@@ -250,7 +228,7 @@ def workloads(settings: TrainSettings, scenes: int) -> list[Workload]:
 
 def scene_of(workload: Workload) -> SceneTensors:
     """Return two objects in a room with an exact number of triangles, and cameras around them."""
-    scene = cost_scene(math.ceil(1.3 * workload.triangles) + 32, _LIGHTS)
+    scene = cost_scene(math.ceil(1.3 * workload.triangles) + 32, LIGHTS)
     poses = [
         look_at_c2w(
             eye=(1.4 + math.cos(6 * angle), math.sin(6 * angle) - 2.2, 1.3),

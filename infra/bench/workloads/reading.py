@@ -1,31 +1,24 @@
-"""Samples packed in several layouts, and reading of many copies as training does."""
+"""Samples packed in several layouts, and datasets of many copies."""
 
 import io
-import itertools
 import time
 from collections.abc import Callable, Mapping, Sequence
-from contextlib import closing
 from pathlib import Path
-from typing import TYPE_CHECKING, TypeVar
+from typing import TypeVar
 
 import h5py
 import numpy as np
 
-from infra.bench.workloads.rendering_speed import Members
 from pipeline.exchange.renderformer_h5 import write_renderformer_h5
 from storage.dataset.layout import DatasetFolder
 from storage.dataset.manifest import Manifest, index_shard, write_manifest
 from storage.dataset.shard import write_shard
-from storage.dataset.training_data import TrainingData
 from storage.records.profiles import PROFILES, Profile
 from storage.records.sample import Sample, decode_sample, encode_sample, sample_key
 from storage.records.scene import ARRAY_FIELDS
 
-if TYPE_CHECKING:
-    from train.settings import TrainSettings
-
-_DECODED_AHEAD = 16
-"""Number of samples that are read before any is timed: what is decoded ahead would count twice."""
+Members = Mapping[str, bytes]
+"""Files of a sample by name."""
 
 
 def write_copies(
@@ -49,44 +42,6 @@ def write_copies(
     )  # fmt: skip
     write_manifest(folder.manifest, manifest)
     return len(every)
-
-
-def time_reading(
-    data: TrainingData,
-    settings: "TrainSettings",
-    threads: int,
-    *,
-    least_count: int = 1,
-    least_s: float = 0.0,
-) -> tuple[float, float]:
-    """Return wall-clock and CPU seconds of reading a sample as training does, without a network.
-
-    Args:
-        data: data to read, again from its start when it ends.
-        threads: number of decoding threads; with 0 the main thread decodes.
-
-    Raises:
-        TrilightError: the data cannot be read at this width.
-    """
-    from train.data.bad_samples import BadSampleCounter
-    from train.data.loader import load_batches
-    from train.data.order import RankSlice
-
-    stream = load_batches(
-        data.split("train"), settings, 0, rank_slice=RankSlice(),
-        workers=threads, unusable=BadSampleCounter(0),
-    )  # fmt: skip
-    with closing(stream) as batches:
-        for _ in itertools.islice(batches, 1 + _DECODED_AHEAD // settings.scenes_per_step):
-            pass
-        began = time.perf_counter()
-        core_began = time.process_time()
-        count = 0
-        while count < least_count or time.perf_counter() - began < least_s:
-            next(batches)
-            count += settings.scenes_per_step
-        seconds = time.perf_counter() - began
-        return seconds / count, (time.process_time() - core_began) / count
 
 
 TEXTURES = {"HDF5 float16": "float16", "HDF5 float32": "float32"}

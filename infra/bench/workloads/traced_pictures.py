@@ -211,7 +211,7 @@ def figures(view: RenderedView, reference: RawReference) -> dict[str, float]:
         "at_cap": float(view.at_cap),
     }
     for name, curve in _CURVES.items():
-        pixels = view.hits if name == "object" else np.ones_like(view.hits)
+        pixels = view.hits if name == "object" else None
         true_db, open_db = true_error_db(view.radiance_rgb, reference, curve, pixels)
         excess_db = stated_db[name] - true_db
         values |= {

@@ -10,7 +10,13 @@ let generation = 0;
 
 function query(first) {
   const asked = new URLSearchParams({ from: first });
-  for (const [name, value] of new FormData(form)) if (value !== "") asked.set(name, value);
+  const limits = [];
+  for (const { name, value, dataset } of form.elements) {
+    if (!name || value === "") continue;
+    if (dataset.limit) limits.push(`${dataset.limit} ${value}`);
+    else asked.set(name, value);
+  }
+  if (limits.length) asked.set("where", limits.join(" and "));
   return asked.toString();
 }
 

@@ -125,7 +125,7 @@ def jsonl_rows(path: Path) -> Iterator[tuple[int, dict[str, Any]]]:
     Raises:
         TrilightError: the file is not UTF-8 text, or a line is not a JSON object.
     """
-    for number, line in enumerate(_file_text(path).split("\n"), start=1):
+    for number, line in enumerate(file_text(path).split("\n"), start=1):
         if not line.strip():
             continue
         try:
@@ -150,14 +150,29 @@ def csv_rows(path: Path) -> Iterator[tuple[int, dict[str, Any]]]:
         TrilightError: the file is not UTF-8 text or breaks the rules of CSV, the first row lacks
             `uid` or `path` or has a name twice, or a row has another number of cells.
     """
+    # newline="" leaves line breaks inside of quotes as they are
+    reader = csv.reader(io.StringIO(file_text(path), newline=""), strict=True)
     names: list[str] = []
-    for number, cells in _csv_lines(path):
+    while True:
+        number = reader.line_num + 1
+        location = f"{path.name}:{number}"
+        try:
+            cells = next(reader, None)
+        except csv.Error as error:
+            raise TrilightError(
+                f"{location}: not CSV ({error}); expected cells with commas between "
+                "them, and double quotes around text that holds commas, quotes or line breaks."
+            ) from error
+        if cells is None:
+            return
+        if not any(cell.strip() for cell in cells):
+            continue
         if not names:
-            names = _header(cells, f"{path.name}:{number}")
+            names = _header(cells, location)
             continue
         if len(cells) != len(names):
             raise TrilightError(
-                f"{path.name}:{number}: has {len(cells)} cells; expected {len(names)}, as in the "
+                f"{location}: has {len(cells)} cells; expected {len(names)}, as in the "
                 "first row. Put text with commas or line breaks in quotes."
             )
         yield number, {name: cell for name, cell in zip(names, cells, strict=True) if cell.strip()}
@@ -176,32 +191,15 @@ def _header(cells: list[str], location: str) -> list[str]:
     return names
 
 
-def _csv_lines(path: Path) -> Iterator[tuple[int, list[str]]]:
-    # newline="" leaves line breaks inside of quotes as they are
-    reader = csv.reader(io.StringIO(_file_text(path), newline=""), strict=True)
-    while True:
-        start = reader.line_num + 1
-        try:
-            cells = next(reader)
-        except StopIteration:
-            return
-        except csv.Error as error:
-            raise TrilightError(
-                f"{path.name}:{start}: not CSV ({error}); expected cells with commas between "
-                "them, and double quotes around text that holds commas, quotes or line breaks."
-            ) from error
-        if any(cell.strip() for cell in cells):
-            yield start, cells
-
-
-def _file_text(path: Path) -> str:
+def file_text(path: Path) -> str:
+    """Return the text of a file; raises TrilightError if it is not UTF-8 or cannot be read."""
     try:
         return read_plain(path).decode("utf-8-sig")
     except (OSError, UnicodeDecodeError) as error:
         reason = error.strerror if isinstance(error, OSError) else error
         raise TrilightError(
-            f"{path.name}: cannot be read ({reason}); expected a file of UTF-8 text. Fix or "
-            "remove it."
+            f"{printable(path.name)}: cannot be read ({reason}); expected a file of UTF-8 text. "
+            "Fix or remove it."
         ) from error
 
 

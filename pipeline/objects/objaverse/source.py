@@ -18,6 +18,7 @@ from typing import Any
 
 from pipeline.objects.licences import UNKNOWN, refuse_licences
 from pipeline.objects.listing import CountDone, Fetched, Listing, failure, fetch_all
+from pipeline.objects.local.folder import file_text
 from storage.atomic import atomic_writer
 from storage.errors import TrilightError
 from storage.records.objects import Failure, ObjectRecord
@@ -202,14 +203,8 @@ def _uids(text: str, source: str) -> list[str]:
     path = Path(os.path.expanduser(text))
     if not text or not path.is_file():
         raise TrilightError(f"objects {printable(source)!r} names no file and no uid; {_FORMS}.")
-    try:
-        lines = path.read_bytes().decode("utf-8-sig").splitlines()
-    except (OSError, UnicodeDecodeError) as error:
-        raise TrilightError(
-            f"{printable(path.name)}: cannot be read; expected UTF-8 text with one uid per line."
-        ) from error
     uids = []
-    for number, line in enumerate(lines, start=1):
+    for number, line in enumerate(file_text(path).splitlines(), start=1):
         uid = line.partition("#")[0].strip().lower()
         if uid and not _UID.fullmatch(uid):
             raise TrilightError(

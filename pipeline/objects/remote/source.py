@@ -45,23 +45,38 @@ _NAME_ERRORS = (errno.ENAMETOOLONG, errno.ENOTDIR, errno.EEXIST, errno.EISDIR, e
 _MAX_BUFFERS = 100
 _MAX_JSON_BYTES = 64_000_000
 _STALE_S = 24 * 3600.0
-
-
 _MAX_FOLDERS = 10_000
 _MAX_DEPTH = 32
 """Maximum depth of folders: a server may answer every address with the same page."""
+MAX_BYTES = 200_000_000
+"""Largest downloaded object with its buffers, in bytes: the limit of the mesh stage."""
+THREADS = 8
 
 
 class RemoteFolder:
-    """Files of a remote folder by name: the unquoted path below it, with / between parts."""
+    """Files of a remote folder, and their local copies; safe for several threads.
+
+    Files have names: the unquoted path below the folder, with / between parts.
+    """
 
     def __init__(self, url: RemoteUrl) -> None:
-        """Open the driver; raises TrilightError where its package is missing."""
+        """Open the driver, and remove leftovers of earlier runs.
+
+        Raises:
+            TrilightError: the driver's package is missing.
+        """
         self.url = url
         self.driver = shared_driver(url)
         self.driver.invalidate_cache()  # one driver keeps listings although that is turned off
+        root = cache_folder("objects") / sha256_hex(url.display_url.encode())[:32]
+        self.files = Path(os.path.realpath(root)) / "files"
+        self.stop = threading.Event()
         self._addresses: dict[str, str] = {}
         self._facts: dict[str, dict[str, Any]] = {}
+        self._lock = threading.Lock()
+        self._outcomes: dict[str, Future[Path]] = {}
+        # younger files may belong to a running process
+        remove_leftovers(self.files, older_than_s=_STALE_S)
 
     def address(self, name: str) -> str:
         """Return the driver's address of a file."""
@@ -70,6 +85,17 @@ class RemoteFolder:
         # Bytes that are not UTF-8 are lone surrogates in `name`.
         inner = quote(name, errors="surrogateescape") if self.url.is_http else name
         return f"{self.url.root}/{inner}"
+
+    def display_url(self, name: str) -> str:
+        """Return the URL of a file for messages and documents, without secrets."""
+        address = self.address(name)
+        return printable(
+            safe_url(address if self.url.is_http else f"{self.url.scheme}://{address}")
+        )
+
+    def name_of(self, record: ObjectRecord) -> str:
+        """Return the name of the file of a record."""
+        return Path(record.path).relative_to(self.files).as_posix()
 
     def facts(self, name: str) -> dict[str, Any]:
         """Return the server's metadata of a file; raises the driver's errors."""
@@ -152,37 +178,6 @@ class RemoteFolder:
         self._addresses = names
         return sorted(names)
 
-
-def _below(address: str, root: str) -> str | None:
-    """Return the file name of a link, or None where it leads elsewhere or sorts the page."""
-    if not address.startswith(f"{root}/") or "?" in address or "#" in address:
-        return None
-    inner = unquote(address[len(root) + 1 :], errors="surrogateescape")
-    hidden_or_upward = any(part.startswith(".") for part in inner.split("/"))
-    return None if hidden_or_upward or not inner else inner
-
-
-class RemoteFiles:
-    """The local copies of a remote folder's files; safe for several threads."""
-
-    def __init__(self, folder: RemoteFolder, root: Path, max_bytes: int) -> None:
-        """Open the local copies and remove leftovers of earlier runs.
-
-        Args:
-            folder: the remote folder.
-            root: local folder for this remote folder alone.
-            max_bytes: largest accepted object in bytes, with the buffers that it names.
-        """
-        self.files = Path(os.path.realpath(root)) / "files"
-        self.stop = threading.Event()
-        self._versions = self.files.parent / "versions"
-        self._folder = folder
-        self._max_bytes = max_bytes
-        self._lock = threading.Lock()
-        self._outcomes: dict[str, Future[Path]] = {}
-        # younger files may belong to a running process
-        remove_leftovers(self.files, older_than_s=_STALE_S)
-
     def path(self, name: str) -> Path:
         """Return the local path of a file; raises TransferFailed for unsafe names."""
         parts = name.split("/")
@@ -234,7 +229,7 @@ class RemoteFiles:
     def _refresh(self, name: str) -> Path:
         """Download a file unless the local copy has the server's version; return its path."""
         path = self.path(name)
-        facts = with_tries(lambda: self._folder.facts(name))
+        facts = with_tries(lambda: self.facts(name))
         if facts.get("type") == "directory":
             raise TransferFailed("download_failed", "is a folder, not a file")
         size = facts.get("size")
@@ -242,18 +237,19 @@ class RemoteFiles:
         version = version_of(facts)
         if size is not None:
             version["size"] = str(size)
-        note = self._versions / f"{sha256_hex(os.fsencode(name))}.json"
+        versions = self.files.parent / "versions"
+        note = versions / f"{sha256_hex(os.fsencode(name))}.json"
         if not version or not _is_here(path, note, version):
             self._transfer(name, path, size)
             write_atomically(note, json.dumps(version, sort_keys=True).encode())
         return path
 
     def _transfer(self, name: str, path: Path, size: int | None) -> None:
-        url = dataclasses.replace(self._folder.url, root=self._folder.address(name))
+        url = dataclasses.replace(self.url, root=self.address(name))
         try:
             with atomic_writer(path) as stream:
                 target = cast(BinaryIO, _StoppableStream(stream, self.stop))
-                download(url, target, num_bytes=size, max_bytes=self._max_bytes)
+                download(url, target, num_bytes=size, max_bytes=MAX_BYTES)
         except TrilightError as error:
             if isinstance(error.__cause__, OSError) and error.__cause__.errno in _NAME_ERRORS:
                 message = f"the name {printable(name)[:100]!r} clashes with another one here"
@@ -261,9 +257,18 @@ class RemoteFiles:
             raise
 
     def _check_size(self, size: int) -> None:
-        if size > self._max_bytes:
-            message = f"{size} bytes; expected <= {self._max_bytes}"
+        if size > MAX_BYTES:
+            message = f"{size} bytes; expected <= {MAX_BYTES}"
             raise TransferFailed("too_large_bytes", message)
+
+
+def _below(address: str, root: str) -> str | None:
+    """Return the file name of a link, or None where it leads elsewhere or sorts the page."""
+    if not address.startswith(f"{root}/") or "?" in address or "#" in address:
+        return None
+    inner = unquote(address[len(root) + 1 :], errors="surrogateescape")
+    hidden_or_upward = any(part.startswith(".") for part in inner.split("/"))
+    return None if hidden_or_upward or not inner else inner
 
 
 class _StoppableStream:
@@ -333,11 +338,6 @@ def _inner(uri: str) -> str | None:
     return inner
 
 
-MAX_BYTES = 200_000_000
-"""Largest downloaded object with its buffers, in bytes: the limit of the mesh stage."""
-THREADS = 8
-
-
 def list_remote(url: RemoteUrl, licence: str | None) -> Listing:
     """List the objects of a remote folder: its catalogue's rows, or else its object files.
 
@@ -351,34 +351,31 @@ def list_remote(url: RemoteUrl, licence: str | None) -> Listing:
             its catalogue is wrong, or there are a catalogue and a `licence`.
     """
     folder = RemoteFolder(url)
-    root = cache_folder("objects") / sha256_hex(url.display_url.encode())[:32]
-    files = RemoteFiles(folder, root, MAX_BYTES)
     catalogue = only_catalogue(folder.has)
     if catalogue is None:
-        listing = _list_object_files(folder, files, stated_licence(licence))
+        listing = _list_object_files(folder, stated_licence(licence))
     else:
         require_unstated(licence, catalogue)
-        listing = Listing(records=_list_catalogue(folder, files, catalogue), failures=[])
-    return dataclasses.replace(listing, fetch=partial(_fetch, folder, files))
+        listing = Listing(records=_list_catalogue(folder, catalogue), failures=[])
+    return dataclasses.replace(listing, fetch=partial(_fetch, folder))
 
 
-def _list_catalogue(folder: RemoteFolder, files: RemoteFiles, catalogue: str) -> list[ObjectRecord]:
+def _list_catalogue(folder: RemoteFolder, catalogue: str) -> list[ObjectRecord]:
     try:
-        records = read_catalogue(files.fetch(catalogue))
+        records = read_catalogue(folder.fetch(catalogue))
     except TransferFailed as error:
         raise TrilightError(
             f"objects {folder.url.display_url!r}: {catalogue} cannot be read ({error.message}); "
             "expected it to be fetched. Try again, or check your access to it."
         ) from error
+    urls = [record.source_url or folder.display_url(folder.name_of(record)) for record in records]
     return [
-        dataclasses.replace(
-            record, source_url=record.source_url or _display_url(folder, _name_below(files, record))
-        )
-        for record in records
+        dataclasses.replace(record, source_url=source_url)
+        for record, source_url in zip(records, urls, strict=True)
     ]
 
 
-def _list_object_files(folder: RemoteFolder, files: RemoteFiles, licence: StatedLicence) -> Listing:
+def _list_object_files(folder: RemoteFolder, licence: StatedLicence) -> Listing:
     names = folder.names()
     for catalogue in set(CATALOGUE_NAMES) & set(names):
         # without the catalogue, the run could use objects that it forbids
@@ -389,30 +386,17 @@ def _list_object_files(folder: RemoteFolder, files: RemoteFiles, licence: Stated
     return list_files(
         names,
         licence,
-        lambda name: {"path": str(files.path(name)), "source_url": _display_url(folder, name)},
+        lambda name: {"path": str(folder.path(name)), "source_url": folder.display_url(name)},
     )
 
 
-def _fetch(
-    folder: RemoteFolder, files: RemoteFiles, records: list[ObjectRecord], downloaded: CountDone
-) -> Fetched:
+def _fetch(folder: RemoteFolder, records: list[ObjectRecord], downloaded: CountDone) -> Fetched:
     def fetch(record: ObjectRecord) -> ObjectRecord:
-        name = _name_below(files, record)
+        name = folder.name_of(record)
         try:
-            return dataclasses.replace(record, path=str(files.fetch_object(name)))
+            return dataclasses.replace(record, path=str(folder.fetch_object(name)))
         except TransferFailed as error:
-            message = f"{_display_url(folder, name)}: {error.message}"
+            message = f"{folder.display_url(name)}: {error.message}"
             raise TransferFailed(error.reason, message) from error
 
-    return fetch_all(records, fetch, downloaded, threads=THREADS, stop=files.stop)
-
-
-def _name_below(files: RemoteFiles, record: ObjectRecord) -> str:
-    return Path(record.path).relative_to(files.files).as_posix()
-
-
-def _display_url(folder: RemoteFolder, name: str) -> str:
-    address = folder.address(name)
-    return printable(
-        safe_url(address if folder.url.is_http else f"{folder.url.scheme}://{address}")
-    )
+    return fetch_all(records, fetch, downloaded, threads=THREADS, stop=folder.stop)

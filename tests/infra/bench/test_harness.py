@@ -79,7 +79,7 @@ def measure(point: str, context: BenchContext, trial: str) -> Figures:
     return {"core_s": cost + late, "db": db}
 
 
-def experiment(*trials: str, warm_up: bool = False) -> Experiment:
+def experiment(*trials: str) -> Experiment:
     """Return three points that are measured in these trials."""
     return Experiment(
         name="made-up",
@@ -103,7 +103,6 @@ def experiment(*trials: str, warm_up: bool = False) -> Experiment:
             for name in TOY_FIGURES
         ],
         trials=lambda scale, options: trials,
-        warm_up=warm_up,
     )
 
 
@@ -125,8 +124,8 @@ def same_machine(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(running, "plot", lambda *_: None)
 
 
-def measured(folder: Path, *trials: str, data: str | None = None, warm_up: bool = False) -> Run:
-    one = experiment(*trials, warm_up=warm_up)
+def measured(folder: Path, *trials: str, data: str | None = None) -> Run:
+    one = experiment(*trials)
     return run(one, TINY, BenchOptions(data=data), folder / "made-up.jsonl")
 
 
@@ -150,9 +149,9 @@ def test_every_declaration_is_whole() -> None:
                 assert trials and len(set(trials)) == len(trials)
 
 
-def test_points_are_measured_in_turn_and_the_warm_up_does_not_count(tmp_path: Path) -> None:
-    found = measured(tmp_path, "a", "b", warm_up=True)
-    assert calls == [(trial, point) for trial in ("a", "a", "b") for point in TOY_FIGURES]
+def test_points_are_measured_in_turn(tmp_path: Path) -> None:
+    found = measured(tmp_path, "a", "b")
+    assert calls == [(trial, point) for trial in ("a", "b") for point in TOY_FIGURES]
     assert found.whole_trials() == ["a", "b"]
 
 

@@ -111,7 +111,7 @@ def test_a_finished_picture_is_kept_and_an_equal_question_costs_nothing() -> Non
     assert easel.submit(wanted()) is first
     assert over(easel, easel.submit(wanted(fov=50.0))) is not first
     assert renderer.rendered == 2
-    easel.close()
+    easel.cancel_all()
 
 
 def test_who_asks_for_another_gives_up_the_one_at_hand() -> None:
@@ -128,7 +128,7 @@ def test_who_asks_for_another_gives_up_the_one_at_hand() -> None:
     assert again is not given_up
     easel.cancel_all()
     assert over(easel, again).state == "cancelled"
-    easel.close()
+    easel.cancel_all()
 
 
 def test_a_failure_is_a_sentence_and_the_next_picture_comes() -> None:
@@ -140,7 +140,7 @@ def test_a_failure_is_a_sentence_and_the_next_picture_comes() -> None:
     assert over(easel, easel.submit(wanted("good"))).state == "done"
     with pytest.raises(TrilightError, match="not kept"):
         easel.job("999")
-    easel.close()
+    easel.cancel_all()
 
 
 def test_the_end_waits_for_the_picture_at_hand() -> None:
@@ -171,7 +171,7 @@ def test_pictures_of_one_place_are_judged_by_the_target_and_else_by_the_traced_o
     assert easel.reference(elsewhere) is None
     free = over(easel, easel.submit(wanted("target", view=None, fov=50.0)))
     assert free.state == "failed" and "own cameras" in free.error
-    easel.close()
+    easel.cancel_all()
 
 
 MEANINGLESS: list[dict[str, Any]] = [

@@ -1,6 +1,5 @@
 """Every dataset preset is complete; published ones stay what they are, whatever changes later."""
 
-import dataclasses
 import json
 import subprocess
 import sys
@@ -17,7 +16,6 @@ from pipeline.presets.settings import DatasetSettings, differences
 from pipeline.renders.settings import NoiseTargets
 from scene_templates import placement
 from scene_templates import sample_lights as emitters
-from scene_templates.rooms import PATCH_FACES, QUADS, SIDES
 from scene_templates.sample_camera import sample_camera
 from scene_templates.settings import SceneSettings
 from scene_templates.templates import TEMPLATES
@@ -191,50 +189,16 @@ FROZEN = {
 }
 """Digest of each set's settings."""
 
-LAYOUTS = {
-    "plane": (("floor",), (0, 180, (3, 87)), (0, 180, (10, 90))),
-    "wall": (("floor", "wall1"), (180, 75, (3, 87)), (180, 90, (10, 90))),
-    "corner": (("floor", "wall0", "wall1"), (225, 45, (3, 87)), (225, 90, (10, 90))),
-    "open_box": (("floor", "wall0", "wall1", "wall2"), (270, 30, (3, 87)), (270, 75, (15, 90))),
-}
-"""Parts, and azimuth, half width and elevations in degrees of where cameras and lights are."""
-
 
 def test_the_settings_of_a_frozen_set_stay_what_they_are() -> None:
     assert {name: preset_settings(name).digest for name in FROZEN} == FROZEN
     assert set(FROZEN) == {*PRESETS_FOR_JUDGING, *RENDERFORMER_PRESETS}
 
 
-def test_the_layouts_of_a_frozen_set_stay_what_they_are() -> None:
-    used = {family.template for name in FROZEN for family in preset_settings(name).scenes.families}
-    assert used == set(LAYOUTS)
-    for name, (parts, *sectors) in LAYOUTS.items():
-        template = TEMPLATES[name]
-        found = [dataclasses.astuple(sector) for sector in (template.cameras, template.lights)]
-        assert (template.parts, found) == (parts, sectors), name
-    assert [(name, side.axis, side.sign) for name, side in SIDES.items()] == [
-        ("floor", 2, -1),
-        ("wall0", 1, 1),
-        ("wall1", 0, 1),
-        ("wall2", 0, -1),
-    ]
-    assert (QUADS, len(PATCH_FACES)) == (8, 128)
-    assert PATCH_FACES[:3].tolist() == [[0, 9, 10], [0, 10, 1], [1, 10, 11]]
+def test_tries_of_a_frozen_set_stay_as_many() -> None:
+    """They are seldom used up, so that the layouts below may not show it."""
     assert (placement.ARRANGEMENT_TRIES, placement.PLACE_TRIES) == (100, 16)
-    assert emitters.TRIANGLE.tolist() == [
-        [-0.025, 0.025, 0.025],
-        [0.025, -0.025, 0.025],
-        [0.025, 0.025, -0.025],
-    ]
-    assert (
-        emitters.SPACING_RADIUS**2,
-        emitters.SPACING_TRIES,
-        emitters.PALEST,
-    ) == (
-        pytest.approx(0.75),
-        256,
-        0.2,
-    )
+    assert (emitters.SPACING_TRIES, emitters.PALEST) == (256, 0.2)
 
 
 DRAWN = {

@@ -21,6 +21,7 @@ from pipeline.exchange.from_description import (
 from pipeline.exchange.renderformer_json import read_renderformer_json
 from pipeline.exchange.scene_files import build_scene
 from storage.records.scene import Scene
+from trilight.compose import mesh_of_arrays
 
 EXAMPLES = {
     "cbox": 4 * 128 + 2 * 2560 + 1,
@@ -141,16 +142,7 @@ def described(*path: str | int, **change: Any) -> SceneDescription:
 
 
 def loaded(mesh: trimesh.Trimesh, uid: str = "box.obj") -> LoadedMesh:
-    points = np.asarray(mesh.vertices)
-    centre = points.mean(axis=0)
-    return LoadedMesh(
-        uid=uid,
-        licence="MIT",
-        positions=points,
-        faces=np.asarray(mesh.faces),
-        centre=centre,
-        reach=float(np.linalg.norm(points - centre, axis=1).max()),
-    )
+    return mesh_of_arrays(mesh.vertices, mesh.faces, uid=uid, licence="MIT")
 
 
 def built(

@@ -194,21 +194,6 @@ def test_an_objects_texture_turns_with_it() -> None:
     assert np.abs(found[0] - found[1]).max() < 1e-5
 
 
-def test_an_objects_texture_is_never_mirrored_and_hardly_stretched() -> None:
-    scene = _scene(apply_overrides(TEXTURED, {"textures.share": 1.0}), 1)
-    assert scene.uv is not None and scene.material_textures is not None
-    row = next(row for row, entry in enumerate(scene.objects) if entry.kind == "object")
-    mine = scene.object_index == row
-    corners = scene.vertex_positions[scene.faces[mine]].astype(np.float64)
-    uv = scene.uv.reshape(-1, 3, 2)[mine].astype(np.float64)
-    edges, steps = corners[:, 1:] - corners[:, :1], uv[:, 1:] - uv[:, :1]
-    on_surface = np.linalg.norm(np.cross(edges[:, 0], edges[:, 1]), axis=1)
-    on_texture = steps[:, 0, 0] * steps[:, 1, 1] - steps[:, 0, 1] * steps[:, 1, 0]
-    ratio = on_texture / on_surface
-    # A projection shrinks areas by the cosine to the nearest of six directions: at least 1/sqrt(3).
-    assert (ratio > 0).all() and ratio.max() / ratio.min() < np.sqrt(3) * 1.01
-
-
 ROUNDING = 1e-6
 """Positions below 1 are float32, good to 6e-8; areas and distances are a few sums of them."""
 

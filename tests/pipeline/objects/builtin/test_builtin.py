@@ -1,15 +1,14 @@
-"""Laws of all built-in families, the digests of their first objects, and volumes known on paper."""
+"""Laws of all built-in families, and the digests of their first objects."""
 
 import itertools
-from functools import cache, partial
+from functools import cache
 from types import SimpleNamespace
 
 import numpy as np
 import pytest
 
-from pipeline.objects.builtin import lattice, shell
+from pipeline.objects.builtin import lattice
 from pipeline.objects.builtin.solids import Mesh
-from pipeline.objects.builtin.superquadric import superquadric
 from pipeline.objects.builtin.torus_knot import torus_knot
 from pipeline.objects.generated import FAMILIES
 from storage.digests import sha256_hex
@@ -125,43 +124,9 @@ def _require_no_floating_part(parts: list[Mesh]) -> None:
     assert len(reached) == len(boxes)
 
 
-@for_each(
-    "exponent, share, tolerance",
-    [
-        # Shares of the box: pi / 6, 1 / 6 and 1; inscribed polyhedra of 64 x 64 miss about 0.3 %,
-        # and an exponent of 0.01 is a box but for 2 % of its edges.
-        (1.0, np.pi / 6, 0.004),
-        (2.0, 1 / 6, 0.004),
-        (0.01, 1.0, 0.02),
-    ],
-)
-def test_superquadrics_have_known_volumes(exponent: float, share: float, tolerance: float) -> None:
-    mesh = superquadric(
-        exponent_profile=exponent,
-        exponent_plan=exponent,
-        half_sizes=(1.0, 0.8, 0.5),
-        rings=63,
-        columns=64,
-    )
-    expected = share * 2.0 * 1.6 * 1.0
-    assert volume(mesh) == pytest.approx(expected, rel=tolerance)
-
-
-_ring = partial(torus_knot, minor_radius=0.4, fill=0.95)
-
-
-def test_the_unknot_is_a_torus_of_known_volume() -> None:
-    positions, faces = _ring(windings=(1, 0), segments=256, sides=48)
-    tube = (np.ptp(positions[:, 2])) / 2
-    centre = 1.4
-    # Pappus: area of the section times the way of its centre; 48-gons miss 0.3 %.
-    expected = np.pi * tube**2 * 2 * np.pi * centre
-    assert volume((positions, faces)) == pytest.approx(expected, rel=0.005)
-
-
 @for_each("windings", [(2, 3), (3, 2), (2, 5), (3, 4), (1, 5), (4, 3), (5, 2)])
 def test_strands_of_a_knot_do_not_meet(windings: tuple[int, int]) -> None:
-    positions, _ = _ring(windings=windings, segments=240, sides=8)
+    positions, _ = torus_knot(windings=windings, minor_radius=0.4, fill=0.95, segments=240, sides=8)
     rings = positions.reshape(240, 8, 3)
     centre = rings.mean(axis=1)
     tube = np.linalg.norm(rings - centre[:, None], axis=2).max()
@@ -171,22 +136,6 @@ def test_strands_of_a_knot_do_not_meet(windings: tuple[int, int]) -> None:
     step = np.linalg.norm(centre - np.roll(centre, 1, axis=0), axis=1).min()
     far_along = apart * step > np.pi * tube
     assert distance[far_along].min() > 2 * tube * 0.99
-
-
-def test_a_shell_is_a_larger_copy_of_itself_some_rings_before(
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:
-    shape = SimpleNamespace(
-        turns=3.0, growth=2.0, drop=1.0, tube=0.6, stretch=1.2, ribs=0, rib_height=0.1, cords=4,
-        cord_height=0.1, spines=1.0, wall=0.1, lean_rad=0.0, rings_per_turn=20, columns=16,
-    )  # fmt: skip
-    monkeypatch.setattr(shell, "_Shell", lambda _: shape)
-    outer = shell.sample_shell(rng_for(0, "any"))[0][:-2].reshape(-1, 16, 3)[:60]
-    # 60 rings from the tip to the mouth are 59 steps of three turns.
-    turns = 20 * 3.0 / 59
-    cosine, sine = np.cos(2 * np.pi * turns), np.sin(2 * np.pi * turns)
-    turned = outer[:-20] @ np.array([[cosine, sine, 0], [-sine, cosine, 0], [0, 0, 1]])
-    np.testing.assert_allclose(turned * 2.0**turns, outer[20:], atol=1e-12)
 
 
 def _lattice(cells: tuple[int, int, int], **changes: object) -> Mesh:
@@ -217,31 +166,3 @@ def test_a_lattice_has_the_genus_of_its_graph(cells: tuple[int, int, int], split
     assert len(mesh[0]) - len(mesh[1]) // 2 == 2 * (crossings - bars)
     # Every side of every piece of a bar is a quad, and so is every side of a crossing without bar.
     assert len(mesh[1]) == 2 * (4 * bars * splits + 6 * crossings - 2 * bars)
-
-
-def test_a_lattice_has_the_volume_of_its_bars() -> None:
-    mesh = _lattice((2, 1, 3))
-    crossings, _ = _graph(2, 1, 3)
-    count = np.array([2, 1, 3])
-    step = 2 * np.array([1.0, 0.8, 0.6]) / (count + 0.25)
-    cube = np.prod(0.25 * step)
-    # A bar is three times as long as a crossing, along its axis.
-    expected = cube * (crossings + 3 * _graph(2, 1, 3)[1])
-    assert volume(mesh) == pytest.approx(expected, rel=1e-12)
-    np.testing.assert_allclose(np.ptp(mesh[0], axis=0), [2.0, 1.6, 1.2])
-
-
-def test_a_hollow_lattice_and_a_crate_have_nothing_inside() -> None:
-    full, hollow = _lattice((3, 3, 3)), _lattice((3, 3, 3), hollow=True)
-    # Inside are 8 crossings, 4 bars along each axis between them, and 24 that lead to them.
-    lost = (8 + 3 * (12 + 24)) * np.prod(0.25 * 2 * np.array([1.0, 0.8, 0.6]) / 3.25)
-    assert volume(full) - volume(hollow) == pytest.approx(lost, rel=1e-9)
-    crate = _lattice((3, 3, 3), hollow=True, crate=True)
-    assert is_closed(crate)
-    inside = (np.abs(crate[0][:, :2] / [1.0, 0.8]) < 0.7).all(axis=1)
-    assert inside.any() and crate[0][inside, 2].max() < -0.4
-    assert np.isclose(crate[0].max(axis=0), [1.0, 0.8, 0.6]).all()
-    # Its rim has no bars across, but all its crossings: two triangles for each cell looking up.
-    a, b, c = crate[0][crate[1]].transpose(1, 0, 2)
-    up = (np.cross(b - a, c - a)[:, 2] > 0) & (a[:, 2] > 0.59)
-    assert up.sum() == 2 * 4 * (3 + 3)

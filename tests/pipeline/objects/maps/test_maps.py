@@ -56,43 +56,30 @@ def _find(folder: Path, kind: str = TEXTURE, licence: str | None = None) -> Foun
     [
         tuple(row.split())
         for row in """
-            wood_floor_diff_4k                wood_floor_4k            base
             Bricks076_1K_Color                Bricks076_1K             base
             Bricks076_1K-JPG_NormalGL         Bricks076_1K-JPG         normal
-            a/oak-baseColor                   a/oak                    base
-            oak_Roughness                     oak                      roughness
             oak_nor_gl_2k                     oak_2k                   normal
             oak_arm_1k                        oak_1k                   orm
-            worn-planks-normal-ogl            worn-planks              normal
             WoodFloor_COL_VAR1_3K             WoodFloor_VAR1_3K        base
             WoodFloor_NRM16_3K                WoodFloor_3K             normal
             Plate_METALNESS_2K_METALNESS      Plate_2K_METALNESS       metallic
             Plate_COL_2K_METALNESS            Plate_2K_METALNESS       base
-            Wood_Base_Color                   Wood                     base
-            wood_base                         wood                     base
             Wood_Normal_(2)                   Wood_(2)                 normal
-            wood_color_v2                     wood_v2                  base
             wood_norm_tex                     wood_tex                 normal
-            wood_diffuse_map                  wood_map                 base
             WoodColor                         Wood                     base
             Wood_Normal_OpenGL                Wood                     normal
             Wood_Roughness_Raw_2k             Wood_2k                  roughness
             Wood_Mixed_AO                     Wood                     occlusion
-            wood_0045_color_4k                wood_0045_4k             base
-            vckndbi_4K_Albedo                 vckndbi_4K               base
             vckndbi_Preview                   vckndbi                  preview
             mat_metallicRoughness             mat                      orm
             mat_specularf0                    mat                      other
             tiles_color_2048x2048             tiles_2048x2048          base
             x_BaseColor.1001                  x.1001                   base
-            OakRoughness                      Oak                      roughness
             Holz_Höhe_2k                      Holz_2k                  height
-            HolzRauheit                       Holz                     roughness
             bois_rugosité                     bois                     roughness
             木_法线                           木                       normal
             oak_metalness                     oak                      metallic
             oak                               oak                      base
-            metal                             metal                    base
             color                             color                    base
             roughness/oak                     roughness/oak            roughness
         """.strip().split("\n")
