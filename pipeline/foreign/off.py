@@ -9,14 +9,7 @@ from numpy.typing import NDArray
 
 from pipeline.foreign.mesh import FileMesh, TriangleMesh, decode_colors
 from pipeline.foreign.polygons import cut_polygons
-from pipeline.foreign.text import (
-    PADDING,
-    TextLines,
-    list_some,
-    parse_numbers,
-    plain_text,
-    split_lines,
-)
+from pipeline.foreign.text import find_lines, list_some, parse_numbers, plain_text
 from storage.errors import Rejected
 
 _HEADER = re.compile(rb"\s*((?:ST|[CN4n])*)(?:OFF|off)(?![A-Za-z])(\s+BINARY)?|\s*(?=\d)")
@@ -34,9 +27,7 @@ def read_off(data: bytes) -> FileMesh:
         state = "is binary" if header else "does not begin with OFF or with its counts"
         raise Rejected("load_error", f"the OFF {state}; expected text. Save it as text")
     flags = header[1] or b""
-    lines = split_lines(text[header.end() :])
-    numbers = parse_numbers(lines.text, len(lines.words), np.float64)
-    rows = _find_rows(lines, numbers, flags)
+    rows, numbers = _find_rows(text[header.end() :], flags)
     points = numbers[rows.points[:, None] + np.arange(rows.dims)]
     if rows.dims == 4:
         points = points[:, :3] / points[:, 3:]
@@ -71,10 +62,10 @@ class _Rows:
     """Coordinates of a vertex: 3, or 4 with a divisor."""
 
 
-def _find_rows(lines: TextLines, numbers: NDArray[np.float64], flags: bytes) -> _Rows:
-    """Find the rows, one a line or separated by any white space."""
-    starts = lines.first[lines.counts > 0]
-    widths = lines.counts[lines.counts > 0]
+def _find_rows(text: bytes, flags: bytes) -> tuple[_Rows, NDArray[np.float64]]:
+    """Find the rows, one a line or separated by any white space; return the numbers, too."""
+    starts, widths = find_lines(text)
+    numbers = parse_numbers(text, int(widths.sum()), np.float64)
     before = int(b"n" in flags)  # the number of dimensions
     row = int(np.searchsorted(starts, before, side="right")) - 1
     stated = int(starts[row] + widths[row]) - before if len(starts) else 0
@@ -94,7 +85,7 @@ def _find_rows(lines: TextLines, numbers: NDArray[np.float64], flags: bytes) -> 
     if by_line and (widths[:num_points] >= dims).all():
         sizes = numbers[starts[num_points:]]
         more = widths[num_points:] - 1 - sizes
-        is_open = not lines.text.removesuffix(PADDING).rstrip(b" ").endswith(b"\n")
+        is_open = not text.rstrip(b" ").endswith(b"\n")
         if (more < 0).any() or (is_open and len(more) > 1 and more[-1] < more[-2]):
             raise _cut_off_error(num_faces, int((more >= 0).sum()))
     else:
@@ -104,7 +95,7 @@ def _find_rows(lines: TextLines, numbers: NDArray[np.float64], flags: bytes) -> 
         more = np.zeros(num_faces)
     if not ((sizes >= 0) & (sizes == np.floor(sizes))).all():
         raise Rejected("load_error", "a face of the OFF does not begin with its size")
-    return _Rows(
+    found = _Rows(
         points=starts[:num_points],
         widths=widths[:num_points],
         faces=starts[num_points:],
@@ -112,6 +103,7 @@ def _find_rows(lines: TextLines, numbers: NDArray[np.float64], flags: bytes) -> 
         more=more.astype(np.int64),
         dims=dims,
     )
+    return found, numbers
 
 
 def _count_numbers(flags: bytes) -> int:

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from pipeline.foreign.mesh import FileMesh, TriangleMesh, decode_colors
 from pipeline.foreign.polygons import CutPolygons, cut_polygons
-from pipeline.foreign.text import decode_name, list_some, parse_numbers, split_lines
+from pipeline.foreign.text import decode_name, find_words, list_some, parse_numbers
 from storage.errors import Rejected
 
 _TYPES = {
@@ -197,8 +197,8 @@ class _Body:
     def __init__(self, data: memoryview, order: Order | None) -> None:
         self._codes = np.frombuffer(data, np.uint8)
         if order is None:
-            count = len(split_lines(bytes(data)).words)
-            self._codes = parse_numbers(bytes(data), count, np.float64).view(np.uint8)
+            text = bytes(data)
+            self._codes = parse_numbers(text, len(find_words(text)), np.float64).view(np.uint8)
         self.size = len(self._codes)
         self._order = order
 
