@@ -61,7 +61,8 @@ def usd_textured_mesh(source: UsdSource, decode: Decode, *, emission: bool = Fal
     if len(looks.primvars) > MOST_UV_SETS:
         count = len(looks.primvars)
         raise Rejected("no_texture_coordinates", f"textures lie on {count} sets of them")
-    looks_of_meshes = [looks.assign(placed.number, placed.cut) for placed in source.meshes]
+    cuts = source.meshes
+    looks_of_meshes = [looks.assign(number, cut) for number, cut in cuts.items()]
     material = np.concatenate([rows for rows, _ in looks_of_meshes])
     tint = np.concatenate([tints for _, tints in looks_of_meshes])
     if (material == looks.plain).all() and (tint == _UNBOUND).all():
@@ -71,7 +72,7 @@ def usd_textured_mesh(source: UsdSource, decode: Decode, *, emission: bool = Fal
         mesh=source.mesh,
         material=material,
         materials=tuple(looks.materials),
-        uv=np.concatenate([placed.coordinates(sets, time) for placed in source.meshes]),
+        uv=np.concatenate([cut.read_coordinate_sets(sets, time) for cut in cuts.values()]),
         color=None if (tint == 1).all() else tint,
     )
 
