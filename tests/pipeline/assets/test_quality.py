@@ -183,7 +183,7 @@ def test_distances_count_both_ways_at_any_scale_as_in_the_slow_twin() -> None:
     assert p99(moved(mesh, 8), moved(other, 8)) == pytest.approx(error, rel=1e-12)
     mesh, other = sphere(rings=5, columns=8), knot(segments=12, sides=4)
     fast = Surface(mesh, FEWER[:40]).hausdorff_deviation(other).to_other
-    points = sample_surface(mesh, FEWER[:40]).positions
+    points = sample_surface(mesh, FEWER[:40])[0]
     slow = np.array([slow_distance(point, other) for point in points]) / mesh.diagonal
     assert (fast <= slow + 1e-12).all()
     # The twin's points are up to a sixtieth of an edge apart; edges are below half a diagonal.
@@ -194,12 +194,12 @@ def test_samples_fall_on_faces_by_area_and_fill_them_evenly() -> None:
     mesh = knot()
     shares = np.linalg.norm(mesh.double_area_vectors, axis=1)
     upper = mesh.corners[:, :, 2].mean(axis=1) > 0
-    points = sample_surface(mesh, FEWER).positions
+    points = sample_surface(mesh, FEWER)[0]
     expected = shares[upper].sum() / shares.sum()
     # Stratified by area: the share is exact to the faces that the plane cuts, about one in fifty.
     assert (points[:, 2] > 0).mean() == pytest.approx(expected, abs=0.02)
     triangle = TriangleMesh(positions=np.diag([1.0, 2.0, 3.0]), faces=np.array([[0, 1, 2]]))
-    weights = sample_surface(triangle, FEWER).positions / [1, 2, 3]
+    weights = sample_surface(triangle, FEWER)[0] / [1, 2, 3]
     # Barycentric coordinates of even points: mean 1/3, variance 1/18, covariance -1/36. Of 4000
     # points the mean is known to 0.004 and the variance to about 2 % (one sigma); 4 sigma allowed.
     np.testing.assert_allclose(weights.mean(axis=0), 1 / 3, atol=0.015)
