@@ -16,7 +16,7 @@ from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
 from pipeline.assets.cleaning.orient import orient_outward
-from pipeline.assets.quality.measure import Surface
+from pipeline.assets.quality.measure import Surface, level_mesh
 from pipeline.assets.recipe import RECIPE, methods_of
 from pipeline.assets.settings import AssetSettings, GateSettings
 from pipeline.foreign.mesh import TriangleMesh
@@ -38,7 +38,6 @@ from tests.pipeline.assets.meshes_by_hand import (
     geometry,
     gltf_tree,
     knot,
-    mesh_of,
     moved,
     prepare,
     sphere,
@@ -64,7 +63,7 @@ def test_every_budget_is_kept_and_used_and_the_error_holds_on_other_points(asset
     for level in asset.levels:
         # pymeshlab collapses edges, which take two faces each: it stops at most one short.
         assert level.record.budget - 1 <= len(level.faces)
-        deviation = surface.hausdorff_deviation(mesh_of(level))
+        deviation = surface.hausdorff_deviation(level_mesh(level))
         for way in (deviation.to_other, deviation.from_other):
             # The recorded percentile comes from 8192 points: its rank is known to 0.33 % (3 sigma).
             assert np.percentile(way, 98.6) <= level.record.quality.error_p99

@@ -14,6 +14,7 @@ from pxr import Gf, Usd, UsdGeom
 
 from pipeline.assets.cleaning.clean import clean, normalize
 from pipeline.assets.cleaning.orient import orient_outward
+from pipeline.assets.quality.measure import level_mesh
 from pipeline.assets.settings import AssetSettings, OwnMaterialSettings
 from pipeline.assets.source_materials.skin import add_skin, read_source_surface
 from pipeline.foreign.mesh import TriangleMesh
@@ -27,7 +28,6 @@ from tests.for_each import for_each
 from tests.pipeline.assets.meshes_by_hand import (
     geometry,
     gltf_tree,
-    mesh_of,
     prepare,
     sphere,
     write_glb,
@@ -313,7 +313,7 @@ def emission(path: Path) -> tuple[NDArray, TriangleMesh]:
     assert asset.materials is not None and "emission" not in asset.materials.lost
     level = asset.levels[0]
     assert level.skin is not None and level.skin.emission is not None
-    return level.skin.emission, mesh_of(level)
+    return level.skin.emission, level_mesh(level)
 
 
 @for_each("kind", GLOWING)
