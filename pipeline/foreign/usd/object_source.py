@@ -10,7 +10,7 @@ import dataclasses
 import hashlib
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
-from functools import cached_property
+from functools import cached_property, partial
 from pathlib import Path
 from typing import Any, TypeVar
 
@@ -77,21 +77,13 @@ class StageMaterials:
     """Contents of pictures by resolved path."""
 
 
-def read_stage_materials(
-    stage: UsdStage,
-    max_bytes: int,
-    read: ReadMaterial | None = None,
-    *,
-    normals: bool = False,
-) -> StageMaterials:
+def read_stage_materials(stage: UsdStage, max_bytes: int, read: ReadMaterial) -> StageMaterials:
     """Return the materials of the visible meshes of a stage.
 
     Args:
         stage: the open stage.
         max_bytes: maximum bytes of all pictures together.
-        read: function that reads a UsdShade.Material, None leaving it out; by default one that
-            refuses a material without a shader that is understood.
-        normals: whether that function reads normal maps, too.
+        read: function that reads a UsdShade.Material; None leaves it out.
 
     Raises:
         Rejected: texture_outside, materials_unreadable.
@@ -104,7 +96,7 @@ def read_stage_materials(
             return -1
         name = str(material.GetPath())
         if name not in rows:
-            stated = read(material) if read else _read_strictly(stage, material, normals=normals)
+            stated = read(material)
             rows[name] = -1 if stated is None else len(materials)
             materials.extend([] if stated is None else [_drop_ior_texture(stage, stated)])
         return rows[name]
@@ -128,6 +120,7 @@ def read_stage_materials(
 
 
 def _read_strictly(stage: UsdStage, material: Any, *, normals: bool) -> StatedMaterial:
+    """Return the inputs of a material; a shader that is not understood is refused."""
     stated = read_material(material, stage.time, stage.opened, normals=normals)
     if stated is None:
         name = str(material.GetPath())
@@ -221,12 +214,10 @@ class UsdSource:
         missing = Rejected("no_materials", "materials were not asked for")
         self._materials: StageMaterials | Rejected = missing
         if limits.with_materials:
+            read = partial(_read_strictly, self.stage, normals=limits.with_normal_maps)
             try:
                 self._materials = read_or_reject(
-                    path,
-                    lambda: read_stage_materials(
-                        self.stage, bytes_left, normals=limits.with_normal_maps
-                    ),
+                    path, lambda: read_stage_materials(self.stage, bytes_left, read)
                 )
             except Rejected as why:
                 self._materials = Rejected(why.reason, why.message)  # its traceback holds the stage

@@ -66,10 +66,9 @@ class BoundSkin:
 class BoundSkins:
     """All skins of a stage, by the path of their mesh."""
 
-    def __init__(self, time: Any) -> None:
+    def __init__(self) -> None:
         from pxr import UsdSkel
 
-        self._time = time
         self._cache = UsdSkel.Cache()
         self._bound: dict[Any, BoundSkin] = {}
         self._roots: set[Any] = set()
@@ -173,7 +172,7 @@ def placed_prims(
     placed: list[PlacedPrim] = []
     unread = Counter[str]()
     known: dict[Any, list[str]] = {}
-    skins = BoundSkins(time)
+    skins = BoundSkins()
     visits = 0
     above_zero = Within(0, FINITE.high, low_open=True)
     meters_per_unit = read_number(UsdGeom.GetStageMetersPerUnit(stage), "metersPerUnit", above_zero)
