@@ -27,7 +27,6 @@ from pipeline.foreign.material_files import (
     MaterialFiles,
     SourceFolder,
     find_in_any_case,
-    gltf_files,
 )
 from pipeline.foreign.numbers import Malformed, read_count
 from storage.errors import Rejected, TrilightError
@@ -236,12 +235,15 @@ def open_gltf(data: bytes, suffix: str, files: SourceFolder, limits: ReadLimits)
     for uri, path in named.items():
         buffers[uri] = files.read(path, bytes_left)
         bytes_left -= len(buffers[uri])
-    has_pictures = limits.with_materials and isinstance(tree.get("images"), list)
+    images = tree.get("images") if limits.with_materials else ()
+    images = images if isinstance(images, list) else ()
+    stated = [row.get("uri") for row in images if isinstance(row, dict)]
+    external = [uri for uri in stated if isinstance(uri, str) and not is_data_uri(uri)]
     return GltfDocument(
         tree=tree,
         binary=binary,
         buffers=buffers,
-        pictures=gltf_files(tree, files, bytes_left) if has_pictures else MaterialFiles(),
+        pictures=files.read_all(external, bytes_left, is_uri=True),
         unread=unread,
     )
 

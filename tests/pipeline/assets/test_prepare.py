@@ -12,8 +12,6 @@ from typing import Any
 
 import numpy as np
 import pytest
-from hypothesis import HealthCheck, given, settings
-from hypothesis import strategies as st
 
 from pipeline.assets.cleaning.orient import orient_outward
 from pipeline.assets.quality.measure import Surface, level_mesh
@@ -34,11 +32,9 @@ from tests.pipeline.assets.meshes_by_hand import (
     WRITERS,
     check_levels,
     cleaned,
-    flip_some,
     geometry,
     gltf_tree,
     knot,
-    moved,
     prepare,
     sphere,
     write_glb,
@@ -76,14 +72,6 @@ def test_a_source_within_budget_is_kept_once_as_it_is(tmp_path: Path) -> None:
     assert (first.record.method, len(first.faces)) == ("source", 624)
     # Points are interpolated and projected in double precision, on a surface of size 1.
     assert first.record.quality.error_max < 1e-14
-
-
-def test_flipped_faces_change_nothing(tmp_path: Path, asset: Asset) -> None:
-    """Every patch is turned outward first, so decimation sees the same mesh."""
-    flipped = flip_some(SMALL, 0.3, np.random.default_rng(5))
-    again = prepare(write_obj(tmp_path / "flipped.obj", flipped))
-    assert geometry(again) == geometry(asset)
-    assert again.geometry_sha256 == asset.geometry_sha256
 
 
 def test_formats_agree_and_buffers_beside_a_gltf_are_read_and_counted(tmp_path: Path) -> None:
@@ -156,33 +144,6 @@ def test_settings_without_meaning_are_refused() -> None:
         for values in wrong:
             with pytest.raises(TrilightError, match=next(iter(values))):
                 kind(**values)
-
-
-TWO_LEVELS = AssetSettings(budgets=(1000, 500))
-QUICK = settings(
-    max_examples=2,
-    deadline=None,
-    derandomize=True,
-    suppress_health_check=[HealthCheck.function_scoped_fixture],
-)
-
-
-@QUICK
-@given(
-    scale=st.floats(1e-6, 1e6),
-    offset=st.tuples(*[st.floats(-100, 100)] * 3),
-    method=st.sampled_from(["pymeshlab_collapse", "meshoptimizer"]),
-)
-def test_any_scale_and_place_give_the_same_bytes(
-    tmp_path: Path, scale: float, offset: tuple[float, float, float], method: str
-) -> None:
-    """Offsets are in extents: text keeps 17 digits, which leaves 1e-13 of the object here."""
-    source = knot(segments=60)
-    plain = prepare(write_obj(tmp_path / "a.obj", source), TWO_LEVELS, method)
-    elsewhere = moved(moved(source, 1.0, offset), scale)
-    again = prepare(write_obj(tmp_path / "b.obj", elsewhere), TWO_LEVELS, method)
-    assert geometry(again) == geometry(plain)
-    assert again.levels[0].record.quality == plain.levels[0].record.quality
 
 
 LICENCES = ("CC0-1.0", "LicenseRef-unknown", "LicenseRef-Stanford-3D-Scanning-Repository")
