@@ -112,22 +112,30 @@ class SourceFolder:
         Raises:
             Rejected: texture_outside or missing_file.
         """
-        parts = urlsplit(name) if is_uri else None
         plain = unquote(name) if is_uri else name.replace("\\", "/")
-        if "\x00" in plain or (parts and (parts.scheme or parts.netloc)):
+        stated = (plain, name, plain.replace("\\", "/")) if is_uri else (plain,)
+        if "\x00" in plain or (is_uri and _is_elsewhere(name)):
             raise Rejected("texture_outside", "it lies elsewhere, and is never fetched")
         is_outside = False
         extra_spellings = (f"{folder}/{plain}" for folder in extra_folders)
-        for spelling in (plain, *extra_spellings, *_list_spellings(plain)):
+        for spelling in (*stated, *extra_spellings, *_list_spellings(plain)):
             with contextlib.suppress(OSError):  # such as a name that is too long
                 target = find_in_any_case(self.folder, spelling, self._root)
                 is_inside = target.is_relative_to(self._root)
                 if is_inside and target.is_file():
                     return target
-                is_outside |= spelling == plain and not is_inside
+                is_outside |= spelling in stated and not is_inside
         if is_outside:
             raise Rejected("texture_outside", "it lies outside the folder of the objects")
         raise Rejected("missing_file", "there is no such file")
+
+
+def _is_elsewhere(uri: str) -> bool:
+    try:
+        parts = urlsplit(uri)
+    except ValueError:
+        return True
+    return bool(parts.scheme or parts.netloc)
 
 
 def _list_spellings(name: str) -> Iterator[str]:
