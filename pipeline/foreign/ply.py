@@ -225,17 +225,26 @@ def _read_rows(body: _Body, element: _Element, at: int) -> tuple[Columns, int]:
             f"the PLY header counts {element.rows} rows of {element.name[:24]!r}, which the file "
             "does not hold",
         )
-    lengths = _list_lengths(body, element, at)
+    lists = [(k, one.count) for k, one in enumerate(element.properties) if one.count is not None]
+    first = _walk_lists(body, element, at, min(element.rows, 1))
+    lengths = np.zeros((element.rows, len(lists)), np.int64) + first
     begins, end = _place_rows(body, element, at, lengths)
+    is_even = end <= body.size and all(
+        (body.take(begins[:, k], kind) == length).all()
+        for (k, kind), length in zip(lists, lengths.T, strict=True)
+    )
+    if not is_even:  # the lists differ in length, and the rows are walked
+        lengths = _walk_lists(body, element, at, element.rows)
+        begins, end = _place_rows(body, element, at, lengths)
     if end > body.size:
         raise Rejected("header_size_mismatch", f"the PLY ends within {element.name[:24]!r}")
     columns: dict[str, NDArray | _Lists] = {}
-    lists = iter(lengths.T)
+    stated = iter(lengths.T)
     for one, begin in zip(element.properties, begins.T, strict=True):
         if one.count is None:
             columns[one.name] = body.take(begin, one.kind)
             continue
-        count = next(lists)
+        count = next(stated)
         within = np.arange(int(count.sum())) - np.repeat(np.cumsum(count) - count, count)
         at_value = np.repeat(begin + body.width(one.count), count) + body.width(one.kind) * within
         columns[one.name] = _Lists(values=body.take(at_value, one.kind), counts=count)
@@ -253,22 +262,6 @@ def _place_rows(
         steps[:, column] = size if one.count is None else body.width(one.count) + size * next(lists)
     ends = at + np.cumsum(steps.ravel()).reshape(steps.shape)
     return ends - steps, int(ends[-1, -1]) if element.rows else at
-
-
-def _list_lengths(body: _Body, element: _Element, at: int) -> NDArray[np.int64]:
-    """Return the lengths [rows, L] of lists, without walking the rows where all are equal."""
-    lists = [k for k, one in enumerate(element.properties) if one.count is not None]
-    if not lists or not element.rows:
-        return np.zeros((element.rows, len(lists)), np.int64)
-    first = _walk_lists(body, element, at, 1)
-    lengths = np.broadcast_to(first, (element.rows, len(lists)))
-    begins, end = _place_rows(body, element, at, lengths)
-    if end <= body.size:
-        kinds = [element.properties[k].count for k in lists]
-        read = [body.take(begins[:, k], kind) for k, kind in zip(lists, kinds, strict=True) if kind]
-        if (np.stack(read, axis=1) == lengths).all():
-            return lengths
-    return _walk_lists(body, element, at, element.rows)
 
 
 def _walk_lists(body: _Body, element: _Element, at: int, rows: int) -> NDArray[np.int64]:
