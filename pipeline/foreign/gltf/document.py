@@ -236,9 +236,9 @@ def open_gltf(data: bytes, suffix: str, files: SourceFolder, limits: ReadLimits)
         unread = list_unread_parts(tree)
         uris = [row["uri"] for row in tree.get("buffers", ()) if "uri" in row]
         named = [uri for uri in uris if not is_data_uri(uri)]
-    beside = SourceFolder(files.folder, files.folder, files.read)
+    folder = SourceFolder(files.folder, files.folder, files.read)
     bytes_left = limits.max_bytes - len(data)
-    buffers = beside.read_all(named, bytes_left, is_uri=True)
+    buffers = folder.read_all(named, bytes_left, is_uri=True)
     for why in buffers.refused.values():
         raise Rejected(_REASONS.get(why.reason, why.reason), f"the buffer {why.message}")
     bytes_left -= sum(map(len, buffers.data.values()))
