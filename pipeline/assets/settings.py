@@ -7,7 +7,7 @@ import pydantic
 
 from pipeline.foreign.limits import ReadLimits
 from storage.errors import TrilightError
-from storage.settings.described import checked
+from storage.settings.described import checked, leaves_out
 from storage.settings.ranges import LowFirst, Within
 
 Profile = Literal["faithful", "uniform"]
@@ -76,16 +76,7 @@ class OwnMaterialSettings:
     """Fate of an object whose materials are missing, unreadable or too far off. `drawn`: it gets
     random materials, and its record holds the reason. `reject`: it is refused."""
 
-    @pydantic.model_serializer(mode="wrap")
-    def _record(self, as_usual: pydantic.SerializerFunctionWrapHandler) -> dict[str, Any]:
-        """Leave out later settings at their defaults: digests of earlier presets stay equal."""
-        record: dict[str, Any] = as_usual(self)
-        defaults = {"emission": False, "normal_maps": False, "transmission": "opaque"}
-        return {
-            name: value
-            for name, value in record.items()
-            if name not in defaults or value != defaults[name]
-        }
+    _record = leaves_out("emission", "normal_maps", "transmission")
 
 
 @checked()

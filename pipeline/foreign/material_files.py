@@ -12,7 +12,6 @@ import unicodedata
 from collections.abc import Callable, Iterable, Iterator, Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any
 from urllib.parse import unquote, urlsplit
 
 from pipeline.foreign.obj import list_libraries
@@ -113,22 +112,30 @@ class SourceFolder:
         Raises:
             Rejected: texture_outside or missing_file.
         """
-        parts = urlsplit(name) if is_uri else None
         plain = unquote(name) if is_uri else name.replace("\\", "/")
-        if "\x00" in plain or (parts and (parts.scheme or parts.netloc)):
+        stated = (plain, name, plain.replace("\\", "/")) if is_uri else (plain,)
+        if "\x00" in plain or (is_uri and _is_elsewhere(name)):
             raise Rejected("texture_outside", "it lies elsewhere, and is never fetched")
         is_outside = False
         extra_spellings = (f"{folder}/{plain}" for folder in extra_folders)
-        for spelling in (plain, *extra_spellings, *_list_spellings(plain)):
+        for spelling in (*stated, *extra_spellings, *_list_spellings(plain)):
             with contextlib.suppress(OSError):  # such as a name that is too long
                 target = find_in_any_case(self.folder, spelling, self._root)
                 is_inside = target.is_relative_to(self._root)
                 if is_inside and target.is_file():
                     return target
-                is_outside |= spelling == plain and not is_inside
+                is_outside |= spelling in stated and not is_inside
         if is_outside:
             raise Rejected("texture_outside", "it lies outside the folder of the objects")
         raise Rejected("missing_file", "there is no such file")
+
+
+def _is_elsewhere(uri: str) -> bool:
+    try:
+        parts = urlsplit(uri)
+    except ValueError:
+        return True
+    return bool(parts.scheme or parts.netloc)
 
 
 def _list_spellings(name: str) -> Iterator[str]:
@@ -167,14 +174,6 @@ def _fold_name(name: str) -> str:
     return unicodedata.normalize("NFC", name).casefold()
 
 
-def gltf_files(tree: Mapping[str, Any], folder: SourceFolder, bytes_left: int) -> MaterialFiles:
-    """Return the pictures that a glTF names, at most `bytes_left` together."""
-    images = tree.get("images", ())
-    uris = [entry.get("uri") for entry in images if isinstance(entry, dict)]
-    named = [uri for uri in uris if isinstance(uri, str) and not uri.startswith("data:")]
-    return folder.read_all(named, bytes_left, is_uri=True)
-
-
 def obj_files(
     data: bytes, folder: SourceFolder, bytes_left: int, *, normal_maps: bool = False
 ) -> MaterialFiles:
@@ -188,7 +187,8 @@ def obj_files(
         libraries = libraries.join(files)
     libraries = dataclasses.replace(libraries, libraries=(*libraries.data, *libraries.refused))
     keys = READ_MAPS | NORMAL_MAPS if normal_maps else READ_MAPS
-    named = [name for text in libraries.data.values() for name in list_pictures(text, keys)]
+    materials = [fields for text in libraries.data.values() for fields in read_mtl(text).values()]
+    named = [split_map(each[key])[1] for each in materials for key in each if key in keys]
     extra_folders = {name.replace("\\", "/").rpartition("/")[0] for name in libraries.data} - {""}
     return libraries.join(folder.read_all(named, bytes_left, extra_folders=sorted(extra_folders)))
 
@@ -218,9 +218,3 @@ def split_map(text: str) -> tuple[Mapping[str, list[str]], str]:
         options[name.lower()] = value.split()
         text = text[option.end() :]
     return options, unquote_name(text.strip())
-
-
-def list_pictures(data: bytes, keys: set[str]) -> Iterator[str]:
-    """Yield the files that the maps of a library name."""
-    for fields in read_mtl(data).values():
-        yield from (split_map(fields[key])[1] for key in fields if key in keys)

@@ -2,21 +2,13 @@
 
 import re
 from collections import Counter
-from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
 
 from pipeline.foreign.mesh import FileMesh, TriangleMesh, decode_colors
 from pipeline.foreign.polygons import cut_polygons
-from pipeline.foreign.text import (
-    PADDING,
-    TextLines,
-    list_some,
-    parse_numbers,
-    plain_text,
-    split_lines,
-)
+from pipeline.foreign.text import find_lines, list_some, parse_numbers, plain_text
 from storage.errors import Rejected
 
 _HEADER = re.compile(rb"\s*((?:ST|[CN4n])*)(?:OFF|off)(?![A-Za-z])(\s+BINARY)?|\s*(?=\d)")
@@ -34,113 +26,91 @@ def read_off(data: bytes) -> FileMesh:
         state = "is binary" if header else "does not begin with OFF or with its counts"
         raise Rejected("load_error", f"the OFF {state}; expected text. Save it as text")
     flags = header[1] or b""
-    lines = split_lines(text[header.end() :])
-    numbers = parse_numbers(lines.text, len(lines.words), np.float64)
-    rows = _find_rows(lines, numbers, flags)
-    points = numbers[rows.points[:, None] + np.arange(rows.dims)]
+    rows = _Rows(text[header.end() :], flags)
+    points = rows.take(rows.points, rows.dims)
     if rows.dims == 4:
         points = points[:, :3] / points[:, 3:]
     within = np.arange(int(rows.sizes.sum())) - np.repeat(
         np.cumsum(rows.sizes) - rows.sizes, rows.sizes
     )
-    indices = numbers[np.repeat(rows.faces + 1, rows.sizes) + within]
+    indices = rows.numbers[np.repeat(rows.faces + 1, rows.sizes) + within]
     if not (indices == np.floor(indices)).all():
         raise Rejected("load_error", "a face of the OFF names no whole number")
     unread = Counter[str]()
     cut = cut_polygons(points, rows.sizes, np.clip(indices, -1, 2**62).astype(np.int64), unread)
-    color = cut.spread_colors(*_read_colors(numbers, rows, flags, unread))
+    color = cut.spread_colors(*rows.read_colors(flags, unread))
     mesh = TriangleMesh(positions=points, faces=cut.vertices)
     return FileMesh(mesh=mesh, color=color, unread=list_some(unread))
 
 
-@dataclass(frozen=True, kw_only=True, eq=False)
 class _Rows:
-    """Positions of the rows of an OFF among its numbers."""
+    """The rows of an OFF, one a line or separated by any white space, by their numbers."""
 
-    points: NDArray[np.int64]
-    """[V] position of the first number of each vertex."""
-    widths: NDArray[np.int64]
-    """[V] count of numbers of each vertex."""
-    faces: NDArray[np.int64]
-    """[F] position of the number that states the size of each face."""
-    sizes: NDArray[np.int64]
-    """[F] count of corners of each face."""
-    more: NDArray[np.int64]
-    """[F] count of numbers after the corners of each face."""
-    dims: int
-    """Coordinates of a vertex: 3, or 4 with a divisor."""
+    def __init__(self, text: bytes, flags: bytes) -> None:
+        starts, widths = find_lines(text)
+        self.numbers = numbers = parse_numbers(text, int(widths.sum()), np.float64)
+        self.dims = dims = 3 + (b"4" in flags)
+        """Coordinates of a vertex: 3, or 4 with a divisor."""
+        self._width = width = (
+            dims + 3 * (b"N" in flags) + 4 * (b"C" in flags) + 2 * (b"ST" in flags)
+        )
+        before = int(b"n" in flags)  # the number of dimensions
+        row = int(np.searchsorted(starts, before, side="right")) - 1
+        stated = int(starts[row] + widths[row]) - before if len(starts) else 0
+        head = numbers[before : before + (2 if stated == 2 else 3)]
+        is_count = (head >= 0) & (head < 1e15) & (head == np.floor(head))
+        if len(head) < 2 or not is_count.all() or (before and numbers[0] != 3):
+            raise Rejected("load_error", f"the OFF has the counts {numbers[:4].tolist()}")
+        num_points = int(head[0])
+        num_faces = int(head[1])
+        if num_points + num_faces > len(numbers):
+            raise _cut_off_error(num_points + num_faces, len(widths) - 1)
+        rows = slice(row + 1, row + 1 + num_points + num_faces)
+        starts = starts[rows]
+        widths = widths[rows]
+        by_line = stated == len(head) and len(widths) == num_points + num_faces
+        if by_line and (widths[:num_points] >= dims).all():
+            sizes = numbers[starts[num_points:]]
+            more = widths[num_points:] - 1 - sizes
+            is_open = not text.rstrip(b" ").endswith(b"\n")
+            if (more < 0).any() or (is_open and len(more) > 1 and more[-1] < more[-2]):
+                raise _cut_off_error(num_faces, int((more >= 0).sum()))
+        else:
+            starts, sizes = _find_words(numbers, before + len(head), width, num_points, num_faces)
+            widths = np.full(num_points, width)
+            more = np.zeros(num_faces)
+        if not ((sizes >= 0) & (sizes == np.floor(sizes))).all():
+            raise Rejected("load_error", "a face of the OFF does not begin with its size")
+        self.points = starts[:num_points]
+        """[V] position of the first number of each vertex."""
+        self._widths = widths[:num_points]
+        self.faces = starts[num_points:]
+        """[F] position of the number that states the size of each face."""
+        self.sizes = sizes.astype(np.int64)
+        """[F] count of corners of each face."""
+        self._more = more.astype(np.int64)  # [F] count of numbers after the corners
 
+    def take(self, first: NDArray[np.int64], count: int) -> NDArray[np.float64]:
+        """Return `count` numbers [N, count] from each position [N] on."""
+        return self.numbers[first[:, None] + np.arange(count)]
 
-def _find_rows(lines: TextLines, numbers: NDArray[np.float64], flags: bytes) -> _Rows:
-    """Find the rows, one a line or separated by any white space."""
-    starts = lines.first[lines.counts > 0]
-    widths = lines.counts[lines.counts > 0]
-    before = int(b"n" in flags)  # the number of dimensions
-    row = int(np.searchsorted(starts, before, side="right")) - 1
-    stated = int(starts[row] + widths[row]) - before if len(starts) else 0
-    head = numbers[before : before + (2 if stated == 2 else 3)]
-    is_count = (head >= 0) & (head < 1e15) & (head == np.floor(head))
-    if len(head) < 2 or not is_count.all() or (before and numbers[0] != 3):
-        raise Rejected("load_error", f"the OFF has the counts {numbers[:4].tolist()}")
-    num_points = int(head[0])
-    num_faces = int(head[1])
-    if num_points + num_faces > len(numbers):
-        raise _cut_off_error(num_points + num_faces, len(widths) - 1)
-    rows = slice(row + 1, row + 1 + num_points + num_faces)
-    starts = starts[rows]
-    widths = widths[rows]
-    dims = 3 + (b"4" in flags)
-    by_line = stated == len(head) and len(widths) == num_points + num_faces
-    if by_line and (widths[:num_points] >= dims).all():
-        sizes = numbers[starts[num_points:]]
-        more = widths[num_points:] - 1 - sizes
-        is_open = not lines.text.removesuffix(PADDING).rstrip(b" ").endswith(b"\n")
-        if (more < 0).any() or (is_open and len(more) > 1 and more[-1] < more[-2]):
-            raise _cut_off_error(num_faces, int((more >= 0).sum()))
-    else:
-        width = _count_numbers(flags)
-        starts, sizes = _find_words(numbers, before + len(head), width, num_points, num_faces)
-        widths = np.full(num_points, width)
-        more = np.zeros(num_faces)
-    if not ((sizes >= 0) & (sizes == np.floor(sizes))).all():
-        raise Rejected("load_error", "a face of the OFF does not begin with its size")
-    return _Rows(
-        points=starts[:num_points],
-        widths=widths[:num_points],
-        faces=starts[num_points:],
-        sizes=sizes.astype(np.int64),
-        more=more.astype(np.int64),
-        dims=dims,
-    )
-
-
-def _count_numbers(flags: bytes) -> int:
-    """Return the count of numbers of a vertex as the header states it."""
-    normal = 3 * (b"N" in flags)
-    color = 4 * (b"C" in flags)
-    uv = 2 * (b"ST" in flags)
-    return 3 + (b"4" in flags) + normal + color + uv
-
-
-def _read_colors(
-    numbers: NDArray[np.float64], rows: _Rows, flags: bytes, unread: Counter[str]
-) -> tuple[NDArray[np.float64] | None, NDArray[np.float64] | None]:
-    """Return the linear colors of vertices [V, 3], or else of faces [F, 3]."""
-    num_unread = int(((rows.more > 0) & (rows.more != 3) & (rows.more != 4)).sum())
-    if num_unread:  # such as rows of a map of colors
-        unread["more numbers of faces"] = num_unread
-    if b"C" in flags and len(rows.widths) and (rows.widths >= _count_numbers(flags) - 1).all():
-        first = rows.points + rows.dims + 3 * (b"N" in flags)
-        return decode_colors(numbers[first[:, None] + np.arange(3)]), None
-    if num_unread := int((rows.widths != _count_numbers(flags)).sum()):
-        unread["more numbers of vertices"] = num_unread
-    has = (rows.more == 3) | (rows.more == 4)
-    if not has.any():
-        return None, None
-    by_face = np.ones((len(has), 3))
-    first = rows.faces[has] + 1 + rows.sizes[has]
-    by_face[has] = decode_colors(numbers[first[:, None] + np.arange(3)])
-    return None, by_face
+    def read_colors(
+        self, flags: bytes, unread: Counter[str]
+    ) -> tuple[NDArray[np.float64] | None, NDArray[np.float64] | None]:
+        """Return the linear colors of vertices [V, 3], or else of faces [F, 3]."""
+        has = (self._more == 3) | (self._more == 4)
+        if num_unread := int(((self._more > 0) & ~has).sum()):  # such as rows of a map of colors
+            unread["more numbers of faces"] = num_unread
+        if b"C" in flags and len(self._widths) and (self._widths >= self._width - 1).all():
+            first = self.points + self.dims + 3 * (b"N" in flags)
+            return decode_colors(self.take(first, 3)), None
+        if num_unread := int((self._widths != self._width).sum()):
+            unread["more numbers of vertices"] = num_unread
+        if not has.any():
+            return None, None
+        by_face = np.ones((len(has), 3))
+        by_face[has] = decode_colors(self.take(self.faces[has] + 1 + self.sizes[has], 3))
+        return None, by_face
 
 
 def _find_words(

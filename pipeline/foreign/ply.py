@@ -2,16 +2,16 @@
 
 import re
 from collections import Counter
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
-from typing import Literal
+from typing import Any, Literal
 
 import numpy as np
 from numpy.typing import NDArray
 
 from pipeline.foreign.mesh import FileMesh, TriangleMesh, decode_colors
 from pipeline.foreign.polygons import CutPolygons, cut_polygons
-from pipeline.foreign.text import decode_name, list_some, parse_numbers, split_lines
+from pipeline.foreign.text import decode_name, find_words, list_some, parse_numbers
 from storage.errors import Rejected
 
 _TYPES = {
@@ -73,35 +73,34 @@ def read_ply(data: bytes) -> FileMesh:
         Rejected: load_error, header_size_mismatch or index_range.
     """
     header = _read_header(data)
-    reader = _ColumnReader()
     elements, rest = _read_elements(data, header)
-    if rest:
-        reader.note("bytes after the last element")
+    notes = Counter({"bytes after the last element": 1} if rest else {})
     vertex = elements.get("vertex", {})
     face = elements.get("face", {})
-    coordinates = reader.take(vertex, "vertex", "x", "y", "z")
+    coordinates = _take(vertex, "x", "y", "z")
     if coordinates is None:
         raise Rejected("load_error", "the PLY has no vertices with x, y and z")
     points = np.stack(coordinates, axis=1).astype(np.float64)
-    polygons = _read_polygons(reader, face, "face")
-    strips = _cut_strips(_read_polygons(reader, elements.get("tristrips", {}), "tristrips"))
+    polygons = _read_polygons(face)
+    strips = _cut_strips(_read_polygons(elements.get("tristrips", {})))
     indices = np.concatenate([polygons.values.astype(np.int64), strips.ravel()])
     counts = np.concatenate([polygons.counts, np.full(len(strips), 3)])
-    cut = cut_polygons(points, counts, indices, reader.notes)
-    by_vertex = _read_colors(reader, vertex, "vertex")
-    by_face = _read_colors(reader, face, "face") if by_vertex is None else None
+    cut = cut_polygons(points, counts, indices, notes)
+    by_vertex = _read_colors(vertex, notes)
+    by_face = _read_colors(face, notes) if by_vertex is None else None
     if by_face is not None:
         by_face = np.concatenate([by_face, np.ones((len(strips), 3))])
-    number = reader.take(face, "face", "texnumber") or [np.zeros(len(polygons.counts))]
+    number = _take(face, "texnumber") or [np.zeros(len(polygons.counts))]
     rows = np.append(number[0].astype(np.int64), np.full(len(strips), -1))[cut.owner]
+    uv = _read_uv(vertex, face, polygons, cut)
     return FileMesh(
         mesh=TriangleMesh(positions=points, faces=cut.vertices),
         material=np.where((rows >= 0) & (rows < len(header.pictures)), rows, -1),
         material_names=tuple(header.pictures),
-        uv=_read_uv(reader, elements, polygons, cut),
+        uv=uv,
         color=cut.spread_colors(by_vertex, by_face),
         is_single=any(one.dtype == np.float32 for one in coordinates),
-        unread=reader.unread(elements),
+        unread=list_some(notes | Counter(_list_unread(elements))),
     )
 
 
@@ -173,7 +172,8 @@ def _read_property(words: Sequence[bytes]) -> _Property:
     )
 
 
-Columns = Mapping[str, NDArray | _Lists]
+Columns = dict[str, Any]
+"""Columns by name: arrays, or `_Lists`; readers remove what they read."""
 
 
 def _read_elements(data: bytes, header: _Header) -> tuple[dict[str, Columns], int]:
@@ -197,8 +197,8 @@ class _Body:
     def __init__(self, data: memoryview, order: Order | None) -> None:
         self._codes = np.frombuffer(data, np.uint8)
         if order is None:
-            count = len(split_lines(bytes(data)).words)
-            self._codes = parse_numbers(bytes(data), count, np.float64).view(np.uint8)
+            text = bytes(data)
+            self._codes = parse_numbers(text, len(find_words(text)), np.float64).view(np.uint8)
         self.size = len(self._codes)
         self._order = order
 
@@ -225,17 +225,26 @@ def _read_rows(body: _Body, element: _Element, at: int) -> tuple[Columns, int]:
             f"the PLY header counts {element.rows} rows of {element.name[:24]!r}, which the file "
             "does not hold",
         )
-    lengths = _list_lengths(body, element, at)
+    lists = [(k, one.count) for k, one in enumerate(element.properties) if one.count is not None]
+    first = _walk_lists(body, element, at, min(element.rows, 1))
+    lengths = np.zeros((element.rows, len(lists)), np.int64) + first
     begins, end = _place_rows(body, element, at, lengths)
+    is_even = end <= body.size and all(
+        (body.take(begins[:, k], kind) == length).all()
+        for (k, kind), length in zip(lists, lengths.T, strict=True)
+    )
+    if not is_even:  # the lists differ in length, and the rows are walked
+        lengths = _walk_lists(body, element, at, element.rows)
+        begins, end = _place_rows(body, element, at, lengths)
     if end > body.size:
         raise Rejected("header_size_mismatch", f"the PLY ends within {element.name[:24]!r}")
     columns: dict[str, NDArray | _Lists] = {}
-    lists = iter(lengths.T)
+    stated = iter(lengths.T)
     for one, begin in zip(element.properties, begins.T, strict=True):
         if one.count is None:
             columns[one.name] = body.take(begin, one.kind)
             continue
-        count = next(lists)
+        count = next(stated)
         within = np.arange(int(count.sum())) - np.repeat(np.cumsum(count) - count, count)
         at_value = np.repeat(begin + body.width(one.count), count) + body.width(one.kind) * within
         columns[one.name] = _Lists(values=body.take(at_value, one.kind), counts=count)
@@ -253,22 +262,6 @@ def _place_rows(
         steps[:, column] = size if one.count is None else body.width(one.count) + size * next(lists)
     ends = at + np.cumsum(steps.ravel()).reshape(steps.shape)
     return ends - steps, int(ends[-1, -1]) if element.rows else at
-
-
-def _list_lengths(body: _Body, element: _Element, at: int) -> NDArray[np.int64]:
-    """Return the lengths [rows, L] of lists, without walking the rows where all are equal."""
-    lists = [k for k, one in enumerate(element.properties) if one.count is not None]
-    if not lists or not element.rows:
-        return np.zeros((element.rows, len(lists)), np.int64)
-    first = _walk_lists(body, element, at, 1)
-    lengths = np.broadcast_to(first, (element.rows, len(lists)))
-    begins, end = _place_rows(body, element, at, lengths)
-    if end <= body.size:
-        kinds = [element.properties[k].count for k in lists]
-        read = [body.take(begins[:, k], kind) for k, kind in zip(lists, kinds, strict=True) if kind]
-        if (np.stack(read, axis=1) == lengths).all():
-            return lengths
-    return _walk_lists(body, element, at, element.rows)
 
 
 def _walk_lists(body: _Body, element: _Element, at: int, rows: int) -> NDArray[np.int64]:
@@ -294,51 +287,33 @@ def _walk_lists(body: _Body, element: _Element, at: int, rows: int) -> NDArray[n
     return lengths
 
 
-class _ColumnReader:
-    """Reads columns and records which were read."""
-
-    def __init__(self) -> None:
-        self._read: set[tuple[str, str]] = set()
-        self.notes = Counter[str]()
-
-    def note(self, text: str) -> None:
-        """Add a sentence to the notes."""
-        self.notes[text] = 1
-
-    def take(self, columns: Columns, element: str, *names: str) -> list[NDArray] | None:
-        """Return columns of single values by name; None where one is missing."""
-        values = [columns.get(name) for name in names]
-        if not all(isinstance(value, np.ndarray) for value in values):
-            return None
-        self._read.update((element, name) for name in names)
-        return [value for value in values if isinstance(value, np.ndarray)]
-
-    def take_lists(self, columns: Columns, element: str, *names: str) -> _Lists | None:
-        """Return the first list column among these names."""
-        for name in names:
-            if isinstance(values := columns.get(name), _Lists):
-                self._read.add((element, name))
-                return values
+def _take(columns: Columns, *names: str) -> list[NDArray] | None:
+    """Remove columns of single values from those that are unread; None where one is missing."""
+    if not all(isinstance(columns.get(name), np.ndarray) for name in names):
         return None
-
-    def unread(self, elements: Mapping[str, Columns]) -> tuple[str, ...]:
-        """Return sentences on elements and properties that were not read."""
-        for element, columns in elements.items():
-            if element not in ("vertex", "face", "tristrips"):
-                self.note(f"element {element[:24]!r}")
-                continue
-            for name in columns:
-                if (element, name) not in self._read and name not in _SILENT:
-                    self.note(f"property {name[:24]!r} of {element}")
-        return list_some(self.notes)
+    return [columns.pop(name) for name in names]
 
 
-def _read_polygons(reader: _ColumnReader, columns: Columns, element: str) -> _Lists:
+def _take_lists(columns: Columns, *names: str) -> _Lists | None:
+    """Remove the first list column among these names from those that are unread."""
+    name = next((name for name in names if isinstance(columns.get(name), _Lists)), None)
+    return None if name is None else columns.pop(name)
+
+
+def _list_unread(elements: Mapping[str, Columns]) -> Iterator[str]:
+    """Yield sentences on the elements and properties that are left."""
+    for element, columns in elements.items():
+        if element not in ("vertex", "face", "tristrips"):
+            yield f"element {element[:24]!r}"
+        else:
+            unread = (name for name in columns if name not in _SILENT)
+            yield from (f"property {name[:24]!r} of {element}" for name in unread)
+
+
+def _read_polygons(columns: Columns) -> _Lists:
     """Return the vertices of faces or strips."""
-    lists = reader.take_lists(columns, element, *_INDICES)
-    if lists is None and columns:
-        names = [name for name, values in columns.items() if isinstance(values, _Lists)]
-        lists = reader.take_lists(columns, element, *names) if len(names) == 1 else None
+    names = [name for name, values in columns.items() if isinstance(values, _Lists)]
+    lists = _take_lists(columns, *_INDICES, *(names if len(names) == 1 else ()))
     if lists is None:
         return _Lists(values=np.zeros(0, np.int64), counts=np.zeros(0, np.int64))
     return lists
@@ -358,27 +333,22 @@ def _cut_strips(strips: _Lists) -> NDArray[np.int64]:
     return np.stack([values[same + turned], values[same + 1 - turned], values[same + 2]], axis=1)
 
 
-def _read_colors(
-    reader: _ColumnReader, columns: Columns, element: str
-) -> NDArray[np.float64] | None:
+def _read_colors(columns: Columns, notes: Counter[str]) -> NDArray[np.float64] | None:
     """Return the linear colors [N, 3] of vertices or faces."""
     for names in _COLORS:
-        if (values := reader.take(columns, element, *names)) is not None:
-            alpha = reader.take(columns, element, "alpha") or reader.take(columns, element, "a")
+        if (values := _take(columns, *names)) is not None:
+            alpha = _take(columns, "alpha") or _take(columns, "a")
             if alpha is not None and (decode_colors(alpha[0]) < 1).any():
-                reader.note("transparency of colors")
+                notes["transparency of colors"] = 1
             return decode_colors(np.stack(values, axis=1))
     return None
 
 
 def _read_uv(
-    reader: _ColumnReader,
-    columns: Mapping[str, Columns],
-    polygons: _Lists,
-    cut: CutPolygons,
+    vertex: Columns, face: Columns, polygons: _Lists, cut: CutPolygons
 ) -> NDArray[np.float64] | None:
     """Return texture coordinates [T, 3, 2] of corners: of faces, or else of vertices."""
-    lists = reader.take_lists(columns.get("face", {}), "face", "texcoord")
+    lists = _take_lists(face, "texcoord")
     if lists is not None and len(lists.values):
         uv = np.full((max(int(cut.corners.max(initial=-1)) + 1, len(polygons.values)), 2), np.nan)
         has = lists.counts == 2 * polygons.counts
@@ -387,6 +357,6 @@ def _read_uv(
         uv[: len(polygons.values)][corner_mask] = lists.values[value_mask].reshape(-1, 2)
         return uv[cut.corners]
     for names in _UVS:
-        if (values := reader.take(columns.get("vertex", {}), "vertex", *names)) is not None:
+        if (values := _take(vertex, *names)) is not None:
             return np.stack(values, axis=1).astype(np.float64)[cut.vertices]
     return None

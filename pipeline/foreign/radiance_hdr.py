@@ -20,6 +20,8 @@ MAGIC = b"#?"
 """First bytes of a Radiance file."""
 
 _MOST_HEADER = 1 << 16
+_HEADER = re.compile(rb"#\?[^\n]*\n(?:(.*?)\n)??\r*\n([^\n]*?)\r*\n", re.DOTALL)
+"""The lines up to an empty one, and the line of the size."""
 _SIZE = re.compile(rb"([-+])([XY])\s+(\d{1,6})\s+([-+])([XY])\s+(\d{1,6})\s*")
 _VARIABLE = re.compile(rb"\s*([A-Z]+)\s*=\s*(.*?)\s*")
 _SHORTEST = 8
@@ -78,22 +80,25 @@ def read_radiance_hdr(data: bytes, max_pixels: int, *, is_color: bool) -> Linear
 
 
 def _read_header(data: bytes) -> _Header:
-    lines, line, start = _header_lines(data)
-    size = _SIZE.fullmatch(line)
+    header = _HEADER.match(data[:_MOST_HEADER])
+    if header is None:
+        raise Rejected("not_hdr", "it is cut off within its header")
+    size = _SIZE.fullmatch(header[2])
     if size is None or size[2] == size[5]:
-        raise Rejected("not_hdr", f"its size is {line[:40]!r}; expected one such as -Y 512 +X 1024")
+        stated = f"{header[2][:40]!r}"
+        raise Rejected("not_hdr", f"its size is {stated}; expected one such as -Y 512 +X 1024")
     factors = np.ones(3)
     primaries = _RADIANCE
     unread: dict[str, None] = {}
-    for name, value in _variables(lines):
+    for name, value in _variables((header[1] or b"").split(b"\n")):
         if name == "FORMAT":
             if value != "32-bit_rle_rgbe":
                 raise Rejected("not_hdr", f"its format is {value!r:.40}; expected 32-bit_rle_rgbe")
         elif name in ("EXPOSURE", "COLORCORR"):
             factors = factors * _parse_numbers(value, 1 if name == "EXPOSURE" else 3, name)
         elif name == "PRIMARIES":
-            stated = tuple(_parse_numbers(value, 8, name))
-            primaries = stated if any(stated) else primaries  # Photoshop states none as zeros
+            numbers = tuple(_parse_numbers(value, 8, name))
+            primaries = numbers if any(numbers) else primaries  # Photoshop states none as zeros
         elif name in ("PIXASPECT", "GAMMA") and (_parse_numbers(value, 1, name) == 1).all():
             continue
         elif name not in _SAYS_NOTHING:
@@ -106,26 +111,11 @@ def _read_header(data: bytes) -> _Header:
         columns=int(size[6]),
         is_column_major=size[2] == b"X",
         flips=(signs[b"Y"] == b"+", signs[b"X"] == b"-"),
-        start=start,
+        start=header.end(),
         factors=factors,
         primaries=primaries,
         unread=tuple(unread),
     )
-
-
-def _header_lines(data: bytes) -> tuple[list[bytes], bytes, int]:
-    """Return the header lines, the line of the size, and the offset of the pixels."""
-    if not data.startswith(MAGIC):
-        raise Rejected("not_hdr", "it does not begin as a Radiance picture (#?); write it again")
-    lines: list[bytes] = []
-    at = 0
-    while (end := data.find(b"\n", at, _MOST_HEADER)) >= 0:
-        line = data[at:end].rstrip(b"\r")
-        at = end + 1
-        if lines and not lines[-1]:
-            return lines[1:-1], line, at
-        lines.append(line)
-    raise Rejected("not_hdr", "it is cut off within its header")
 
 
 def _variables(lines: Sequence[bytes]) -> Iterator[tuple[str, str]]:

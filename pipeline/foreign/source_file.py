@@ -127,7 +127,10 @@ def read_source(path: Path, limits: ReadLimits, root: Path | None = None) -> Sou
         raise Rejected("unsupported_format", f"suffix {suffix!r}; expected one of {SUFFIXES}")
     data = _read_regular(path, limits.max_bytes)
     if needs_child(path):
-        return _usd_file(path, limits)
+        from pipeline.foreign.usd.object_source import UsdSource
+
+        usd = UsdSource(path, limits)
+        return SourceFile(kind=suffix[1:], data=b"", sha256=usd.sha256, usd=usd)
     _check_start(data, suffix, limits.max_faces)
     gltf: GltfDocument | None = None
     materials = MaterialFiles()
@@ -170,14 +173,6 @@ def _check_start(data: bytes, suffix: str, max_faces: int) -> None:
             raise Rejected("too_many_faces", f"{count} faces; expected <= {max_faces}")
     elif suffix == ".ply":
         check_face_count(data, max_faces)
-
-
-def _usd_file(path: Path, limits: ReadLimits) -> SourceFile:
-    from pipeline.foreign.usd.object_source import UsdSource
-
-    usd = UsdSource(path, limits)
-    kind = path.suffix.lower()[1:]
-    return SourceFile(kind=kind, data=b"", sha256=usd.sha256, usd=usd)
 
 
 def _read_regular(path: Path, max_bytes: int) -> bytes:

@@ -3,7 +3,6 @@
 import codecs
 import re
 import warnings
-from dataclasses import dataclass
 from typing import TypeVar
 
 import numpy as np
@@ -12,12 +11,9 @@ from numpy.typing import NDArray
 from storage.errors import Rejected
 
 _MARKS = {codecs.BOM_UTF16_LE: "utf-16", codecs.BOM_UTF16_BE: "utf-16", codecs.BOM_UTF8: ""}
-PADDING = b"\n\n\n"
-"""Suffix that `split_lines` appends, so that a look beyond a word stays within the text."""
 T = TypeVar("T", bound=np.generic)
 
-_SPACE = 32
-"""Bytes up to this value separate words."""
+_IS_WORD = np.array([not bytes([code]).isspace() for code in range(256)])
 _MOST_LISTED = 12
 
 
@@ -51,50 +47,19 @@ def join_continued(text: bytes) -> bytes:
     return re.sub(rb"\\[ \t]*\n", b" ", text)
 
 
-@dataclass(frozen=True, kw_only=True, eq=False)
-class TextLines:
-    """The lines and words of a text."""
-
-    text: bytes
-    """Bytes of the text, followed by `PADDING`."""
-    codes: NDArray[np.uint8]
-    """[N] the same bytes as an array."""
-    starts: NDArray[np.int64]
-    """[L] first byte of each line."""
-    words: NDArray[np.int64]
-    """[W] first byte of each word."""
-    first: NDArray[np.int64]
-    """[L] index in `words` of the first word of each line, or of the next line for an empty one."""
-    counts: NDArray[np.int64]
-    """[L] number of words of each line."""
-
-    def take_rows(self, rows: NDArray[np.int64], text: bytes) -> bytes:
-        """Return lines of `text`, which has the same line starts, joined."""
-        if not len(rows):
-            return b""
-        ends = np.append(self.starts[1:], len(self.text))
-        breaks = np.flatnonzero(np.diff(rows) != 1)
-        begin = self.starts[rows[np.append(0, breaks + 1)]].tolist()
-        end = ends[rows[np.append(breaks, len(rows) - 1)]].tolist()
-        return b"".join(text[low:high] for low, high in zip(begin, end, strict=True))
-
-    def line(self, row: int) -> bytes:
-        """Return one line without surrounding space."""
-        end = self.starts[row + 1] if row + 1 < len(self.starts) else len(self.text)
-        return self.text[self.starts[row] : end].strip()
+def find_words(text: bytes) -> NDArray[np.int64]:
+    """Return the position [W] of the first byte of each word."""
+    is_word = _IS_WORD[np.frombuffer(text, np.uint8)]
+    return np.flatnonzero(is_word & ~np.append(False, is_word[:-1]))
 
 
-def split_lines(text: bytes) -> TextLines:
-    """Find the lines and words of a text."""
-    text += PADDING
-    codes = np.frombuffer(text, np.uint8)
-    starts = np.append(0, np.flatnonzero(codes == ord("\n"))[:-1] + 1)
-    is_word = codes > _SPACE
-    is_word[1:] &= codes[:-1] <= _SPACE
-    words = np.flatnonzero(is_word)
-    first = np.searchsorted(words, starts)
+def find_lines(text: bytes) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
+    """Return the index of the first word, and the number of words, of each line with words."""
+    words = find_words(text)
+    breaks = np.flatnonzero(np.frombuffer(text, np.uint8) == ord("\n"))
+    first = np.searchsorted(words, np.append(0, breaks))
     counts = np.diff(np.append(first, len(words)))
-    return TextLines(text=text, codes=codes, starts=starts, words=words, first=first, counts=counts)
+    return first[counts > 0], counts[counts > 0]
 
 
 def parse_numbers(text: bytes, count: int, dtype: type[T]) -> NDArray[T]:

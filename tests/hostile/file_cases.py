@@ -14,7 +14,6 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from safetensors.numpy import load, save
 
 from pipeline.exchange.renderformer_h5 import write_renderformer_h5
 from pipeline.exchange.renderformer_json import describe_scene
@@ -23,7 +22,6 @@ from storage.records.scene_file import encode_scene
 from tests.scenes_by_hand import tiny_sample, tiny_scene
 
 Make = Callable[[Path], object]
-NAN, INF = float("nan"), float("inf")
 
 
 def _sparse(path: Path) -> None:
@@ -40,17 +38,6 @@ def _safetensors(change: Callable[[bytes], bytes]) -> Make:
     return lambda folder: (folder / "s.safetensors").write_bytes(change(encode_scene(tiny_scene())))
 
 
-def _arrays(change: Callable[[dict[str, Any]], Any]) -> Make:
-    def changed(data: bytes) -> bytes:
-        arrays = {name: values.copy() for name, values in load(data).items()}
-        length = int.from_bytes(data[:8], "little")
-        metadata = json.loads(data[8 : 8 + length])["__metadata__"]
-        change(arrays)
-        return save(arrays, metadata)
-
-    return _safetensors(changed)
-
-
 def _header(change: Callable[[dict[str, Any]], Any]) -> Make:
     def changed(data: bytes) -> bytes:
         length = int.from_bytes(data[:8], "little")
@@ -62,16 +49,8 @@ def _header(change: Callable[[dict[str, Any]], Any]) -> Make:
     return _safetensors(changed)
 
 
-def _put(name: str, value: float) -> Make:
-    return _arrays(lambda arrays: arrays[name].reshape(-1).__setitem__(0, value))
-
-
 def _claim(field: str, value: Any) -> Make:
     return _header(lambda header: header["faces"].update({field: value}))
-
-
-def _metadata(text: str) -> Make:
-    return _header(lambda header: header["__metadata__"].update(trilight_scene=text))
 
 
 def _cut(part: float) -> Make:
@@ -79,23 +58,12 @@ def _cut(part: float) -> Make:
 
 
 def safetensors_cases() -> Iterator[tuple[str, Make, str]]:
-    """Yield name, what writes `s.safetensors`, and what has to come of it."""
-    for name in ("vertex_positions", "vertex_normals", "materials", "c2w", "fov_deg"):
-        for value in (NAN, INF):
-            yield f"{name} {value}", _put(name, value), "refused"
-    for name in ("faces", "material_index", "object_index"):
-        yield f"{name} out of range", _put(name, 60_000), "refused"
-    yield "an array missing", _arrays(lambda a: a.pop("faces")), "refused"
-    yield "an array too many", _arrays(lambda a: a.update(x=np.zeros(3))), "refused"
-    of_doubles = _arrays(lambda a: a.update(faces=a["faces"].astype(np.float64)))
-    yield "another type", of_doubles, "refused"
+    """Yield name, what writes `s.safetensors`; values and metadata are those of test_scene.py."""
     for shape in ([2**62, 3], [-1, 3], [10**9, 3], "x", None, [3.5, 3], [[1], 3]):
         yield f"shape {shape}", _claim("shape", shape), "refused"
     for offsets in ([0, 2**60], [-5, 9], [9, 0], "x", [0]):
         yield f"offsets {offsets}", _claim("data_offsets", offsets), "refused"
     yield "no metadata", _header(lambda header: header.pop("__metadata__")), "refused"
-    for text in ("", "[]", "{}", "[" * 10**5, '{"schema_version": 99}', "\0"):
-        yield f"metadata {text[:20]!r}", _metadata(text), "refused"
     for kind, data in {
         "empty": b"", "8 bytes": b"\xff" * 8, "a header of 2^63": struct.pack("<Q", 2**63) + b"{}",
         "noise": bytes(range(256)) * 9, "a deep header": struct.pack("<Q", 10**6) + b"[" * 10**6,
@@ -144,7 +112,7 @@ def _changed(*where: Any, value: Any) -> Make:
         for key in where[:-1]:
             at = at[next(iter(at)) if key == "ANY" else key]
         at[where[-1]] = value
-        (folder / "s.json").write_text(json.dumps(scene).replace('"BIG"', "1e400"))
+        (folder / "s.json").write_text(json.dumps(scene))
 
     return make
 
@@ -158,7 +126,7 @@ def _mesh(spoil: Callable[[Path], object]) -> Make:
 
 
 def json_cases() -> Iterator[tuple[str, Make, str]]:
-    """Yield name, what writes `s.json`, and what has to come of it."""
+    """Yield name, what writes `s.json`, what comes of it; test_renderformer_json.py has more."""
     mesh = ("objects", "ANY", "mesh_path")
     values: tuple[Any, ...] = (
         "../outside/secret.obj", "/etc/passwd", "linked/secret.obj", "link.obj", "", ".", "..",
@@ -179,41 +147,17 @@ def json_cases() -> Iterator[tuple[str, Make, str]]:
     }
     for kind, spoil in kinds.items():
         yield f"mesh is {kind}", _mesh(spoil), "refused"
-    transform = ("objects", "ANY", "transform")
-    for field in ("translation", "rotation", "scale"):
-        for value in ([1e30] * 3, ["BIG"] * 3, [1, 2], "x", None, [[1, 2, 3]] * 3, [True] * 3):
-            shown = str(value)[:20]
-            yield f"{field} {shown}", _changed(*transform, field, value=value), "refused"
-    material = ("objects", "ANY", "material")
-    for field, values in {
-        "diffuse": (2, -1), "specular": (2, -1), "emissive": (1e10, -1),
-    }.items():  # fmt: skip
-        for number in values:
-            yield f"{field} {number}", _changed(*material, field, value=[number] * 3), "refused"
-    yield "diffuse and specular", _changed(*material, "specular", value=[0.9] * 3), "any"
-    yield "emission 1e9", _changed(*material, "emissive", value=[1e9] * 3), "any"
-    for fov in (0, 180, -1, 1e30, "x", None):
-        yield f"angle {fov}", _changed("cameras", 0, "fov", value=fov), "refused"
+    over = _changed("objects", "ANY", "material", "specular", value=[0.9] * 3)
+    yield "diffuse and specular", over, "any"
+    bright = _changed("objects", "ANY", "material", "emissive", value=[1e9] * 3)
+    yield "emission 1e9", bright, "any"
     same = _changed("cameras", 0, "position", value=[0, 0, 0])
     yield "a camera that looks at itself", same, "any"
     yield "no cameras", _changed("cameras", value=[]), "any"
-    yield "100000 cameras", _changed("cameras", value=[{}] * 100_000), "refused"
-    yield "no objects", _changed("objects", value={}), "refused"
-    yield (
-        "100000 objects",
-        _changed("objects", value={str(i): 0 for i in range(100_000)}),
-        "refused",
-    )
-    yield "another version", _changed("version", value="9"), "refused"
     yield "a field that is not known", _changed("script", value="rm -rf"), "read"
     remesh = _changed("objects", "ANY", "remesh_target_face_num", value=10**9)
     yield "remeshed to 10^9 faces", remesh, "refused"
-    for kind, data in {
-        "empty": b"", "a list": b"[]", "a number": b"1", "noise": bytes(range(256)),
-        "deep": b"[" * 10**6, "deep objects": b'{"a":' * 10**5, "cut": b'{"scene_name": "x"',
-        "a name twice": b'{"version": "1.0", "version": "1.0"}', "digits": b"9" * 10**6,
-        "half a letter": b'{"scene_name": "\xc3"}', "UTF-16": '{"a": 1}'.encode("utf-16"),
-    }.items():  # fmt: skip
+    for kind, data in {"noise": bytes(range(256)), "cut": b'{"scene_name": "x"'}.items():
         yield f"JSON is {kind}", _bytes("s.json", data), "refused"
     yield "JSON is a fifo", lambda folder: os.mkfifo(folder / "s.json"), "refused"
     yield "JSON is endless", lambda f: (f / "s.json").symlink_to("/dev/zero"), "refused"

@@ -103,30 +103,33 @@ def lay_out(folder: Path) -> Path:
     return inner
 
 
-def read(child: IsolatedChild, folder: Path, make: usd_cases.Make) -> tuple[str, Outcome]:
+def read(
+    child: IsolatedChild, folder: Path, make: usd_cases.Make, look: Callable[[str], Outcome]
+) -> tuple[str, Outcome]:
     """Return `read`, `refused` or `ended`, and what came of the file that is made."""
     inner = lay_out(folder)
     make(inner)
     (path,) = (
         inner / name for name in FILES if (inner / name).is_symlink() or (inner / name).exists()
     )
+    ended, found = "read", Outcome(said="", farthest=0.0, names="")
     try:
-        return "read", child.call(outcome, str(path))
-    except TrilightError as error:
-        return "refused", Outcome(said=str(error), farthest=0.0, names="")
+        found = child.call(look, str(path))
+    except (Rejected, TrilightError) as error:
+        ended, found = "refused", Outcome(said=str(error), farthest=0.0, names="")
     except ChildFailed as failure:
         assert failure.reason != "exception", failure.message
-        return "ended", Outcome(said=str(failure), farthest=0.0, names="")
+        ended, found = "ended", Outcome(said=str(failure), farthest=0.0, names="")
+    said = found.said.replace(str(folder / "outside"), "")  # which some of the files name
+    assert found.said.isprintable() and str(folder) not in said, (path, found)
+    return ended, found
 
 
 @pytest.mark.parametrize("form", CASES)
 def test_every_file_ends_well(tmp_path: Path, child: IsolatedChild, form: str) -> None:
     for folder, (name, make, expected) in with_folders(tmp_path, CASES[form]()):
-        kind, found = read(child, folder, make)
+        kind, found = read(child, folder, make, outcome)
         assert "LEAK" not in found.names and found.farthest != 778.0, name
-        outside = str(folder / "outside")  # which some of the files name themselves
-        said = found.said.replace(outside, "")
-        assert found.said.isprintable() and str(tmp_path) not in said, (name, found)
         assert kind in (("read", "refused") if expected == "any" else (expected,)), (name, found)
 
 
@@ -137,43 +140,25 @@ HARMLESS = ("place NaN", "intensity", "radius", "time codes", "place 1e300")
 """What is wrong with a lamp is nothing to an object."""
 
 
-def object_outcome(path: str) -> tuple[float, str]:
-    """Return the farthest coordinate of an object and all that a user would read."""
+def object_outcome(path: str) -> Outcome:
+    """Read an object with its materials; only children come here."""
     source = read_source(Path(path), SETTINGS.read_limits)
     farthest = float(np.abs(load_mesh(source).positions).max())
     attempt = prepare_asset(Path(path), SETTINGS, "meshoptimizer")
     materials = attempt.asset.materials
     assert materials is not None
-    return farthest, f"{materials.reason} {materials.message} {list(attempt.missed.values())}"
+    said = f"{materials.reason} {materials.message} {list(attempt.missed.values())}"
+    return Outcome(said=said, farthest=farthest, names="")
 
 
 @pytest.mark.slow("hostile")
 def test_every_object_ends_well(tmp_path: Path, child: IsolatedChild) -> None:
     """The cases are those of scenes; there a missing part is noted, here it refuses the object."""
     for folder, (name, make, expected) in with_folders(tmp_path, usd_cases.cases()):
-        _require_good_end(folder, child, name, make, expected)
-
-
-def _require_good_end(
-    folder: Path, child: IsolatedChild, name: str, make: usd_cases.Make, expected: str
-) -> None:
-    inner = lay_out(folder)
-    make(inner)
-    (path,) = (inner / each for each in FILES if (inner / each).exists())
-    farthest, ended = 0.0, "refused"
-    try:
-        farthest, said = child.call(object_outcome, str(path))
-        ended = "read"
-    except Rejected as why:
-        said = f"{why.reason} {why.message}"
-    except ChildFailed as failure:
-        assert failure.reason != "exception", failure.message
-        said, ended = failure.message, "ended"
-    outside = str(folder / "outside")  # which some of the files name themselves
-    assert said.isprintable() and str(folder) not in said.replace(outside, ""), (name, said)
-    assert farthest < 700, (name, said)
-    if name.startswith("texture ") and expected == "refused":
-        assert ended == "read" and said.startswith("texture_"), (name, said)
-    elif expected == "refused" and not any(word in name for word in HARMLESS):
-        assert ended == "refused", (name, said)
-    assert (ended == "ended") == (expected == "ended"), (name, said)
+        ended, found = read(child, folder, make, object_outcome)
+        assert found.farthest < 700, (name, found)
+        if name.startswith("texture ") and expected == "refused":
+            assert ended == "read" and found.said.startswith("texture_"), (name, found)
+        elif expected == "refused" and not any(word in name for word in HARMLESS):
+            assert ended == "refused", (name, found)
+        assert (ended == "ended") == (expected == "ended"), (name, found)

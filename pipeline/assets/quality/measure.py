@@ -105,16 +105,6 @@ def open_half_edges(mesh: TriangleMesh) -> NDArray[np.int64]:
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
-class SurfacePoints:
-    """Points spread evenly over a surface."""
-
-    positions: NDArray[np.float64]
-    """[N, 3] positions, in the units of the mesh."""
-    faces: NDArray[np.int64]
-    """[N] face of each point."""
-
-
-@dataclass(frozen=True, kw_only=True, eq=False)
 class Deviation:
     """Distances and angles between two surfaces, point by point."""
 
@@ -133,8 +123,12 @@ class Deviation:
         return max(float(np.percentile(distances, percentile)) for distances in both)
 
 
-def sample_surface(mesh: TriangleMesh, uniform: NDArray[np.float64]) -> SurfacePoints:
-    """Return N points spread evenly by area: one from each of N equal fractions of it.
+def sample_surface(
+    mesh: TriangleMesh, uniform: NDArray[np.float64]
+) -> tuple[NDArray[np.float64], NDArray[np.int64]]:
+    """Return N points [N, 3] spread evenly by area, and their faces [N].
+
+    There is one in each of N equal fractions of the area.
 
     Args:
         mesh: at least one face with area.
@@ -145,7 +139,7 @@ def sample_surface(mesh: TriangleMesh, uniform: NDArray[np.float64]) -> SurfaceP
     face = np.minimum(np.searchsorted(total, target, side="right"), len(total) - 1)
     root = np.sqrt(uniform[:, 1])
     weights = np.stack([1 - root, root * (1 - uniform[:, 2]), root * uniform[:, 2]], axis=1)
-    return SurfacePoints(positions=np.einsum("ij,ijk->ik", weights, mesh.corners[face]), faces=face)
+    return np.einsum("ij,ijk->ik", weights, mesh.corners[face]), face
 
 
 class Surface:
@@ -154,7 +148,7 @@ class Surface:
     def __init__(self, mesh: TriangleMesh, uniform: NDArray[np.float64]) -> None:
         """Sample `mesh`, and later each other surface, at `uniform` [N, 3]."""
         self.mesh = mesh
-        self.points = sample_surface(mesh, uniform)
+        self._points, self.point_faces = sample_surface(mesh, uniform)
         self._uniform = uniform
         self._normals = unit_normals(mesh)
         self._tree = igl.AABB()
@@ -162,13 +156,13 @@ class Surface:
 
     def hausdorff_deviation(self, other: TriangleMesh) -> Deviation:
         """Return the sampled Hausdorff distances to and from `other`, point by point."""
-        points = self.points.positions
+        points = self._points
         squared, nearest, _ = igl.point_mesh_squared_distance(points, other.positions, other.faces)
         cosine = np.einsum(
-            "ij,ij->i", self._normals[self.points.faces], unit_normals(other)[nearest]
+            "ij,ij->i", self._normals[self.point_faces], unit_normals(other)[nearest]
         )
         back = self._tree.squared_distance(
-            self.mesh.positions, self.mesh.faces, sample_surface(other, self._uniform).positions
+            self.mesh.positions, self.mesh.faces, sample_surface(other, self._uniform)[0]
         )[0]
         return Deviation(
             to_other=np.sqrt(squared) / self.mesh.diagonal,
@@ -185,7 +179,7 @@ class MeasuredSource:
         self.mesh = mesh
         self.surface = Surface(mesh, rng_for(0, "asset-error").random((_NUM_POINTS, 3)))
         component = label_components(mesh)
-        self._component = component[self.surface.points.faces]
+        self._component = component[self.surface.point_faces]
         extents = _diagonals(mesh, component) / mesh.diagonal
         self.num_components = len(extents)
         self._lost_beyond = np.maximum(_OWN_SIZE * extents, _VISIBLE)[self._component]
@@ -195,10 +189,6 @@ class MeasuredSource:
     def area_ratio(self, result: TriangleMesh) -> float:
         """Return the area of `result` as a multiple of the source's."""
         return _area(result) / self._area
-
-    def silhouette_iou(self, result: TriangleMesh) -> float:
-        """Return the intersection over union of the outlines, 0 to 1."""
-        return intersection_over_union(self._silhouette, silhouette(result))
 
     def _lost_area(self, distances: NDArray[np.float64]) -> float:
         """Return the fraction of the source's area in lost components.
@@ -216,7 +206,7 @@ class MeasuredSource:
 
     def source_quality(self) -> LevelQuality:
         """Return the measures of the unchanged source as a level: the error is exactly 0."""
-        none = np.zeros(len(self.surface.points.faces))
+        none = np.zeros(len(self.surface.point_faces))
         return self.quality(self.mesh, Deviation(to_other=none, from_other=none, angle_deg=none))
 
     def quality(self, result: TriangleMesh, deviation: Deviation | None = None) -> LevelQuality:
@@ -228,7 +218,9 @@ class MeasuredSource:
             error_max=round_digits(measured.two_way(100)),
             normal_error_deg=round_digits(measured.angle_deg.mean()),
             area_ratio=round_digits(self.area_ratio(result)),
-            silhouette_iou=round_digits(self.silhouette_iou(result)),
+            silhouette_iou=round_digits(
+                intersection_over_union(self._silhouette, silhouette(result))
+            ),
             lost_area=round_digits(self._lost_area(measured.to_other)),
             area_variation=round_digits(area_variation(result)),
             min_angle_p5_deg=round_digits(np.percentile(smallest_angles_deg(result), 5)),

@@ -7,7 +7,6 @@ lookup within it can read belongs to it alone. The other half holds another tria
 degrees. Triangles of one flat color share four texels.
 """
 
-from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -93,30 +92,15 @@ class Atlas:
 
 
 def pack_atlas(cells: NDArray[np.int64]) -> Atlas:
-    """Lay out tiles with the given cells a side [K], nearly square, in rows of squares."""
-    order = np.argsort(-cells, kind="stable")
-    squares, square_of, is_turned = _squares(cells, order)
-    area = sum(side * side for side in squares)
-    width = max([int(np.ceil(np.sqrt(area))), *squares[:1]])
-    corners, height = _rows(squares, width)
-    return Atlas(
-        width=width,
-        height=height,
-        corner=corners[square_of],
-        is_turned=is_turned,
-        cells=cells,
-    )
+    """Lay out tiles with the given cells a side [K], nearly square, in rows of squares.
 
-
-def _squares(
-    cells: NDArray[np.int64], order: NDArray[np.int64]
-) -> tuple[list[int], NDArray[np.int64], NDArray[np.bool_]]:
-    """Return the widths of squares, and the square and half of each tile."""
+    Squares come from the largest on; two tiles of equal size share one.
+    """
     squares: list[int] = []
     square_of = np.zeros(len(cells), np.int64)
     is_turned = np.zeros(len(cells), np.bool_)
     half_free = 0  # cells of the tile that would fit into the last square
-    for tile in order:
+    for tile in np.argsort(-cells, kind="stable"):
         count = int(cells[tile])
         if count and count == half_free:
             is_turned[tile] = True
@@ -125,11 +109,8 @@ def _squares(
             squares.append(count + _GUTTER if count else FLAT)
             half_free = count
         square_of[tile] = len(squares) - 1
-    return squares, square_of, is_turned
-
-
-def _rows(squares: Sequence[int], width: int) -> tuple[NDArray[np.int64], int]:
-    """Return the first texel of each square, in rows from the largest, and the height."""
+    area = sum(side * side for side in squares)
+    width = max([int(np.ceil(np.sqrt(area))), *squares[:1]])
     corners = np.zeros((len(squares), 2), np.int64)
     x = y = tallest = 0
     for number, side in enumerate(squares):
@@ -140,7 +121,13 @@ def _rows(squares: Sequence[int], width: int) -> tuple[NDArray[np.int64], int]:
         corners[number] = x, y
         x += side
         tallest = max(tallest, side)
-    return corners, y + tallest
+    return Atlas(
+        width=width,
+        height=y + tallest,
+        corner=corners[square_of],
+        is_turned=is_turned,
+        cells=cells,
+    )
 
 
 _INSET = 0.02

@@ -195,13 +195,11 @@ def _color_errors(
 ) -> NDArray[np.float64]:
     """Return the mean color difference [N] at points spread evenly over the source."""
     uniform = rng_for(0, "own-materials").random((_NUM_POINTS, 3))
-    points = sample_surface(source.mesh, uniform)
-    weights = barycentric(source.mesh.corners[points.faces], points.positions)
-    at = FacePoints(points.faces, weights)
+    points, point_faces = sample_surface(source.mesh, uniform)
+    weights = barycentric(source.mesh.corners[point_faces], points)
+    at = FacePoints(point_faces, weights)
     source_rgb = source.columns(at, 1 / baked.density)[:, DIFFUSE]
-    _, faces, nearest = igl.point_mesh_squared_distance(
-        points.positions, level.positions, level.faces
-    )
+    _, faces, nearest = igl.point_mesh_squared_distance(points, level.positions, level.faces)
     faces = np.asarray(faces, np.int64).ravel()
     uv = np.einsum("nc,ncd->nd", barycentric(level.corners[faces], nearest), baked.uv[faces])
     level_rgb = texture_values(baked.textures[0], uv)

@@ -6,9 +6,8 @@ import struct
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import dataclass, field
-from pathlib import Path
 from typing import Any
-from urllib.parse import unquote_to_bytes, urlsplit
+from urllib.parse import unquote_to_bytes
 
 import numpy as np
 from numpy.typing import NDArray
@@ -26,8 +25,6 @@ from pipeline.foreign.limits import ReadLimits
 from pipeline.foreign.material_files import (
     MaterialFiles,
     SourceFolder,
-    find_in_any_case,
-    gltf_files,
 )
 from pipeline.foreign.numbers import Malformed, read_count
 from storage.errors import Rejected, TrilightError
@@ -213,6 +210,14 @@ class GltfDocument:
         return memoryview(data)[start : start + length]
 
 
+_REASONS = {
+    "texture_outside": "external_uri",
+    "texture_missing": "missing_file",
+    "texture_too_large": "too_large_bytes",
+}
+"""Reasons of a buffer that is not read, by those of a picture."""
+
+
 def open_gltf(data: bytes, suffix: str, files: SourceFolder, limits: ReadLimits) -> GltfDocument:
     """Return a glTF with its buffers, and with its pictures where the limits include materials.
 
@@ -230,18 +235,22 @@ def open_gltf(data: bytes, suffix: str, files: SourceFolder, limits: ReadLimits)
         check_tree(tree, limits)
         unread = list_unread_parts(tree)
         uris = [row["uri"] for row in tree.get("buffers", ()) if "uri" in row]
-        named = {uri: local_path(uri, files.folder) for uri in uris if not is_data_uri(uri)}
-    buffers: dict[str, bytes] = {}
+        named = [uri for uri in uris if not is_data_uri(uri)]
+    folder = SourceFolder(files.folder, files.folder, files.read)
     bytes_left = limits.max_bytes - len(data)
-    for uri, path in named.items():
-        buffers[uri] = files.read(path, bytes_left)
-        bytes_left -= len(buffers[uri])
-    has_pictures = limits.with_materials and isinstance(tree.get("images"), list)
+    buffers = folder.read_all(named, bytes_left, is_uri=True)
+    for why in buffers.refused.values():
+        raise Rejected(_REASONS.get(why.reason, why.reason), f"the buffer {why.message}")
+    bytes_left -= sum(map(len, buffers.data.values()))
+    images = tree.get("images") if limits.with_materials else ()
+    images = images if isinstance(images, list) else ()
+    stated = [row.get("uri") for row in images if isinstance(row, dict)]
+    external = [uri for uri in stated if isinstance(uri, str) and not is_data_uri(uri)]
     return GltfDocument(
         tree=tree,
         binary=binary,
-        buffers=buffers,
-        pictures=gltf_files(tree, files, bytes_left) if has_pictures else MaterialFiles(),
+        buffers=buffers.data,
+        pictures=files.read_all(external, bytes_left, is_uri=True),
         unread=unread,
     )
 
@@ -353,29 +362,3 @@ def data_uri_bytes(uri: str) -> bytes:
 def is_data_uri(uri: str) -> bool:
     """Return whether a URI holds its data itself."""
     return uri[:5].lower() == "data:"
-
-
-def local_path(uri: str, folder: Path) -> Path:
-    """Return the file below a folder that a relative URI names, percent-encoded or not.
-
-    Raises:
-        Rejected: external_uri or missing_file.
-    """
-    root = folder.resolve()
-    try:
-        plain = unquote_to_bytes(uri).decode("utf-8", "replace")
-        parts = urlsplit(uri)
-    except ValueError:
-        plain = "\0"
-        parts = urlsplit("")
-    if "\0" in plain or parts.scheme or parts.netloc:
-        raise Rejected("external_uri", f"{uri[:80]!r} lies elsewhere, not in the file's folder")
-    targets = [(root / name).resolve() for name in (plain, uri, plain.replace("\\", "/"))]
-    if not all(target.is_relative_to(root) for target in targets):
-        raise Rejected("external_uri", f"{uri[:80]!r} lies outside of the file's folder")
-    if target := next((target for target in targets if target.is_file()), None):
-        return target
-    target = find_in_any_case(root, plain, root)
-    if target.is_relative_to(root) and target.is_file():
-        return target
-    raise Rejected("missing_file", f"the buffer {uri[:80]!r} is not beside the file")

@@ -6,6 +6,7 @@ defines, and metadata of the picture are ignored.
 
 import dataclasses
 from collections.abc import Mapping
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -13,7 +14,6 @@ from numpy.typing import NDArray
 from pipeline.foreign.material import (
     MOST_UV_SETS,
     RGB,
-    WHITE,
     Slot,
     SourceMaterial,
     TexturedMesh,
@@ -32,6 +32,15 @@ from pipeline.foreign.usd.shaders import (
 from pipeline.foreign.usd.texture_nodes import TextureNode
 from storage.errors import Rejected
 
+_INPUTS = {
+    "diffuseColor": ("base_rgb", "base"),
+    "roughness": ("roughness", "roughness_map"),
+    "emissiveColor": ("emission_rgb", "emission"),
+    "metallic": ("metallic", "metallic_map"),
+    "specularColor": ("specular_rgb", "specular_colour"),
+}
+"""Names of the factor and of the picture of each input in `SourceMaterial`."""
+_COLORS = ("diffuseColor", "emissiveColor", "specularColor")
 _CHANNELS = {"rgb": 0, "r": 0, "g": 1, "b": 2, "a": 3}
 _STRIP = 256
 _MOST_VARIED = 4096
@@ -52,7 +61,8 @@ def usd_textured_mesh(source: UsdSource, decode: Decode, *, emission: bool = Fal
     if len(looks.primvars) > MOST_UV_SETS:
         count = len(looks.primvars)
         raise Rejected("no_texture_coordinates", f"textures lie on {count} sets of them")
-    looks_of_meshes = [looks.assign(placed.number, placed.cut) for placed in source.meshes]
+    cuts = source.meshes
+    looks_of_meshes = [looks.assign(number, cut) for number, cut in cuts.items()]
     material = np.concatenate([rows for rows, _ in looks_of_meshes])
     tint = np.concatenate([tints for _, tints in looks_of_meshes])
     if (material == looks.plain).all() and (tint == _UNBOUND).all():
@@ -62,7 +72,7 @@ def usd_textured_mesh(source: UsdSource, decode: Decode, *, emission: bool = Fal
         mesh=source.mesh,
         material=material,
         materials=tuple(looks.materials),
-        uv=np.concatenate([placed.coordinates(sets, time) for placed in source.meshes]),
+        uv=np.concatenate([cut.read_coordinate_sets(sets, time) for cut in cuts.values()]),
         color=None if (tint == 1).all() else tint,
     )
 
@@ -178,44 +188,41 @@ class MeshMaterials:
         return np.array(rows, np.int64)[index.reshape(-1)]
 
     def _convert(self, stated: StatedMaterial) -> SourceMaterial:
-        base = self._color_slot(stated, "diffuseColor")
-        is_tint = base is not None or "diffuseColor" in stated.primvars
-        roughness = self._slot(stated, "roughness")
-        lost = name_unsupported(stated)
         is_lit = any(_glow(stated, "emissiveColor" in stated.textures))
-        glows = is_lit or "emissiveColor" in stated.primvars
-        material = SourceMaterial(
-            base_rgb=WHITE if is_tint else _rgb(stated, "diffuseColor"),
-            base=base,
-            roughness=1.0 if roughness is not None else _first_channel(stated, "roughness"),
-            roughness_map=roughness,
-            lost=("emission", *lost) if glows else lost,
-        )
-        if self._emission and is_lit:
-            picture = self._color_slot(stated, "emissiveColor")
-            glow = _glow(stated, picture is not None)
-            material = dataclasses.replace(material, emission_rgb=glow, emission=picture)
+        lost = name_unsupported(stated)
+        if is_lit or "emissiveColor" in stated.primvars:
+            lost = ("emission", *lost)
+        names = ["diffuseColor", "roughness"]
+        names += ["emissiveColor"] if self._emission and is_lit else []
+        material = self._with_inputs(SourceMaterial(lost=lost), stated, *names)
         if "normal" in stated.textures:
             material = self._with_normal_map(material, stated.textures["normal"])
-        if stated.is_specular:
-            return self._specular(stated, material)
-        metallic = self._slot(stated, "metallic")
+        if not stated.is_specular:
+            f0 = float(reflect_head_on(stated.constants["ior"].astype(float))[0])
+            return dataclasses.replace(self._with_inputs(material, stated, "metallic"), f0=f0)
         return dataclasses.replace(
-            material,
-            metallic=1.0 if metallic is not None else _first_channel(stated, "metallic"),
-            metallic_map=metallic,
-            f0=float(reflect_head_on(stated.constants["ior"].astype(float))[0]),
-        )
-
-    def _specular(self, stated: StatedMaterial, common: SourceMaterial) -> SourceMaterial:
-        color = self._color_slot(stated, "specularColor")
-        return dataclasses.replace(
-            common,
+            self._with_inputs(material, stated, "specularColor"),
             f0=1.0,
-            specular_rgb=WHITE if color is not None else _rgb(stated, "specularColor"),
-            specular_colour=color,
             has_fresnel=stated.constants["ior"][0] != IOR_OF_CONSTANT_ALBEDOS,
         )
+
+    def _with_inputs(
+        self, material: SourceMaterial, stated: StatedMaterial, *names: str
+    ) -> SourceMaterial:
+        """Return a material with the factors and pictures of some inputs.
+
+        A picture has the factor 1, and so have diffuse primvars, which tint corners.
+        """
+        fields: dict[str, Any] = {}
+        for name in names:
+            factor, picture = _INPUTS[name]
+            slot = self._slot(stated, name)
+            is_tint = slot is not None or (name in stated.primvars and name == "diffuseColor")
+            value = np.ones(3) if is_tint else _read_constant(stated, name)
+            glow = name == "emissiveColor"
+            fields[factor] = _glow(stated, is_tint) if glow else _factor(name, value)
+            fields[picture] = slot
+        return dataclasses.replace(material, **fields)
 
     def _with_normal_map(self, material: SourceMaterial, node: TextureNode) -> SourceMaterial:
         """Return a material with its normal map.
@@ -236,15 +243,12 @@ class MeshMaterials:
         scale, bias = (values[:3].astype(float).tolist() for values in (node.scale, node.bias))
         return dataclasses.replace(material, normal_scale=tuple(scale), normal_bias=tuple(bias))
 
-    def _color_slot(self, stated: StatedMaterial, name: str) -> Slot | None:
-        """Return the slot of a color input; a single channel is copied to all three."""
-        node = stated.textures.get(name)
-        return self._slot(stated, name, is_grey=node is not None and node.output != "rgb")
-
-    def _slot(self, stated: StatedMaterial, name: str, *, is_grey: bool = False) -> Slot | None:
+    def _slot(self, stated: StatedMaterial, name: str) -> Slot | None:
+        """Return the slot of an input; the single channel of a color is copied to all three."""
         node = stated.textures.get(name)
         if node is None:
             return None
+        is_grey = name in _COLORS and node.output != "rgb"
         try:
             return self._read_slot(node, f"{stated.where}.{name}", is_grey=is_grey)
         except Rejected as why:
@@ -291,21 +295,12 @@ def _replace_values(
     material: SourceMaterial, values: Mapping[str, NDArray[np.float64]]
 ) -> SourceMaterial:
     """Return a material with some inputs replaced by values [3]."""
-
-    def number(name: str, old: float) -> float:
-        return float(values[name][0]) if name in values else old
-
-    specular = values.get("specularColor")
-    glow = values.get("emissiveColor")
-    f0 = float(reflect_head_on(values["ior"])[0]) if "ior" in values else material.f0
-    return dataclasses.replace(
-        material,
-        metallic=number("metallic", material.metallic),
-        roughness=number("roughness", material.roughness),
-        f0=f0,
-        specular_rgb=material.specular_rgb if specular is None else _drop_negative(specular),
-        emission_rgb=material.emission_rgb if glow is None else _drop_negative(glow),
-    )
+    fields: dict[str, Any] = {
+        _INPUTS[name][0]: _factor(name, value) for name, value in values.items() if name != "ior"
+    }
+    if "ior" in values:
+        fields["f0"] = float(reflect_head_on(values["ior"])[0])
+    return dataclasses.replace(material, **fields)
 
 
 def _scale_picture(
@@ -319,10 +314,6 @@ def _scale_picture(
     return Picture(values=values, is_srgb=False, wrap=picture.wrap)
 
 
-def _rgb(stated: StatedMaterial, name: str) -> RGB:
-    return _drop_negative(_read_constant(stated, name))
-
-
 def _read_constant(stated: StatedMaterial, name: str) -> NDArray[np.float32]:
     """Return the constant of an input, which is the fallback of a texture that is left out."""
     node = stated.textures.get(name)
@@ -330,22 +321,22 @@ def _read_constant(stated: StatedMaterial, name: str) -> NDArray[np.float32]:
     return stated.constants[name] if fallback is None else fallback
 
 
-def _drop_negative(values: NDArray) -> RGB:
-    red, green, blue = np.maximum(values, 0).tolist()
+def _factor(name: str, value: NDArray) -> float | RGB:
+    """Return a value [3] of an input as a factor of `SourceMaterial`: a number, or a color."""
+    if name not in _COLORS:
+        return float(value[0])
+    red, green, blue = np.maximum(value, 0).tolist()
     return red, green, blue
 
 
 def _glow(stated: StatedMaterial, has_picture: bool) -> RGB:
     """Return the emission, or the factor of its picture."""
     strength = _read_strength(stated)
-    colors = WHITE if has_picture else _rgb(stated, "emissiveColor")
-    red, green, blue = (strength * value for value in colors)
+    value = np.ones(3) if has_picture else _read_constant(stated, "emissiveColor")
+    red, green, blue = (strength * channel for channel in np.maximum(value, 0).tolist())
     return red, green, blue
 
 
 def _read_strength(stated: StatedMaterial) -> float:
-    return max(_first_channel(stated, "strength"), 0.0) if stated.has_strength else 1.0
-
-
-def _first_channel(stated: StatedMaterial, name: str) -> float:
-    return float(_read_constant(stated, name)[0])
+    has_strength = stated.has_strength
+    return max(float(_read_constant(stated, "strength")[0]), 0.0) if has_strength else 1.0

@@ -8,9 +8,9 @@ refused: a missing reference, surfaces other than polygons, bones without a pose
 
 import dataclasses
 import hashlib
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
-from functools import cached_property
+from functools import cached_property, partial
 from pathlib import Path
 from typing import Any, TypeVar
 
@@ -77,21 +77,13 @@ class StageMaterials:
     """Contents of pictures by resolved path."""
 
 
-def read_stage_materials(
-    stage: UsdStage,
-    max_bytes: int,
-    read: ReadMaterial | None = None,
-    *,
-    normals: bool = False,
-) -> StageMaterials:
+def read_stage_materials(stage: UsdStage, max_bytes: int, read: ReadMaterial) -> StageMaterials:
     """Return the materials of the visible meshes of a stage.
 
     Args:
         stage: the open stage.
         max_bytes: maximum bytes of all pictures together.
-        read: function that reads a UsdShade.Material, None leaving it out; by default one that
-            refuses a material without a shader that is understood.
-        normals: whether that function reads normal maps, too.
+        read: function that reads a UsdShade.Material; None leaves it out.
 
     Raises:
         Rejected: texture_outside, materials_unreadable.
@@ -104,7 +96,7 @@ def read_stage_materials(
             return -1
         name = str(material.GetPath())
         if name not in rows:
-            stated = read(material) if read else _read_strictly(stage, material, normals=normals)
+            stated = read(material)
             rows[name] = -1 if stated is None else len(materials)
             materials.extend([] if stated is None else [_drop_ior_texture(stage, stated)])
         return rows[name]
@@ -128,6 +120,7 @@ def read_stage_materials(
 
 
 def _read_strictly(stage: UsdStage, material: Any, *, normals: bool) -> StatedMaterial:
+    """Return the inputs of a material; a shader that is not understood is refused."""
     stated = read_material(material, stage.time, stage.opened, normals=normals)
     if stated is None:
         name = str(material.GetPath())
@@ -153,56 +146,36 @@ def name_unsupported(stated: StatedMaterial) -> tuple[str, ...]:
 def _read_pictures(nodes: Sequence[TextureNode], bytes_left: int) -> MaterialFiles:
     data: dict[str, bytes] = {}
     refused: dict[str, Rejected] = {}
+    distinct: dict[str, TextureNode] = {}
     for node in nodes:
-        path = node.resolved or node.named
-        if path in data or path in refused:
-            continue
+        distinct.setdefault(node.resolved or node.named, node)
+    for path, node in distinct.items():
+        name = node.named
         try:
             picture = None if node.resolved is None else asset_bytes(node.resolved, bytes_left)
         except TrilightError as error:
             refused[path] = Rejected("texture_too_large", f"{error!s:.200}")
             continue
-        if picture is None:
-            why = f"{node.named!r:.80} is not beside the object"
-            refused[path] = Rejected("texture_missing", why)
-            if "<UDIM>" in node.named:
-                why = f"{node.named!r:.80} has UDIM tiles, which are not read"
-                refused[path] = Rejected("texture_unreadable", why)
-        else:
+        if picture is not None:
             data[path] = picture
             bytes_left -= len(picture)
+        elif "<UDIM>" in name:
+            why = f"{name!r:.80} has UDIM tiles, which are not read"
+            refused[path] = Rejected("texture_unreadable", why)
+        else:
+            why = f"{name!r:.80} is not beside the object"
+            refused[path] = Rejected("texture_missing", why)
     return MaterialFiles(data=data, refused=refused)
 
 
-@dataclass(frozen=True, kw_only=True, eq=False)
-class PlacedMesh:
-    """The triangles of one mesh of a stage in world space."""
-
-    number: int
-    """Index of the mesh within the stage."""
-    points: NDArray[np.float64]
-    """[P, 3] in meters, +Z up."""
-    cut: CutMesh
-    """Triangles as rows of `points`."""
-
-    def coordinates(self, primvars: Sequence[str], time: object) -> NDArray[np.float64]:
-        """Return the values [T, S, 3, 2] of primvars at corners; NaN where there are none."""
-        uv = np.full((len(self.cut.corners), len(primvars), 3, 2), np.nan)
-        for row, name in enumerate(primvars):
-            values = self.cut.read_coordinates(name, time)
-            if values is not None:
-                uv[:, row] = values
-        return uv
-
-
-def place_meshes(stage: UsdStage, limits: ReadLimits) -> tuple[PlacedMesh, ...]:
-    """Return the meshes of a stage that have triangles.
+def cut_meshes(stage: UsdStage, limits: ReadLimits) -> Mapping[int, CutMesh]:
+    """Return the meshes of a stage that have triangles, by their index within it.
 
     Raises:
         Rejected: no_faces, too_many_faces, offset_precision.
         TrilightError: arrays of a mesh contradict each other, or are not finite.
     """
-    meshes: list[PlacedMesh] = []
+    meshes: dict[int, CutMesh] = {}
     faces_left = limits.max_faces
     farthest = 0.0
     for number, each in enumerate(stage.meshes):
@@ -211,21 +184,17 @@ def place_meshes(stage: UsdStage, limits: ReadLimits) -> tuple[PlacedMesh, ...]:
         if len(cut.corners):
             scale = np.linalg.norm(each.to_world[:3, :3], 2)
             farthest = max(farthest, float(scale * np.abs(cut.points).max()))
-            meshes.append(PlacedMesh(number=number, points=cut.world_points, cut=cut))
+            meshes[number] = cut
     if not meshes:
         raise Rejected("no_faces", "the stage shows no mesh with triangles")
-    _require_precision(meshes, farthest)
-    return tuple(meshes)
-
-
-def _require_precision(meshes: Sequence[PlacedMesh], farthest: float) -> None:
-    used = np.concatenate([p.points[p.cut.indices[p.cut.corners.ravel()]] for p in meshes])
-    extent = float(np.ptp(used, axis=0).max())
+    used = [cut.world_points[cut.indices[cut.corners.ravel()]] for cut in meshes.values()]
+    extent = float(np.ptp(np.concatenate(used), axis=0).max())
     if farthest > _MAX_OFFSET * extent > 0:
         raise Rejected(
             "offset_precision",
             f"points lie {farthest / extent:.3g} times the size of the object from their origin",
         )
+    return meshes
 
 
 class UsdSource:
@@ -242,14 +211,13 @@ class UsdSource:
         self._limits = limits
         self.stage = read_or_reject(path, lambda: _read_stage(path, limits))
         self._digest, bytes_left = _digest_files(self.stage.opened.files, limits.max_bytes)
-        self._materials: StageMaterials | Rejected | None = None
+        missing = Rejected("no_materials", "materials were not asked for")
+        self._materials: StageMaterials | Rejected = missing
         if limits.with_materials:
+            read = partial(_read_strictly, self.stage, normals=limits.with_normal_maps)
             try:
                 self._materials = read_or_reject(
-                    path,
-                    lambda: read_stage_materials(
-                        self.stage, bytes_left, normals=limits.with_normal_maps
-                    ),
+                    path, lambda: read_stage_materials(self.stage, bytes_left, read)
                 )
             except Rejected as why:
                 self._materials = Rejected(why.reason, why.message)  # its traceback holds the stage
@@ -270,17 +238,17 @@ class UsdSource:
         return self.stage.opened.notes
 
     @cached_property
-    def meshes(self) -> tuple[PlacedMesh, ...]:
-        """Return the meshes; raises Rejected as `place_meshes`, or load_error."""
-        return read_or_reject(self._path, lambda: place_meshes(self.stage, self._limits))
+    def meshes(self) -> Mapping[int, CutMesh]:
+        """Return the meshes; raises Rejected as `cut_meshes`, or load_error."""
+        return read_or_reject(self._path, lambda: cut_meshes(self.stage, self._limits))
 
     @cached_property
     def mesh(self) -> TriangleMesh:
         """Return all meshes as one, unwelded, in meters, +Z up; raises Rejected as `meshes`."""
         return join_meshes(
             [
-                TriangleMesh(positions=part.points, faces=part.cut.indices[part.cut.corners])
-                for part in self.meshes
+                TriangleMesh(positions=cut.world_points, faces=cut.indices[cut.corners])
+                for cut in self.meshes.values()
             ]
         )
 
@@ -288,8 +256,6 @@ class UsdSource:
         """Return the materials; raises Rejected as `read_stage_materials`, or no_materials."""
         if isinstance(self._materials, Rejected):
             raise self._materials
-        if self._materials is None:
-            raise Rejected("no_materials", "materials were not asked for")
         return self._materials
 
 

@@ -7,7 +7,7 @@ and blend shapes.
 
 import dataclasses
 from collections import Counter
-from collections.abc import Collection, Iterator
+from collections.abc import Collection, Iterator, Mapping
 from dataclasses import dataclass, field
 from typing import Any
 
@@ -63,57 +63,46 @@ class BoundSkin:
         return np.einsum("pi,ij->pj", np.array(points, np.float64), move[:3, :3]) + move[3, :3]
 
 
-class BoundSkins:
-    """All skins of a stage, by the path of their mesh."""
+def bind_skins(prim: Any, predicate: Any, cache: Any) -> dict[Any, BoundSkin]:
+    """Return the skins that a SkelRoot binds below it, by the paths of their meshes."""
+    from pxr import UsdSkel
 
-    def __init__(self, time: Any) -> None:
-        from pxr import UsdSkel
+    root = UsdSkel.Root(prim)
+    cache.Populate(root, predicate)
+    return {
+        target.GetPrim().GetPath(): BoundSkin(
+            bones=bound.GetSkeleton().GetPrim(),
+            skeleton=cache.GetSkelQuery(bound.GetSkeleton()),
+            binding=target,
+        )
+        for bound in cache.ComputeSkelBindings(root, predicate)
+        for target in bound.GetSkinningTargets()
+        if target.HasJointInfluences() or target.HasBlendShapes()
+    }
 
-        self._time = time
-        self._cache = UsdSkel.Cache()
-        self._bound: dict[Any, BoundSkin] = {}
-        self._roots: set[Any] = set()
 
-    def add_root(self, prim: Any, predicate: Any) -> None:
-        """Add the skins that a SkelRoot binds below it."""
-        from pxr import UsdSkel
+def find_skin(skins: Mapping[Any, BoundSkin], prim: Any) -> BoundSkin | None:
+    """Return the skin of a prim by its path, or None.
 
-        if prim.GetPath() in self._roots:
-            return
-        self._roots.add(prim.GetPath())
-        root = UsdSkel.Root(prim)
-        self._cache.Populate(root, predicate)
-        for bound in self._cache.ComputeSkelBindings(root, predicate):
-            skeleton = self._cache.GetSkelQuery(bound.GetSkeleton())
-            for target in bound.GetSkinningTargets():
-                if not (target.HasJointInfluences() or target.HasBlendShapes()):
-                    continue
-                path = target.GetPrim().GetPath()
-                bones = bound.GetSkeleton().GetPrim()
-                self._bound[path] = BoundSkin(bones=bones, skeleton=skeleton, binding=target)
-
-    def find(self, prim: Any) -> BoundSkin | None:
-        """Return the skin of a prim, or None.
-
-        Raises:
-            UnposedMesh: bones are bound to it in a way that UsdSkel does not support.
-        """
-        skin = self._bound.get(prim.GetPath())
-        stated = prim.GetRelationship(_ANIMATION)
-        is_posed = skin is not None and skin.binding.HasJointInfluences()
-        if not is_posed and prim.GetAttribute(_JOINTS).HasValue():
-            raise UnposedMesh(
-                f"{prim.GetPath()}: it has bones, and no skeleton and weights pose it. "
-                "Apply the skin before exporting."
-            )
-        names = {path.name for path in stated.GetForwardedTargets()} if skin and stated else set()
-        used = skin.skeleton.GetAnimQuery() if skin and skin.skeleton else None
-        if names - {used.GetPrim().GetName() if used else ""}:
-            raise UnposedMesh(
-                f"{prim.GetPath()}: its animation is bound to the mesh; UsdSkel poses by that of "
-                "the skeleton alone. Bind it there, or apply the skin before exporting."
-            )
-        return skin
+    Raises:
+        UnposedMesh: bones are bound to it in a way that UsdSkel does not support.
+    """
+    skin = skins.get(prim.GetPath())
+    stated = prim.GetRelationship(_ANIMATION)
+    is_posed = skin is not None and skin.binding.HasJointInfluences()
+    if not is_posed and prim.GetAttribute(_JOINTS).HasValue():
+        raise UnposedMesh(
+            f"{prim.GetPath()}: it has bones, and no skeleton and weights pose it. "
+            "Apply the skin before exporting."
+        )
+    names = {path.name for path in stated.GetForwardedTargets()} if skin and stated else set()
+    used = skin.skeleton.GetAnimQuery() if skin and skin.skeleton else None
+    if names - {used.GetPrim().GetName() if used else ""}:
+        raise UnposedMesh(
+            f"{prim.GetPath()}: its animation is bound to the mesh; UsdSkel poses by that of "
+            "the skeleton alone. Bind it there, or apply the skin before exporting."
+        )
+    return skin
 
 
 def _blend_shapes(skeleton: Any, binding: Any, prim: Any, points: Any, time: Any) -> None:
@@ -168,12 +157,13 @@ def placed_prims(
         TrilightError: more than MAX_PLACED prims with all instances, prims or prototypes that are
             nested more than MAX_NESTED deep, a transform that is not finite, or UnposedMesh.
     """
-    from pxr import UsdGeom
+    from pxr import UsdGeom, UsdSkel
 
     placed: list[PlacedPrim] = []
     unread = Counter[str]()
     known: dict[Any, list[str]] = {}
-    skins = BoundSkins(time)
+    skins: dict[Any, BoundSkin] = {}
+    skeletons = UsdSkel.Cache()
     visits = 0
     above_zero = Within(0, FINITE.high, low_open=True)
     meters_per_unit = read_number(UsdGeom.GetStageMetersPerUnit(stage), "metersPerUnit", above_zero)
@@ -187,13 +177,13 @@ def placed_prims(
         path = prim.GetPath()
         if path not in known:  # instances of one prototype have one path
             known[path] = list(list_unread(prim, time, kinds))
+            if kind == "SkelRoot":
+                skins |= bind_skins(prim, visit.predicate, skeletons)
         unread.update(known[path])
-        if kind == "SkelRoot":
-            skins.add_root(prim, visit.predicate)
         if kind in kinds:
             if not np.isfinite(to_world).all():
                 raise TrilightError(f"{prim.GetPath()}: its place is not finite.")
-            skin = skins.find(prim)
+            skin = find_skin(skins, prim)
             placed.append(
                 PlacedPrim(
                     prim=prim,

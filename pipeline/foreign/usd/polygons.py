@@ -1,7 +1,9 @@
 """A mesh or solid of a stage as triangles of its checked polygons."""
 
 import dataclasses
+from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import cached_property
 from typing import Any
 
 import numpy as np
@@ -38,7 +40,7 @@ class CutMesh:
         """Return the prim of the mesh."""
         return self.placed.prim
 
-    @property
+    @cached_property
     def world_points(self) -> NDArray[np.float64]:
         """Return the points [P, 3] in meters, +Z up."""
         to_world = self.placed.to_world
@@ -98,6 +100,15 @@ class CutMesh:
         if values is None or values.ndim != 3 or values.shape[2] < 2:
             return None
         return np.asarray(values[..., :2], np.float64)
+
+    def read_coordinate_sets(self, primvars: Sequence[str], time: Any) -> NDArray[np.float64]:
+        """Return the values [T, S, 3, 2] of primvars at corners; NaN where there are none."""
+        uv = np.full((len(self.corners), len(primvars), 3, 2), np.nan)
+        for row, name in enumerate(primvars):
+            values = self.read_coordinates(name, time)
+            if values is not None:
+                uv[:, row] = values
+        return uv
 
 
 def cut_mesh(placed: PlacedPrim, time: Any, max_faces: int | None = None) -> CutMesh:

@@ -11,12 +11,13 @@ from numpy.typing import ArrayLike, NDArray
 
 from pipeline.assets.cleaning.clean import clean, normalize
 from pipeline.assets.prepare import prepare_asset
+from pipeline.assets.quality.measure import level_mesh
 from pipeline.assets.settings import AssetSettings
 from pipeline.foreign.mesh import TriangleMesh, join_meshes
 from pipeline.objects.builtin.superquadric import superquadric
 from pipeline.objects.builtin.torus_knot import torus_knot
 from storage.errors import Rejected
-from storage.records.asset import Asset, Level
+from storage.records.asset import Asset
 from storage.records.objects import ObjectRecord
 from tests.pipeline.foreign.gltf.gltf_writer import GltfWriter
 
@@ -67,12 +68,6 @@ def with_vertex(mesh: TriangleMesh, place: ArrayLike, row: int = 3) -> TriangleM
     return TriangleMesh(positions=positions, faces=mesh.faces)
 
 
-def mesh_of(level: Level) -> TriangleMesh:
-    return TriangleMesh(
-        positions=level.positions.astype(np.float64), faces=level.faces.astype(np.int64)
-    )
-
-
 def check_levels(asset: Asset) -> None:
     """Assert the laws of levels, which hold whatever came in."""
     sizes = [len(level.faces) for level in asset.levels]
@@ -83,7 +78,7 @@ def check_levels(asset: Asset) -> None:
         assert np.isfinite(level.positions).all()
         assert np.abs(level.positions).max() <= 0.5 + 0.01 * np.sqrt(3)
         assert level.faces.max() < len(level.positions)
-        assert (np.linalg.norm(mesh_of(level).double_area_vectors, axis=1) > 0).all()
+        assert (np.linalg.norm(level_mesh(level).double_area_vectors, axis=1) > 0).all()
 
 
 def geometry(asset: Asset) -> bytes:

@@ -16,7 +16,7 @@ from pipeline.assets import watertight
 from pipeline.assets.cleaning.orient import orient_outward
 from pipeline.assets.decimation.decimate import decimate, safe_method, smallest_passing
 from pipeline.assets.decimation.pymeshlab_filters import REQUIRED_FILTERS, pymeshlab
-from pipeline.assets.quality.measure import Surface, require_watertight
+from pipeline.assets.quality.measure import Surface, level_mesh, require_watertight
 from pipeline.assets.recipe import methods_of, missing_filters
 from pipeline.assets.settings import AssetSettings, GateSettings
 from pipeline.foreign.mesh import TriangleMesh
@@ -34,7 +34,6 @@ from tests.pipeline.assets.meshes_by_hand import (
     grid,
     joined,
     knot,
-    mesh_of,
     moved,
     prepare,
     reason_of,
@@ -393,9 +392,9 @@ def test_levels_are_watertight_and_near_the_source(
     surface = Surface(orient_outward(cleaned(mesh))[0], np.random.default_rng(9).random((8192, 3)))
     for level in asset.levels:
         quality = level.record.quality
-        assert is_watertight(mesh_of(level)) and quality.open_edges == 0
+        assert is_watertight(level_mesh(level)) and quality.open_edges == 0
         assert len(level.faces) <= level.record.budget
-        other = surface.hausdorff_deviation(mesh_of(level)).two_way(98.6)
+        other = surface.hausdorff_deviation(level_mesh(level)).two_way(98.6)
         assert other <= quality.error_p99 + 1e-14
         assert quality.error_p99 <= WATERTIGHT.gate.max_error_p99
 

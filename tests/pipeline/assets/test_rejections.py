@@ -160,20 +160,6 @@ def test_bad_files(tmp_path: Path, name: str) -> None:
     assert reason_of(path) == reason
 
 
-@for_each("keep", [0.1, 0.5, 0.97])
-def test_files_that_were_cut_off(tmp_path: Path, keep: float) -> None:
-    for path in (
-        write_glb(tmp_path / "a.glb", *gltf_tree(BALL)),
-        write_stl(tmp_path / "a.stl", BALL),
-        write_ply(tmp_path / "a.ply", BALL),
-        write_off(tmp_path / "a.off", BALL),
-    ):
-        data = path.read_bytes()
-        path.write_bytes(data[: int(keep * len(data))])
-        expected = {"cut_off", "load_error", "header_size_mismatch", "index_range", "no_faces"}
-        assert reason_of(path) in expected
-
-
 @for_each("write", [write_stl, write_ply, write_off, write_obj])
 def test_limits_of_size(tmp_path: Path, write: Callable[[Path, TriangleMesh], Path]) -> None:
     path = write(tmp_path / f"a.{write.__name__[-3:]}", BALL)

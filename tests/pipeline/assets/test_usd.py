@@ -34,13 +34,11 @@ from tests.pipeline.assets.source_materials.textured_kit import (
     TEXTURE,
     Change,
     connect_texture,
-    coordinates,
     exported,
     material,
     new_stage,
     set_inputs,
     textured_usd,
-    transform_coordinates,
     usd_mesh,
 )
 
@@ -194,29 +192,6 @@ def made(
     return prepare(textured_usd(tmp_path / "a.usda", picture, change, **more), kit.KEEP)
 
 
-@for_each("suffix", ["usda", "usdc", "usd", "usdz"])
-def test_a_quad_keeps_its_corner_colours(tmp_path: Path, suffix: str) -> None:
-    """In every form of the file, in centimetres with Y up; and twice the same bytes."""
-    path = textured_usd(tmp_path / f"a.{suffix}", PICTURE, y_up=True, unit=0.01)
-    asset = prepare(path, kit.KEEP)
-    kit.assert_corners(asset)
-    assert geometry(prepare(path)) == geometry(asset)
-
-
-def test_a_quad_of_four_corners_and_a_place_of_its_own(tmp_path: Path) -> None:
-    """One polygon with coordinates of its corners, a quarter turn above it."""
-
-    def placed(stage: Usd.Stage) -> None:
-        mesh = UsdGeom.Mesh(stage.GetPrimAtPath(MESH))
-        mesh.GetFaceVertexCountsAttr().Set([4])
-        mesh.GetFaceVertexIndicesAttr().Set([0, 1, 2, 3])
-        coordinates(mesh, kit.UV_UP, "faceVarying")
-        UsdGeom.Xformable(stage.GetPrimAtPath("/W")).AddRotateYOp().Set(90)
-
-    # +y by 90 degrees: x to -z, and z to x
-    kit.assert_corners(made(tmp_path, placed), lambda right, up: (up, -right))
-
-
 def _skins(asset: Asset) -> list[NDArray]:
     assert asset.materials is not None and not asset.materials.reason, asset.materials
     skins = [level.skin for level in asset.levels if level.skin is not None]
@@ -304,15 +279,6 @@ def test_wrap_modes_beyond_the_picture(tmp_path: Path, wrap: str, wanted: ArrayL
     # an eighth into the second tile: a quarter of the picture
     seen = kit.seen_at(made(tmp_path, change, uv=kit.UV_UP * [2, 1] + [1, 0]), -0.375, -0.25)
     assert np.abs(seen - kit.shown(wanted)).max() < 2 * kit.SLOPE
-
-
-def test_a_transform_scales_turns_and_shifts_in_this_order(tmp_path: Path) -> None:
-    """A quarter turn counter-clockwise and a shift back: (s, t) reads (1 - t, s)."""
-
-    def move(stage: Usd.Stage) -> None:
-        transform_coordinates(stage, 90.0, (1, 1), (1, 0))
-
-    kit.assert_corners(made(tmp_path, move), lambda right, up: (up, -right))
 
 
 def test_subsets_display_colours_and_what_nothing_here_can_show(tmp_path: Path) -> None:

@@ -1,6 +1,7 @@
 """Meshes and their materials: as written in every dialect, and alike as object and as scene."""
 
 import itertools
+import json
 import math
 import re
 from collections import Counter
@@ -18,7 +19,7 @@ from pipeline.assets.source_materials.skin import _parts
 from pipeline.assets.source_materials.source_surface import FacePoints, SourceSurface
 from pipeline.exchange.open_scene import load_source, scene_source
 from pipeline.exchange.renderformer_json import read_renderformer_json
-from pipeline.foreign.gltf.document import data_uri_bytes, local_path
+from pipeline.foreign.gltf.document import data_uri_bytes
 from pipeline.foreign.limits import ReadLimits
 from pipeline.foreign.material import LEAST_ROUGHNESS, SourceMaterial
 from pipeline.foreign.mesh import FileMesh
@@ -364,10 +365,16 @@ def test_json_scenes_of_public_reports(shared: Path, name: str) -> None:
 
 
 def test_buffers_are_found_in_any_case_and_in_both_base64s(tmp_path: Path) -> None:
-    (tmp_path / "My Mesh.bin").write_bytes(b"x")
-    assert local_path("my%20mesh.BIN", tmp_path) == tmp_path.resolve() / "My Mesh.bin"
-    with pytest.raises(Rejected, match="missing_file.*'gone.bin' is not beside"):
-        local_path("gone.bin", tmp_path)
+    tree, buffer = kit.textured_tree(PICTURE)
+    (tmp_path / "My Mesh.bin").write_bytes(buffer)
+    for uri in ("my%20mesh.BIN", "gone.bin"):
+        tree["buffers"][0]["uri"] = uri
+        (tmp_path / "a.gltf").write_text(json.dumps(tree))
+        if uri == "gone.bin":
+            with pytest.raises(Rejected, match="missing_file.*the buffer 'gone.bin': there is no"):
+                read_source(tmp_path / "a.gltf", ReadLimits())
+        else:
+            assert len(load_mesh(read_source(tmp_path / "a.gltf", ReadLimits())).faces) == 2
     assert data_uri_bytes("data:;base64,-_8") == data_uri_bytes("data:;base64,+/8=")
 
 

@@ -308,15 +308,10 @@ def _shown(asset: Asset, places: NDArray = PLACES) -> NDArray[np.float64]:
     u = u_directions(corners, level.skin.uv)
     found = []
     for right, up in places:
-        for face, (triangle, uv) in enumerate(zip(corners, level.skin.uv, strict=True)):
-            flat = np.vstack([triangle[:, [0, 2]].T, np.ones(3)])
-            weights = np.linalg.solve(flat, [right, up, 1.0])
-            if (weights >= -1e-9).all():
-                texels = texture_values(level.skin.normal, weights @ uv)
-                normal = mapped_normals(normals[face], u[face], texels)
-                found.append(normal * np.sign(normals[face] @ FRONT))
-                break
-    assert len(found) == len(places)
+        face, weights = kit.find_triangle(level, right, up)
+        texels = texture_values(level.skin.normal, weights @ level.skin.uv[face])
+        normal = mapped_normals(normals[face], u[face], texels)
+        found.append(normal * np.sign(normals[face] @ FRONT))
     return np.array(found)
 
 

@@ -3,16 +3,18 @@
 import dataclasses
 import json
 from collections.abc import Callable
+from functools import partial
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
 from numpy.typing import NDArray
-from pxr import Gf, Usd
+from pxr import Gf, Usd, UsdGeom
 
 from pipeline.assets.cleaning.clean import clean, normalize
 from pipeline.assets.cleaning.orient import orient_outward
+from pipeline.assets.quality.measure import level_mesh
 from pipeline.assets.settings import AssetSettings, OwnMaterialSettings
 from pipeline.assets.source_materials.skin import add_skin, read_source_surface
 from pipeline.foreign.mesh import TriangleMesh
@@ -26,7 +28,6 @@ from tests.for_each import for_each
 from tests.pipeline.assets.meshes_by_hand import (
     geometry,
     gltf_tree,
-    mesh_of,
     prepare,
     sphere,
     write_glb,
@@ -35,6 +36,7 @@ from tests.pipeline.assets.meshes_by_hand import (
 from tests.pipeline.assets.source_materials.textured_kit import (
     CORNERS,
     KEEP,
+    MESH,
     OWN,
     SQUARE,
     STORED,
@@ -43,6 +45,7 @@ from tests.pipeline.assets.source_materials.textured_kit import (
     F,
     assert_corners,
     connect_texture,
+    coordinates,
     picture_bytes,
     seen_at,
     set_inputs,
@@ -51,34 +54,64 @@ from tests.pipeline.assets.source_materials.textured_kit import (
     textured_obj,
     textured_tree,
     textured_usd,
+    transform_coordinates,
 )
 
 PICTURE = picture_bytes(CORNERS)
-FILES: dict[str, Callable[[Path], Path]] = {
-    "glb": lambda folder: textured_glb(folder / "a.glb", PICTURE),
-    "along": lambda folder: textured_glb(folder / "a.glb", PICTURE, np.add(UV_UP, (3, -2))),
-    "back": lambda folder: textured_glb(folder / "a.glb", PICTURE, np.add(UV_UP, (-7, 1))),
-    "gltf": lambda folder: textured_gltf(folder / "a.gltf", PICTURE),
-    "obj": lambda folder: textured_obj(folder / "o" / "a.obj", PICTURE),
-}
 
 
-@for_each("kind", FILES)
-def test_a_quad_keeps_its_corner_colours(tmp_path: Path, kind: str) -> None:
-    """A mirrored u or v, or a quarter turn, would swap them; beyond 1 the picture repeats."""
-    assert_corners(prepare(FILES[kind](tmp_path), KEEP))
-
-
-def test_a_texture_transform_moves_the_picture(tmp_path: Path) -> None:
+def _transformed_glb(path: Path) -> Path:
     """A quarter turn about the lower left and a shift back: by the formula of the extension."""
     tree, buffer = textured_tree(PICTURE)
     slot = tree["materials"][0]["pbrMetallicRoughness"]["baseColorTexture"]
     slot["extensions"] = {
         "KHR_texture_transform": {"rotation": np.pi / 2, "offset": [0.0, 1.0], "scale": [1, 1]}
     }
-    asset = prepare(write_glb(tmp_path / "a.glb", tree, buffer), KEEP)
     # (u, w), w down, reads shift + [[cos, sin], [-sin, cos]] (u, w) = (w, 1 - u)
-    assert_corners(asset, lambda right, up: (up, -right))
+    return write_glb(path, tree, buffer)
+
+
+def _transform(stage: Usd.Stage) -> None:
+    """A quarter turn counter-clockwise and a shift back: (s, t) reads (1 - t, s)."""
+    transform_coordinates(stage, 90.0, (1, 1), (1, 0))
+
+
+def _place_quad(stage: Usd.Stage) -> None:
+    """One polygon with coordinates of its corners, a quarter turn above it: +y, x to -z."""
+    mesh = UsdGeom.Mesh(stage.GetPrimAtPath(MESH))
+    mesh.GetFaceVertexCountsAttr().Set([4])
+    mesh.GetFaceVertexIndicesAttr().Set([0, 1, 2, 3])
+    coordinates(mesh, UV_UP, "faceVarying")
+    UsdGeom.Xformable(stage.GetPrimAtPath("/W")).AddRotateYOp().Set(90)
+
+
+TURNED: dict[str, Callable[[Path], Path]] = {
+    "glb transform": lambda folder: _transformed_glb(folder / "a.glb"),
+    "usd transform": lambda folder: textured_usd(folder / "a.usda", PICTURE, _transform),
+    "usd quad": lambda folder: textured_usd(folder / "a.usda", PICTURE, _place_quad),
+}
+
+
+def _in_centimetres(folder: Path, suffix: str) -> Path:
+    return textured_usd(folder / f"a.{suffix}", PICTURE, y_up=True, unit=0.01)
+
+
+FILES: dict[str, Callable[[Path], Path]] = {
+    "glb": lambda folder: textured_glb(folder / "a.glb", PICTURE),
+    "along": lambda folder: textured_glb(folder / "a.glb", PICTURE, np.add(UV_UP, (3, -2))),
+    "back": lambda folder: textured_glb(folder / "a.glb", PICTURE, np.add(UV_UP, (-7, 1))),
+    "gltf": lambda folder: textured_gltf(folder / "a.gltf", PICTURE),
+    "obj": lambda folder: textured_obj(folder / "o" / "a.obj", PICTURE),
+    **{form: partial(_in_centimetres, suffix=form) for form in ("usda", "usdc", "usd", "usdz")},
+    **TURNED,
+}
+
+
+@for_each("kind", FILES)
+def test_a_quad_keeps_its_corner_colours(tmp_path: Path, kind: str) -> None:
+    """A mirrored u or v, or a quarter turn, would swap them; beyond 1 the picture repeats."""
+    asset = prepare(FILES[kind](tmp_path), KEEP)
+    assert_corners(asset, lambda right, up: (up, -right) if kind in TURNED else (right, up))
 
 
 def _plain_skin(path: Path, extensions: dict[str, Any] | None = None, **metal: Any) -> LevelSkin:
@@ -280,7 +313,7 @@ def emission(path: Path) -> tuple[NDArray, TriangleMesh]:
     assert asset.materials is not None and "emission" not in asset.materials.lost
     level = asset.levels[0]
     assert level.skin is not None and level.skin.emission is not None
-    return level.skin.emission, mesh_of(level)
+    return level.skin.emission, level_mesh(level)
 
 
 @for_each("kind", GLOWING)

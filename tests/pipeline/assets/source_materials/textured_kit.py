@@ -13,7 +13,7 @@ from pxr import Gf, Sdf, Usd, UsdGeom, UsdShade, UsdUtils
 
 from pipeline.assets.settings import AssetSettings, OwnMaterialSettings
 from pipeline.foreign.mesh import TriangleMesh
-from storage.records.asset import Asset
+from storage.records.asset import Asset, Level
 from storage.records.lookup import texture_values
 from tests.pipeline.assets.meshes_by_hand import gltf_tree, prepare, write_glb
 from tests.pipeline.foreign.gltf.gltf_writer import GltfWriter
@@ -102,16 +102,22 @@ def textured_obj(path: Path, picture: bytes, mtl: str = "map_Kd its picture.png\
     return path
 
 
+def find_triangle(level: Level, right: float, up: float) -> tuple[int, NDArray[np.float64]]:
+    """Return the triangle of an upright square at a place, and the weights [3] of its corners."""
+    for face, corners in enumerate(level.positions[level.faces]):
+        flat = np.vstack([corners[:, [0, 2]].T, np.ones(3)])
+        weights = np.linalg.solve(flat.astype(np.float64), [right, up, 1.0])
+        if (weights >= -1e-9).all():
+            return face, np.asarray(weights, np.float64)
+    raise AssertionError(f"no triangle at {right}, {up}")
+
+
 def seen_at(asset: Asset, right: float, up: float, column: int = 0) -> NDArray[np.float64]:
     """Return what the finest level of an upright square shows at a place."""
     level = asset.levels[0]
     assert level.skin is not None, asset.materials
-    for corners, uv in zip(level.positions[level.faces], level.skin.uv, strict=True):
-        flat = np.vstack([corners[:, [0, 2]].T, np.ones(3)])
-        weights = np.linalg.solve(flat.astype(np.float64), [right, up, 1.0])
-        if (weights >= -1e-9).all():
-            return texture_values(level.skin.textures[column], weights @ uv)
-    raise AssertionError(f"no triangle at {right}, {up}")
+    face, weights = find_triangle(level, right, up)
+    return texture_values(level.skin.textures[column], weights @ level.skin.uv[face])
 
 
 def shown(colour: ArrayLike) -> NDArray[np.float64]:
