@@ -2,7 +2,6 @@
 
 import time
 
-from rich.progress import Progress
 from rich.text import Text
 
 from infra.cli.console import progress_bars
@@ -23,29 +22,20 @@ def render(options: RenderOptions) -> None:
         plan = plan_render(options, reader)
         if plan.choice is not None:
             bars.console.print(Text(plan.choice.sentence), soft_wrap=True)
-        outcome = run_plan(plan, reader, _Bars(bars))
-    print_outcome(outcome, time.monotonic() - started)
-
-
-class _Bars:
-    """Progress bars of finished pictures, and of the samples of the current one."""
-
-    def __init__(self, bars: Progress) -> None:
-        self._bars = bars
-        self._pictures = bars.add_task("pictures", total=None, note="", visible=False)
-        self._samples = bars.add_task("samples", total=None, note="", visible=False)
-
-    def on_picture(self, done: int, total: int) -> None:
-        self._bars.update(self._pictures, completed=done, total=total, visible=True)
-
-    def on_samples(self, now: Sampling | Image) -> None:
-        if isinstance(now, Image):
-            return
-        note = "" if now.missing_db is None else f"{now.missing_db:.1f} dB to go"
-        self._bars.update(
-            self._samples,
-            completed=min(now.spp, now.expected_spp),
-            total=now.expected_spp,
-            note=note,
-            visible=True,
+        names = ("pictures", "samples")
+        pictures, samples = (
+            bars.add_task(name, total=None, note="", visible=False) for name in names
         )
+
+        def on_picture(done: int, total: int) -> None:
+            bars.update(pictures, completed=done, total=total, visible=True)
+
+        def on_samples(now: Sampling | Image) -> None:
+            if not isinstance(now, Image):
+                note = "" if now.missing_db is None else f"{now.missing_db:.1f} dB to go"
+                done = min(now.spp, now.expected_spp)
+                total = now.expected_spp
+                bars.update(samples, completed=done, total=total, note=note, visible=True)
+
+        shots, notes = run_plan(plan, reader, on_picture, on_samples)
+    print_outcome(plan, shots, notes, time.monotonic() - started)

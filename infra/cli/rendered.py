@@ -1,6 +1,5 @@
 """Output of `trilight render` at its end."""
 
-import dataclasses
 from collections import Counter
 from collections.abc import Sequence
 from typing import Any
@@ -11,7 +10,7 @@ from infra.cli.console import note, print_json, print_rows, suggest_look
 from infra.render.networks import NetworkRenderer
 from infra.render.path_tracer import PathTracer
 from infra.render.plan import RenderPlan
-from infra.render.run_render import FinishedShot, RenderResult
+from infra.render.run_render import FinishedShot
 from infra.render.tone_mapping import enlargement
 from pipeline.renders.calibrated_error import OUTSIDE, promise_sentence
 from pipeline.renders.preview import PreviewSettings
@@ -34,12 +33,13 @@ _STATED = {
 _FILTERS = {"fast": "one fast denoise", "high": "one denoise", "off": "not denoised"}
 
 
-def print_outcome(outcome: RenderResult, seconds: float) -> None:
+def print_outcome(
+    plan: RenderPlan, finished: Sequence[FinishedShot], notes: Sequence[str], seconds: float
+) -> None:
     """Print files and figures of the only picture, or a summary of many."""
-    plan = outcome.plan
     record = {
         "engine": plan.engine,
-        "notes": list(outcome.notes),
+        "notes": list(notes),
         "resolution": plan.resolution,
         "seconds": round(seconds, 2),
         "source": plan.source,
@@ -47,16 +47,16 @@ def print_outcome(outcome: RenderResult, seconds: float) -> None:
     }
     if plan.choice is not None:
         record["choice"] = plan.choice.sentence
-    shots = [_shot_json(shot, timed=plan.choice is not None) for shot in outcome.shots]
-    for text in outcome.notes:
+    shots = [_shot_json(shot, timed=plan.choice is not None) for shot in finished]
+    for text in notes:
         note(text)
     if plan.output.is_sequence:
         video = plan.output.video
         print_json({**record, "pictures": shots, "video": None if video is None else str(video)})
-        _print_sequence(plan, outcome.shots, seconds)
+        _print_sequence(plan, finished, seconds)
     else:
         print_json({**record, **shots[0]})
-        _print_one(plan, outcome.shots[0], seconds)
+        _print_one(plan, finished[0], seconds)
 
 
 def _shot_json(done: FinishedShot, *, timed: bool) -> dict[str, Any]:
@@ -75,8 +75,8 @@ def _shot_json(done: FinishedShot, *, timed: bool) -> dict[str, Any]:
     else:
         by_renderer = {**by_renderer, "psnr_log_db": round(done.psnr_log_db or 0, 3)}
         if done.flicker is not None:
-            flicker = dataclasses.asdict(done.flicker)
-            by_renderer["flicker"] = {name: round(value, 3) for name, value in flicker.items()}
+            rounded = {name: round(value, 3) for name, value in done.flicker.items()}
+            by_renderer["flicker"] = rounded
     return {
         "lights": done.num_lights,
         "png": str(done.shot.png),
@@ -185,8 +185,8 @@ def _print_sequence(plan: RenderPlan, shots: Sequence[FinishedShot], seconds: fl
         rows += _spread("stated error", values, metric)
     rows += _spread("agreement", agreements, "psnr_log_db")
     if flickers := [shot.flicker for shot in shots if shot.flicker is not None]:
-        db = np.median([flicker.db for flicker in flickers])
-        noise_db = np.median([flicker.noise_db for flicker in flickers])
+        db = np.median([flicker["db"] for flicker in flickers])
+        noise_db = np.median([flicker["noise_db"] for flicker in flickers])
         text = f"median {db:.1f} dB from frame to frame; the traced frames' noise alone"
         rows.append(("flicker", f"{text} {noise_db:.1f}"))
     rows += _time_rows(plan, shots)

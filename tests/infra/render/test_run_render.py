@@ -52,16 +52,6 @@ class FlatRenderer(RendererHere):
         return Image(radiance_rgb=picture, cpu_seconds=0.0, facts=facts)
 
 
-class SilentProgress:
-    """Progress of a render that prints nothing."""
-
-    def on_picture(self, done: int, total: int) -> None:
-        pass
-
-    def on_samples(self, now: object) -> None:
-        pass
-
-
 Pairs = list[tuple[SceneSource, Camera | int]]
 
 
@@ -91,8 +81,7 @@ def run(
         shots=list(shots(pairs, where, [each.name for each in renderers])),
         fps=24,
     )
-    outcome = run_plan(plan, HereReader(), SilentProgress())
-    return outcome.shots, outcome.notes
+    return run_plan(plan, HereReader(), lambda done, total: None, lambda now: None)
 
 
 def test_pictures_are_numbered_and_the_scene_is_opened_once(turn: Pairs, tmp_path: Path) -> None:
