@@ -8,7 +8,7 @@ from rich.table import Table
 from rich.text import Text
 
 from infra.bench_options import BenchOptions
-from infra.cli.console import console, first_words, progress_bars
+from infra.cli.console import console, first_words, progress
 from infra.cli.options import command
 from storage.errors import TrilightError
 from storage.settings.described import checked
@@ -64,15 +64,8 @@ def bench(run_options: BenchRunOptions, options: BenchOptions) -> None:
         _print_run(experiment, newest)
         return
     first_words(f"Measuring {experiment.name}: {experiment.title}")
-    with progress_bars() as bars:
-        task = bars.add_task("trials", total=None, note=experiment.name)
-        result = run(
-            experiment,
-            scale,
-            options,
-            out,
-            lambda done, total: bars.update(task, completed=done, total=total),
-        )
+    with progress("trials") as on_trial:
+        result = run(experiment, scale, options, out, on_trial)
     _print_run(experiment, result)
     console.print(f"Written: {out} and {out.with_suffix('.png').name}", style="bold")
 

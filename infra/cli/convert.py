@@ -3,7 +3,7 @@
 from pathlib import Path
 from typing import Annotated
 
-from infra.cli.console import first_words, print_result, progress_bars
+from infra.cli.console import first_words, print_result, progress
 from infra.cli.options import command
 from pipeline.exchange.from_description import AlbedoOverOne
 from storage.settings.described import checked
@@ -39,14 +39,8 @@ def convert(options: ConvertOptions) -> None:
         usd_folder=options.usd_folder,
         albedo_over_one=options.albedo_over_one,
     )
-    with progress_bars() as bars:
-        task = bars.add_task("files", total=None, note="")
-        result = convert_scene(
-            scene,
-            options.target,
-            budget=options.budget,
-            done=lambda now, total: bars.update(task, completed=now, total=total),
-        )
+    with progress("files") as done:
+        result = convert_scene(scene, options.target, budget=options.budget, done=done)
     files = [str(path) for path in result.files]
     record = {"files": files, "notes": list(result.notes), "triangles": result.triangles}
     more = len(files) - 1

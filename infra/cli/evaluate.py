@@ -7,7 +7,7 @@ from typing import Any
 from rich.table import Table
 from rich.text import Text
 
-from infra.cli.console import console, first_words, print_json, progress_bars, suggest_look
+from infra.cli.console import console, first_words, print_json, progress, suggest_look
 from infra.cli.leaderboard import judge_methods
 from infra.cli.options import command
 from infra.torch_library import require_torch
@@ -37,8 +37,7 @@ def _judge_network(options: EvaluationOptions, checkpoint: str) -> tuple[dict[st
     require_torch("evaluate")
     from infra.judging import judge_network, write_judgement
 
-    with progress_bars() as bars:
-        task = bars.add_task("scenes", total=None, note="")
+    with progress("scenes") as done:
         judgement = judge_network(
             checkpoint,
             data=options.data,
@@ -49,7 +48,7 @@ def _judge_network(options: EvaluationOptions, checkpoint: str) -> tuple[dict[st
             tracer_views=options.tracer_views,
             lpips=options.lpips,
             device=options.device,
-            done=lambda now, total: bars.update(task, completed=now, total=total),
+            done=done,
         )
     first_words("Drawing the sheets")
     record = judgement.record

@@ -8,7 +8,7 @@ from infra.cli.console import (
     note,
     print_json,
     print_table,
-    progress_bars,
+    progress,
     suggest_look,
 )
 from infra.cli.options import command
@@ -28,12 +28,8 @@ def judge_methods(options: LeaderboardOptions) -> dict[str, Any]:
     require_torch("leaderboard")
     from infra.leaderboard import make_leaderboard
 
-    with progress_bars() as bars:
-        task = bars.add_task("scenes", total=None, note="")
-        board = make_leaderboard(
-            options,
-            lambda now, total, what: bars.update(task, completed=now, total=total, note=what),
-        )
+    with progress("scenes") as on_progress:
+        board = make_leaderboard(options, on_progress)
     for one in board.widths:
         title = f"{one.width} x {one.width} pixels: median psnr_log_db of {one.num_views} views"
         rows = [_row(each) for each in one.standings]
@@ -41,7 +37,16 @@ def judge_methods(options: LeaderboardOptions) -> dict[str, Any]:
     for text in board.notes:
         note(text)
     suggest_look(f"Read {board.out / 'leaderboard.md'}, look at {board.out / 'leaderboard.png'}")
-    return {"out": str(board.out), "rival": board.rival, "widths": _plain(board)}
+    widths = [
+        {
+            "width": one.width,
+            "views": one.num_views,
+            "scenes": one.num_scenes,
+            "standings": [dataclasses.asdict(each) for each in one.standings],
+        }
+        for one in board.widths
+    ]
+    return {"out": str(board.out), "rival": board.rival, "widths": widths}
 
 
 def _row(standing: Any) -> dict[str, str]:
@@ -49,35 +54,13 @@ def _row(standing: Any) -> dict[str, str]:
     from train.evaluation.judged_view import METRIC, interval_text
 
     lead = standing.lead
-    price = standing.price
     scores = standing.scores[METRIC]
     ends = interval_text(lead.low, lead.high, 1) if lead is not None else ""
     return {
         "": standing.name,
-        "first, s": "" if price is None else number_text(price.first_s),
-        "further": "" if price is None else number_text(price.further_s),
+        "first, s": "" if standing.first_s is None else number_text(standing.first_s),
+        "further": "" if standing.further_s is None else number_text(standing.further_s),
         "dB": f"{scores['median']:.1f}",
         "5th": f"{scores['worse_5_percent']:.1f}",
         "lead, dB": "" if lead is None else f"{lead.mean:+.1f}" + (f" ({ends})" if ends else ""),
     }
-
-
-def _plain(board: Any) -> list[dict[str, Any]]:
-    return [
-        {
-            "width": one.width,
-            "views": one.num_views,
-            "scenes": one.num_scenes,
-            "standings": [_plain_standing(each) for each in one.standings],
-        }
-        for one in board.widths
-    ]
-
-
-def _plain_standing(standing: Any) -> dict[str, Any]:
-    """Return the fields of a standing, with both seconds of its price in the place of that."""
-    record: dict[str, Any] = {}
-    for name, value in dataclasses.asdict(standing).items():
-        no_price = {"first_s": None, "further_s": None}
-        record |= (value or no_price) if name == "price" else {name: value}
-    return record

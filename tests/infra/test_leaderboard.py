@@ -416,10 +416,10 @@ FORMULA = r"runs of $\nothing$"
 def test_dollar_signs_in_names_are_no_formula(tmp_path: Path) -> None:
     priced, unpriced = (
         Standing(
-            name=FORMULA, kind="network", price=price, timed_scenes=1,
+            name=FORMULA, kind="network", first_s=cost, further_s=cost, timed_scenes=1,
             scores={METRIC: {"median": 30.0}}, lead=None, on_front=None,
         )
-        for price in (Price(first_s=0.5, further_s=0.5), None)
+        for cost in (0.5, None)
     )  # fmt: skip
     one = WidthStandings(
         width=64, num_views=1, triangles={"a": 1}, standings=(priced, unpriced), pairs={}

@@ -31,7 +31,7 @@ def plot_leaderboard(widths: Sequence[WidthStandings], title: str, path: Path) -
             axes.set_ylabel(f"median {METRIC}, higher is better", fontsize=_FONT)
             groups.append(list[SeriesPoint]())
             for each in one.standings:
-                if each.price is None:
+                if each.first_s is None or each.further_s is None:
                     style = "--" if each.name == NOISE else ":"
                     axes.axhline(each.median_db, color="0.45", linewidth=1, linestyle=style)
                     axes.annotate(
@@ -45,7 +45,7 @@ def plot_leaderboard(widths: Sequence[WidthStandings], title: str, path: Path) -
                         horizontalalignment="right",
                     )
                     continue
-                costs = [each.price.first_s, each.price.further_s]
+                costs = [each.first_s, each.further_s]
                 groups[-1].append(
                     SeriesPoint(name=each.name, kind=each.kind, costs=costs, error=each.median_db)
                 )

@@ -303,7 +303,7 @@ def _judge(
         scores = picture_scores(picture, scene.target_VRR3[view], scene.hits_VRR[view], board.lpips)
         row = Row(scores=scores)
         if price is not None and view == 0:
-            row = Row(scores=scores, **dataclasses.asdict(price), machine=board.machine)
+            row = Row(scores=scores, **asdict(price), machine=board.machine)
         board.rows.add(board.key_of(method, sample.key, view), row)
 
 
@@ -343,8 +343,10 @@ class Standing:
     """Name of the method, or NOISE."""
     kind: str
     """Kind of method; empty for NOISE."""
-    price: Price | None
-    """Median CPU seconds; None without times."""
+    first_s: float | None = None
+    """Median CPU seconds of a scene's first view, loading included; None without times."""
+    further_s: float | None = None
+    """Median CPU seconds of a further view; None without times."""
     timed_scenes: int
     """Number of scenes behind these medians."""
     scores: Mapping[str, Any]
@@ -390,9 +392,9 @@ def standings_of(board: Board, width: int, rival: str) -> WidthStandings | None:
     pairs = {two: paired_lead(views, *two) for two in itertools.permutations(names, 2)}
     scores = {name: summarize_views(views, name) for name in [NOISE, *names]}
     prices = board.prices(width)
-    costs = {name: median_price(each) for name, each in prices.items()}
+    costs = {name: asdict(median_price(each)) for name, each in prices.items()}
     figures = [
-        (-float(scores[name][METRIC]["median"]), (cost.first_s, cost.further_s))
+        (-float(scores[name][METRIC]["median"]), tuple(cost.values()))
         for name, cost in costs.items()
     ]
     front = dict(zip(costs, on_front(figures), strict=True))
@@ -400,11 +402,11 @@ def standings_of(board: Board, width: int, rival: str) -> WidthStandings | None:
         Standing(
             name=name,
             kind=board.kinds.get(name, ""),
-            price=costs.get(name),
             timed_scenes=len(prices.get(name, ())),
             scores=summary,
             lead=pairs.get((name, rival)),
             on_front=front.get(name),
+            **costs.get(name, {}),
         )
         for name, summary in scores.items()
     ]
