@@ -136,8 +136,8 @@ COMMANDS = {
     "model": "Print parameters, FLOPs and memory of a model size or a checkpoint.",
     "doctor": "Check this machine: what is missing or slow, and how to fix it.",
 }
-"""Help by command. A command is the function of its name in the module of its name; a group of
-commands is the `app` in that module."""
+"""Help by command. A command is the function of its name in the module of its name, or of a command
+like it; a group of commands is the `app` in that module."""
 
 SECTIONS = {
     "Make": ("generate", "assets", "plan", "status", "verify"),
@@ -176,11 +176,19 @@ _SECTION_OF = {
     for section in [Group(title, sort_key=rank)]
     for name in names
 }
+_BESIDE = {
+    "leaderboard": "evaluate",
+    "revisit": "generate",
+    "export": "convert",
+    "push": "convert",
+    "verify": "status",
+}
+"""Command beside which another one stands, in one module."""
 for _rank, (_name, _help) in enumerate(COMMANDS.items()):
     _function = "app" if _name in GROUPS else _name
     _options: Any = {} if _name in GROUPS else {"help_epilogue": ""}  # groups state their own
     app.command(
-        f"{__package__}.{_name}:{_function}",
+        f"{__package__}.{_BESIDE.get(_name, _name)}:{_function}",
         name=_name,
         help=_help,
         sort_key=_rank,

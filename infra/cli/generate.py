@@ -20,6 +20,7 @@ from infra.cli.overrides import BaseSettings, with_base_settings
 from pipeline.executors.registry import find_executor
 from pipeline.generation.dataset_writer import require_its_extensions
 from pipeline.generation.generate_options import GenerateOptions
+from pipeline.generation.revisit_options import RevisitOptions, to_generate_options
 from pipeline.objects.licences import USER_PROVIDED
 from storage.dataset.layout import DatasetFolder, dataset_folder
 from storage.dataset.manifest import Manifest, read_head
@@ -224,3 +225,10 @@ def _print_json(
 def _shown_path(folder: DatasetFolder, path: Path) -> str:
     """Return the path or URL of a file of a dataset, for people."""
     return f"{folder.display_name}/{path.relative_to(folder.root)}"
+
+
+@command("dataset")
+def revisit(options: RevisitOptions, runner: ExecutorOptions) -> None:
+    first_words(f"Reading {options.dataset}")
+    made = with_base_settings(to_generate_options(options), BaseSettings(like=options.dataset))
+    make(made, runner)

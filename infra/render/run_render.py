@@ -18,8 +18,7 @@ from numpy.typing import NDArray
 from PIL import Image as Picture
 from PIL import ImageDraw, ImageFont
 
-from infra.render.output_paths import write_video
-from infra.render.plan import RenderPlan, Shot
+from infra.render.plan import RenderPlan, Shot, write_video
 from infra.render.preview_table import Choice
 from infra.render.sources import own_camera
 from infra.render.tone_mapping import Look, display_pixels, enlarge

@@ -12,8 +12,8 @@ import numpy as np
 import pytest
 import torch
 
-from infra import leaderboard as run_module
-from infra.leaderboard import (
+from infra import judging as run_module
+from infra.judging import (
     NEAREST_OTHER,
     NEAREST_TRAINED,
     Leaderboard,
@@ -34,9 +34,8 @@ from tests.for_each import case
 from tests.model.kit import awake, publishable
 from tests.train.toy import VIEWS, toy_sample, write_toy_dataset
 from train.evaluation import leaderboard as board_module
-from train.evaluation.chart import plot_leaderboard
-from train.evaluation.equal_time import Price
-from train.evaluation.judged_view import METRIC, NETWORK
+from train.evaluation.cost_charts import plot_leaderboard
+from train.evaluation.evaluate import Price
 from train.evaluation.leaderboard import (
     NOISE,
     UNKNOWN_MACHINE,
@@ -46,6 +45,7 @@ from train.evaluation.leaderboard import (
     Standing,
     WidthStandings,
 )
+from train.evaluation.metrics import METRIC, NETWORK
 from train.evaluation.options import LeaderboardOptions
 from train.evaluation.validation import PictureSource, nearest_view
 

@@ -55,7 +55,7 @@ from tests.train.toy import (
 from train.data.buckets import collate_batch
 from train.data.scenes import TrainingScene, training_scene
 from train.evaluation.evaluate import judge_views, make_baselines
-from train.evaluation.judged_view import NETWORK, summarize_views
+from train.evaluation.metrics import NETWORK, summarize_views
 from train.evaluation.validation import MEDIAN, NEAREST, predict
 from train.loop.distributed import DistributedContext
 from train.loop.train_state import TrainState, new_state

@@ -28,16 +28,18 @@ from storage.renderer import Camera, Renderer, fingerprint
 from storage.typed_json import read_json_lines
 from train.data.bad_samples import BadSampleCounter, first_samples
 from train.evaluation.cost_charts import on_front
-from train.evaluation.equal_time import Price, median_price, time_scene
-from train.evaluation.judged_view import (
+from train.evaluation.evaluate import Price, median_price, time_scene
+from train.evaluation.metrics import (
     METRIC,
+    METRICS,
     JudgedView,
     PairedLead,
+    noise_floors,
     paired_lead,
+    picture_scores,
     scene_facts,
     summarize_views,
 )
-from train.evaluation.metrics import METRICS, noise_floors, picture_scores
 from train.evaluation.validation import PictureSource, ValidationScene, validation_scene
 from train.loss.lpips import Lpips
 
@@ -350,7 +352,7 @@ class Standing:
     timed_scenes: int
     """Number of scenes behind these medians."""
     scores: Mapping[str, Any]
-    """Summary of each metric by name (train.evaluation.judged_view.summarize_views)."""
+    """Summary of each metric by name (train.evaluation.metrics.summarize_views)."""
     lead: PairedLead | None
     """Paired difference from the rival; None for the rival and for NOISE."""
     on_front: bool | None

@@ -10,10 +10,12 @@ import numpy as np
 
 from storage.markdown import inert, table, text
 from train.evaluation.cost_charts import number_text
-from train.evaluation.equal_time import TRACER, sentences
-from train.evaluation.judged_view import (
+from train.evaluation.evaluate import TRACER, sentences
+from train.evaluation.leaderboard import NOISE, WidthStandings
+from train.evaluation.metrics import (
     GROUPED,
     METRIC,
+    METRICS,
     NEAR_DB,
     NETWORK,
     JudgedView,
@@ -22,8 +24,6 @@ from train.evaluation.judged_view import (
     interval_text,
     summarize_views,
 )
-from train.evaluation.leaderboard import NOISE, WidthStandings
-from train.evaluation.metrics import METRICS
 
 BENCHMARK = "benchmark-v1"
 """Name of our public test set (pipeline.presets.frozen_v1)."""
@@ -64,7 +64,7 @@ def record(
 
     Args:
         about: network, data, split and resolution, as the report shows them.
-        traced: comparison at equal time (evaluation.equal_time); None if it was not measured.
+        traced: comparison at equal time (evaluation.evaluate); None if it was not measured.
     """
     ours = summarize_views(views)
     both = [view for view in views if GROUPED in view.scores]  # one pass, and groups of lights

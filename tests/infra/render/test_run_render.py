@@ -10,8 +10,7 @@ from PIL import Image as Picture
 
 from infra.render import tone_mapping as look_module
 from infra.render.networks import RendererHere, SceneHere
-from infra.render.output_paths import OutputPaths, output_paths, write_video
-from infra.render.plan import RenderPlan, shots
+from infra.render.plan import OutputPaths, RenderPlan, output_paths, shots, write_video
 from infra.render.run_render import FinishedShot, run_plan
 from infra.render.sources import orbit, own_camera, pair_cameras
 from infra.render.tone_mapping import Look, tone_mapped

@@ -27,10 +27,10 @@ from tests.train.kit import eval_config, tiny_run
 from tests.train.loss.test_training_loss import small_weights
 from tests.train.toy import toy_sample, toy_scene, write_toy_dataset
 from train.data.scenes import training_scene
-from train.evaluation.chart import plot_excursions
-from train.evaluation.equal_time import TRACER
+from train.evaluation.cost_charts import plot_excursions
 from train.evaluation.evaluate import (
     GROUPED,
+    TRACER,
     EvalConfig,
     grouped_pictures,
     judge_views,
@@ -38,8 +38,16 @@ from train.evaluation.evaluate import (
     worst_and_median,
     worst_of_each_excursion,
 )
-from train.evaluation.judged_view import NETWORK, JudgedView, by_group, scene_facts, summarize_views
-from train.evaluation.metrics import METRICS, hdr_flip, picture_scores
+from train.evaluation.metrics import (
+    METRICS,
+    NETWORK,
+    JudgedView,
+    by_group,
+    hdr_flip,
+    picture_scores,
+    scene_facts,
+    summarize_views,
+)
 from train.evaluation.options import EvaluationOptions
 from train.evaluation.report_pages import BENCHMARK, evaluation_page, record
 from train.evaluation.validation import (
