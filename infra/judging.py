@@ -304,7 +304,6 @@ class Leaderboard:
     notes: tuple[str, ...]
     rival: str
     """Name of the row that all others are compared with."""
-    out: Path
 
 
 def make_leaderboard(options: LeaderboardOptions, on_progress: OnProgress) -> Leaderboard:
@@ -314,22 +313,35 @@ def make_leaderboard(options: LeaderboardOptions, on_progress: OnProgress) -> Le
         TrilightError: the dataset, a network or a folder of pictures is unusable, the folder's rows
             are of another dataset, or no view could be evaluated.
     """
-    with _open_board(options) as (board, opened, most_triangles):
+    with open_board(options) as (board, opened):
         judge_all(board, on_progress)
-        return _write_leaderboard(options, opened, board, most_triangles)
-
-
-def check_leaderboard(options: LeaderboardOptions) -> None:
-    """Raise TrilightError for wrong options or pictures of a leaderboard that is made later."""
-    with _open_board(options):
-        pass
+    rival = _names(options.checkpoint or BUILTIN_NETWORKS[:1])[0]
+    standings = [standings_of(board, width, rival) for width in board.widths]
+    tables = tuple(one for one in standings if one is not None)
+    if not tables:
+        why = next(iter(board.left_out.values()), "the split is empty")
+        raise TrilightError(f"leaderboard: no scene could be rendered by all entries ({why}).")
+    about = {
+        "set": f"{opened.build or 'a set of unknown build'}, digest {opened.digest[:12]}",
+        "split": options.split,
+        "scenes": str(len(board.keys)),
+        "processor": board.machine,
+    }
+    notes = tuple(dict.fromkeys([*board.notes, *_notes(board, tables)]))
+    for name, data in {
+        "leaderboard.md": leaderboard_page(about, tables, notes, rival).encode(),
+        "leaderboard.csv": standings_csv(tables, board.machine),
+        "pairs.csv": pairs_csv(tables),
+    }.items():
+        write_atomically(options.out / name, data)
+    title = f"{opened.build or 'leaderboard'}: what CPU seconds buy"
+    plot_leaderboard(tables, title, options.out / "leaderboard.png")
+    return Leaderboard(widths=tables, notes=notes, rival=rival)
 
 
 @contextlib.contextmanager
-def _open_board(
-    options: LeaderboardOptions,
-) -> Iterator[tuple[Board, TrainingData, dict[str, int]]]:
-    """Yield board, dataset, and the most triangles that each network was trained on."""
+def open_board(options: LeaderboardOptions) -> Iterator[tuple[Board, TrainingData]]:
+    """Yield board and dataset; raises TrilightError for wrong options or pictures."""
     opened = open_training_data([options.source])
     shards = opened.split(options.split)
     if opened.num_views is None:
@@ -350,7 +362,8 @@ def _open_board(
     _add_folders(board, options.pictures)
     _add_nearest(board, options, opened)
     with contextlib.closing(RenderChild(choose_variant(), threads=1)) as child:
-        yield board, opened, _add_renderers(board, options.checkpoint, child)
+        _add_renderers(board, options.checkpoint, child)
+        yield board, opened
 
 
 def widths_of(requested: Sequence[int], stored: int) -> list[int]:
@@ -413,12 +426,8 @@ def _add_nearest(board: Board, options: LeaderboardOptions, opened: TrainingData
     board.notes.append(note)
 
 
-def _add_renderers(board: Board, checkpoints: Sequence[str], child: RenderChild) -> dict[str, int]:
-    """Add the built-in networks, those of the options, traced light and the path tracer.
-
-    Returns:
-        Triangles of the largest scene that a network was trained on, by its name.
-    """
+def _add_renderers(board: Board, checkpoints: Sequence[str], child: RenderChild) -> None:
+    """Add the built-in networks, those of the options, traced light and the path tracer."""
     places = [*BUILTIN_NETWORKS, *(each for each in checkpoints if each not in BUILTIN_NETWORKS)]
     names = _names(places)
     if twice := [name for name in names if names.count(name) > 1]:
@@ -426,15 +435,12 @@ def _add_renderers(board: Board, checkpoints: Sequence[str], child: RenderChild)
             f"{twice[0]} is there twice; expected each network once, in folders of different names."
         )
     networks: dict[str, NeuralRenderer] = {}
-    most_triangles: dict[str, int] = {}
     for name, place in zip(names, places, strict=True):
         network = networks[name] = NeuralRenderer.load(place, device="cpu")
         trained = network.trained
         width = "an unknown width" if trained.resolution is None else f"{trained.resolution} pixels"
-        most = ""
-        if trained.max_triangles is not None:
-            most_triangles[name] = trained.max_triangles
-            most = f", at most {trained.max_triangles} triangles"
+        triangles = trained.max_triangles
+        most = "" if triangles is None else f", at most {triangles} triangles"
         board.notes.append(f"{name} is {network.digest[:8]}, trained at {width}{most}")
     for px in board.widths:
         fitting = {}
@@ -447,41 +453,11 @@ def _add_renderers(board: Board, checkpoints: Sequence[str], child: RenderChild)
                 board.notes.append(f"{name} is not judged at {px} pixels: {why}")
         for one in compared_renderers(px, fitting, child, [(spp, "fast") for spp in SAMPLES]):
             board.add(one, kind_of(one.name))
-    return most_triangles
 
 
 def _names(places: Sequence[str]) -> list[str]:
     """Return the row names of networks, by the folder of a run and without paths."""
     return [network_name(label) for label in network_labels(places)]
-
-
-def _write_leaderboard(
-    options: LeaderboardOptions,
-    opened: TrainingData,
-    board: Board,
-    most_triangles: dict[str, int],
-) -> Leaderboard:
-    rival = _names(options.checkpoint or BUILTIN_NETWORKS[:1])[0]
-    standings = [standings_of(board, width, rival) for width in board.widths]
-    tables = tuple(one for one in standings if one is not None)
-    if not tables:
-        why = next(iter(board.left_out.values()), "the split is empty")
-        raise TrilightError(f"leaderboard: no scene could be rendered by all entries ({why}).")
-    about = {
-        "set": f"{opened.build or 'a set of unknown build'}, digest {opened.digest[:12]}",
-        "split": options.split,
-        "scenes": str(len(board.keys)),
-        "processor": board.machine,
-    }
-    every_note = [*board.notes, *_notes(board, tables), *_beyond(most_triangles, tables)]
-    notes = tuple(dict.fromkeys(every_note))
-    page = leaderboard_page(about, tables, notes, rival)
-    write_atomically(options.out / "leaderboard.md", page.encode())
-    write_atomically(options.out / "leaderboard.csv", standings_csv(tables, board.machine))
-    write_atomically(options.out / "pairs.csv", pairs_csv(tables))
-    title = f"{opened.build or 'leaderboard'}: what CPU seconds buy"
-    plot_leaderboard(tables, title, options.out / "leaderboard.png")
-    return Leaderboard(widths=tables, notes=notes, rival=rival, out=options.out)
 
 
 def _notes(board: Board, tables: Sequence[WidthStandings]) -> Iterator[str]:
@@ -504,17 +480,14 @@ def _notes(board: Board, tables: Sequence[WidthStandings]) -> Iterator[str]:
         "In log_l1 it is an upper bound, and in metrics after it, SSIM, LPIPS and HDR-FLIP that of "
         "independent noise of its size, where a denoiser's is smoother: a row may score better"
     )
-
-
-def _beyond(most_triangles: dict[str, int], tables: Sequence[WidthStandings]) -> Iterator[str]:
-    """Yield a note for each network that rendered larger scenes than it was trained on."""
     sizes = {key: size for one in tables for key, size in one.triangles.items()}
-    for name, most in most_triangles.items():
-        larger = sum(size > most for size in sizes.values())
+    for method in board.methods:
+        most = method.network.trained.max_triangles if isinstance(method, NetworkRenderer) else None
+        larger = 0 if most is None else sum(size > most for size in sizes.values())
         if larger:
             yield (
-                f"{larger} of {len(sizes)} scenes have more triangles than any that {name} was "
-                "trained on"
+                f"{larger} of {len(sizes)} scenes have more triangles than any that {method.name} "
+                "was trained on"
             )
 
 

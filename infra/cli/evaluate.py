@@ -21,6 +21,11 @@ from infra.torch_library import require_torch
 from storage.remote.safe_url import safe_url
 from train.evaluation.options import EvaluationOptions, LeaderboardOptions
 
+_JUDGED_BY = (
+    "data", "split", "resolution", "most_scenes", "tracer_views", "lpips", "device"
+)  # fmt: skip
+"""Options that the evaluation of a network takes as they are."""
+
 
 @command("checkpoint")
 def evaluate(options: EvaluationOptions) -> None:
@@ -28,9 +33,10 @@ def evaluate(options: EvaluationOptions) -> None:
     board = options.leaderboard()
     if options.checkpoint:
         if board:
-            from infra.judging import check_leaderboard
+            from infra.judging import open_board
 
-            check_leaderboard(board)  # the evaluation before it may take hours
+            with open_board(board):  # checked first: the evaluation before it may take hours
+                pass
         record, out = _judge_network(options, options.checkpoint)
         board = board and dataclasses.replace(board, out=out)
     if board:
@@ -48,15 +54,9 @@ def _judge_network(options: EvaluationOptions, checkpoint: str) -> tuple[dict[st
     with progress("scenes") as done:
         judgement = judge_network(
             checkpoint,
-            data=options.data,
-            split=options.split,
             train_data=options.train_data or None,
-            resolution=options.resolution,
-            most_scenes=options.most_scenes,
-            tracer_views=options.tracer_views,
-            lpips=options.lpips,
-            device=options.device,
             done=done,
+            **{name: getattr(options, name) for name in _JUDGED_BY},
         )
     first_words("Drawing the sheets")
     record = judgement.record
@@ -108,7 +108,8 @@ def judge_methods(options: LeaderboardOptions) -> dict[str, Any]:
         print_table(f"{title}, lead over {board.rival}", rows)
     for text in board.notes:
         note(text)
-    suggest_look(f"Read {board.out / 'leaderboard.md'}, look at {board.out / 'leaderboard.png'}")
+    out = options.out
+    suggest_look(f"Read {out / 'leaderboard.md'}, look at {out / 'leaderboard.png'}")
     widths = [
         {
             "width": one.width,
@@ -118,7 +119,7 @@ def judge_methods(options: LeaderboardOptions) -> dict[str, Any]:
         }
         for one in board.widths
     ]
-    return {"out": str(board.out), "rival": board.rival, "widths": widths}
+    return {"out": str(out), "rival": board.rival, "widths": widths}
 
 
 def _row(standing: Any) -> dict[str, str]:
