@@ -194,24 +194,17 @@ def costs_of_here() -> PictureCosts:
     return PictureCosts(machine=machine_name(VARIANT), rows=tuple(slower))
 
 
-def test_costs_that_were_measured_here_win(cache: Path) -> None:
+def test_costs_that_were_measured_here_win_and_those_of_another_machine_do_not(cache: Path) -> None:
     costs, source = known_costs(VARIANT)
     assert costs == shipped_table().costs
     assert f"costs as shipped: `{MEASURE}` measures this machine" == source
-    path = keep_machine_costs(costs_of_here())
-    assert path == machine_costs_path() and path.is_relative_to(cache)
-    costs, source = known_costs(VARIANT)
-    assert costs == costs_of_here()
-    assert source == "costs as measured here"
-
-
-@pytest.mark.usefixtures("cache")
-def test_costs_of_another_machine_are_not_used() -> None:
     keep_machine_costs(dataclasses.replace(costs_of_here(), machine="another, 128 cores"))
     costs, source = known_costs(VARIANT)
     assert costs == shipped_table().costs
     assert "is of another machine (another, 128 cores)" in source
-    keep_machine_costs(costs_of_here())
+    path = keep_machine_costs(costs_of_here())
+    assert path == machine_costs_path() and path.is_relative_to(cache)
+    assert known_costs(VARIANT) == (costs_of_here(), "costs as measured here")
     card = dataclasses.replace(VARIANT, name="cuda_ad_rgb")
     assert "of another machine" in known_costs(card)[1], "a graphics card is another machine"
 
