@@ -6,6 +6,7 @@ from typing import Annotated, Literal
 
 from cyclopts import App, Group
 
+from infra.cli.commands import HELP_FLAGS
 from infra.cli.console import (
     first_words,
     next_step,
@@ -15,7 +16,6 @@ from infra.cli.console import (
     print_table,
     progress,
 )
-from infra.cli.everyday import HELP_FLAGS
 from infra.cli.options import command
 from pipeline.generation.derive_dataset import DeriveOptions, Selection
 from pipeline.generation.derive_dataset import list_scenes as read_scene_rows

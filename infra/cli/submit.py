@@ -7,6 +7,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 from cyclopts import App, Group
 
+from infra.cli.commands import HELP_FLAGS
 from infra.cli.console import (
     console,
     first_words,
@@ -16,7 +17,6 @@ from infra.cli.console import (
     print_rows,
     progress_bars,
 )
-from infra.cli.everyday import HELP_FLAGS
 from infra.cli.options import command
 from infra.cli.overrides import BaseSettings, with_base_settings
 from pipeline.executors.slurm_and_kubernetes import (

@@ -14,8 +14,7 @@ from typing import Annotated, Any, Literal, Optional
 import pytest
 
 from infra.cli import console
-from infra.cli.commands import COMMANDS, SECTIONS
-from infra.cli.everyday import EVERYDAY
+from infra.cli.commands import COMMANDS, EVERYDAY, SECTIONS
 from infra.cli.options import choices_of, is_repeated, takes_names, value_of
 from infra.cli.options import kind_of as kind_of_field
 from infra.setup.generated_pages import PAGES, every_command
