@@ -120,7 +120,9 @@ def _describe(renderer: Renderer, facts: Facts) -> Rows:
             floors = [_floor(settings, facts, metric) for metric in _shown_metrics(settings)]
             rows = [("stated error", floors[0]), *(("", floor) for floor in floors[1:])]
             if settings.stated_error == "calibrated":
-                rows.append(("", _meaning(settings, facts)))
+                bound = f"a bound: pictures like this one are not calibrated ({OUTSIDE})"
+                promise = promise_sentence(settings.resolution)
+                rows.append(("", promise if "expected_error_db" in facts else bound))
             mean = f"{facts['mean_radiance']:.4g} (radiance), that of its samples"
             rows = [
                 ("samples per pixel", f"{facts['spp']} on average"),
@@ -154,24 +156,6 @@ def _floor(settings: RenderSettings, facts: Facts, metric: str) -> str:
     return f"{text}; {'reached' if reached else 'the cap came before'} {target_db:g} dB)"
 
 
-def _meaning(settings: RenderSettings, facts: Facts) -> str:
-    """Return what a stated error promises, in one sentence."""
-    if "expected_error_db" in facts:
-        return promise_sentence(settings.resolution)
-    return f"a bound: pictures like this one are not calibrated ({OUTSIDE})"
-
-
-def _floors(plan: RenderPlan, shots: Sequence[FinishedShot]) -> dict[str, list[float]]:
-    """Return the stated errors of all pictures that were asked for, by metric."""
-    every = [shot.pictures["mitsuba"].facts for shot in shots if "mitsuba" in shot.pictures]
-    metrics: list[str] = []
-    for renderer in plan.renderers:
-        match renderer:
-            case PathTracer(settings=RenderSettings() as settings):
-                metrics = _shown_metrics(settings)
-    return {each: [float(facts[_STATED[each][0]]) for facts in every] for each in metrics}
-
-
 def _print_sequence(plan: RenderPlan, shots: Sequence[FinishedShot], seconds: float) -> None:
     pictures = [picture for shot in shots for picture in shot.pictures.values()]
     num_kept = Counter(picture.was_kept for picture in pictures)[True]
@@ -179,10 +163,14 @@ def _print_sequence(plan: RenderPlan, shots: Sequence[FinishedShot], seconds: fl
         ("pictures", f"{len(shots)} of {plan.resolution} x {plan.resolution}"),
         ("files", f"{len(pictures)}, of which {num_kept} were there already"),
     ]
-    floors = _floors(plan, shots)
     agreements = [shot.psnr_log_db for shot in shots if shot.psnr_log_db is not None]
-    for metric, values in floors.items():
-        rows += _spread("stated error", values, metric)
+    for renderer in plan.renderers:
+        match renderer:
+            case PathTracer(settings=RenderSettings() as settings):
+                for metric in _shown_metrics(settings):
+                    stated = [shot.pictures[renderer.name].facts for shot in shots]
+                    values = [float(facts[_STATED[metric][0]]) for facts in stated]
+                    rows += _spread("stated error", values, metric)
     rows += _spread("agreement", agreements, "psnr_log_db")
     if flickers := [shot.flicker for shot in shots if shot.flicker is not None]:
         db = np.median([flicker["db"] for flicker in flickers])
