@@ -61,6 +61,7 @@ def network(opened: NeuralRenderer) -> NetworkRenderer:
 
 
 def test_light_of_lamps_is_what_is_left_when_nothing_is_gathered() -> None:
+    """And the smallest layers show what large ones show."""
     of_lamps = shown(DirectLightRenderer(resolution=PX))
     config = dataclasses.replace(hits_smoke(), gather_rays=0)
     # the network's picture went through log10(1 + radiance) in float32
@@ -68,12 +69,8 @@ def test_light_of_lamps_is_what_is_left_when_nothing_is_gathered() -> None:
         of_lamps, shown(network(untrained_network(config))), rtol=1e-4, atol=1e-5
     )
     assert of_lamps.max() > 0.01
-    everything = shown(network(traced_network()))
-    assert everything.mean() > of_lamps.mean(), "other surfaces send light too"
-
-
-def test_the_smallest_layers_show_what_large_ones_show() -> None:
     small = shown(network(traced_network()))
+    assert small.mean() > of_lamps.mean(), "other surfaces send light too"
     unfiltered = dataclasses.replace(hits_smoke(), filter_width=0)
     large = shown(network(untrained_network(unfiltered)))
     np.testing.assert_allclose(small, large, rtol=1e-3, atol=1e-4)  # sums in another order

@@ -83,22 +83,17 @@ def run(
     return run_plan(plan, HereReader(), lambda done, total: None, lambda now: None)
 
 
-def test_pictures_are_numbered_and_the_scene_is_opened_once(turn: Pairs, tmp_path: Path) -> None:
-    engine = FlatRenderer()
-    finished, notes = run([engine], tmp_path / "turn", turn)
+def test_pictures_are_numbered_and_what_is_there_is_kept(turn: Pairs, tmp_path: Path) -> None:
+    """The scene is opened once, and only the rest is made."""
+    out = tmp_path / "turn"
+    engine, again, nothing = FlatRenderer(), FlatRenderer(), FlatRenderer()
+    first, notes = run([engine], out, turn)
     assert (engine.opened, engine.rendered) == (1, 4)
     assert notes == ["tiny.safetensors: it was opened"]
-    names = sorted(path.name for path in (tmp_path / "turn").iterdir())
-    assert names == [f"{at:06d}.{suffix}" for at in range(4) for suffix in ("exr", "png")]
-    expected = [5, 3, 1, 3]
-    for shot, value in zip(finished, expected, strict=True):
-        np.testing.assert_allclose(decode_exr(shot.pictures["neural"].path.read_bytes()), value)
-
-
-def test_what_is_there_is_kept_and_only_the_rest_is_made(turn: Pairs, tmp_path: Path) -> None:
-    out, again = tmp_path / "turn", FlatRenderer()
-    first, _ = run([FlatRenderer()], out, turn)
     before = {path.name: path.read_bytes() for path in out.iterdir()}
+    assert sorted(before) == [f"{at:06d}.{suffix}" for at in range(4) for suffix in ("exr", "png")]
+    for shot, value in zip(first, [5, 3, 1, 3], strict=True):
+        np.testing.assert_allclose(decode_exr(shot.pictures["neural"].path.read_bytes()), value)
     (out / "000002.exr").unlink()
     (out / "000003.exr").write_bytes(before["000003.exr"][:200])
     second, _ = run([again], out, turn)
@@ -108,7 +103,6 @@ def test_what_is_there_is_kept_and_only_the_rest_is_made(turn: Pairs, tmp_path: 
     assert kept[1].facts == first[1].pictures["neural"].facts == {"number": 2, "half": 0.5}
     for shown in ("000000.png", "000003.png"):
         assert (out / shown).read_bytes() == before[shown]
-    nothing = FlatRenderer()
     run([nothing], out, turn)
     assert (nothing.opened, nothing.rendered) == (0, 0)
 

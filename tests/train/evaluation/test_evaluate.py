@@ -303,13 +303,12 @@ def test_facts_come_from_the_scene() -> None:
 
 
 def test_the_command_writes_report_and_sheets(
-    dataset: Dataset, weights: str, tmp_path: Path
+    dataset: Dataset, weights: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     out = tmp_path / "out"
     data = ["--data", str(dataset.folder.root)]
     command = ["evaluate", weights, *data, "--split", "validation", "--out", str(out)]
-    command += ["--tracer-views", "0"]
-    done = trilight([*command, "--json", "--resolution", "16"])
+    done = trilight([*command, "--json", "--resolution", "16", "--tracer-views", "0"])
     assert done.exit_code == 0, done.output
     found = json.loads((out / "evaluation.json").read_text())
     assert found["contestants"] == json.loads(done.output[done.output.index("{") :])["contestants"]
@@ -318,24 +317,18 @@ def test_the_command_writes_report_and_sheets(
     for name in ("worst.png", "median.png"):
         with Image.open(out / name) as sheet:
             assert min(sheet.size) > 200
-    shown = trilight([*command, "--most-scenes", "1"], env={"COLUMNS": "160"}).output.splitlines()
-    (scores,) = [line.split() for line in shown if line.split()[:1] == ["psnr_log_db"]]
+    monkeypatch.setenv("TRILIGHT_VARIANT", "none_such")
+    few = [*command, "--most-scenes", "1", "--tracer-views", "1"]
+    shown = trilight(few, env={"COLUMNS": "160"}).output
+    (scores,) = [line.split() for line in shown.splitlines() if "psnr_log_db" in line.split()[:1]]
     assert len(scores) == 1 + len(found["contestants"])  # a column for each
+    assert "The path tracer in that time is not shown: TRILIGHT_VARIANT is" in shown
+    assert "is not shown: TRILIGHT" in (out / "evaluation.md").read_text()
     missing = trilight(["evaluate", str(tmp_path / "no"), *data])
     assert isinstance(missing.exception, TrilightError)
     assert "no such file or folder" in str(missing.exception)
     empty = trilight(["evaluate", weights, *data])
     assert "the test split holds no scene" in str(empty.exception)
-
-
-def test_without_a_path_tracer_the_report_says_why(
-    dataset: Dataset, weights: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.setenv("TRILIGHT_VARIANT", "none_such")
-    data = ["--data", str(dataset.folder.root), "--split", "validation", "--most-scenes", "1"]
-    told = trilight(["evaluate", weights, *data, "--out", str(tmp_path / "out")]).output
-    assert "The path tracer in that time is not shown: TRILIGHT_VARIANT is" in told
-    assert "is not shown: TRILIGHT" in (tmp_path / "out" / "evaluation.md").read_text()
 
 
 @pytest.mark.slow("references")
