@@ -381,9 +381,9 @@ def test_a_sample_and_a_whole_shard(tmp_path: Path, shard: Path) -> None:
     convert(f"{shard}::000000003", tmp_path / "a.h5")
     convert(tmp_path / "a.h5", tmp_path / "b.h5")
     for name in ("a.h5", "b.h5"):
-        found = read_renderformer_h5(tmp_path / name).radiance_rgb
-        assert found is not None
-        assert np.array_equal(found, tiny_sample().radiance_rgb)
+        stored_rgb = read_renderformer_h5(tmp_path / name).radiance_rgb
+        assert stored_rgb is not None
+        assert np.array_equal(stored_rgb, tiny_sample().radiance_rgb)
     convert(tmp_path / "one.usdz", tmp_path / "c.h5")
     assert read_renderformer_h5(tmp_path / "c.h5").radiance_rgb is None
 
