@@ -158,24 +158,24 @@ def _material_rows(
 
 
 def _settings(options: AssetOptions) -> AssetSettings:
+    """Return the settings of the mesh stage; a tolerance is written as 0.5% or 0.005."""
     usual = _EPSILON_BUDGET if options.epsilon else _BUDGET
-    return AssetSettings(
-        profile=options.profile,
-        budgets=(usual if options.budget is None else options.budget,),
-        epsilon=_parse_fraction(options.epsilon) if options.epsilon else None,
-        watertight=options.watertight,
-        own_materials=OwnMaterialSettings(keep=options.own_materials),
-    )
-
-
-def _parse_fraction(text: str) -> float:
-    """Read 0.5% or 0.005."""
+    text = options.epsilon or ""
     try:
-        return float(text.removesuffix("%")) / (100 if text.endswith("%") else 1)
+        epsilon = (
+            float(text.removesuffix("%")) / (100 if text.endswith("%") else 1) if text else None
+        )
     except ValueError as error:
         raise TrilightError(
             f"--epsilon is {text!r}; expected a fraction of the diagonal such as 0.5% or 0.005."
         ) from error
+    return AssetSettings(
+        profile=options.profile,
+        budgets=(usual if options.budget is None else options.budget,),
+        epsilon=epsilon,
+        watertight=options.watertight,
+        own_materials=OwnMaterialSettings(keep=options.own_materials),
+    )
 
 
 def _print_table(report: "AssetReport") -> None:

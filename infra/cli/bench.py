@@ -8,7 +8,7 @@ from rich.table import Table
 from rich.text import Text
 
 from infra.bench_options import BenchOptions
-from infra.cli.console import console, first_words, progress_bars
+from infra.cli.console import console, first_words, progress
 from infra.cli.options import command
 from storage.errors import TrilightError
 from storage.settings.described import checked
@@ -39,7 +39,7 @@ _COLUMNS = 8
 @command("names", has_json=False)
 def bench(run_options: BenchRunOptions, options: BenchOptions) -> None:
     try:
-        from infra.bench.experiment import FULL, QUICK, Store, experiment_of
+        from infra.bench.experiment import FULL, QUICK, Store, every_experiment, experiment_of
         from infra.bench.run_benchmark import results_path, run
     except ModuleNotFoundError as error:
         if ".bench" not in (error.name or ""):
@@ -49,7 +49,10 @@ def bench(run_options: BenchRunOptions, options: BenchOptions) -> None:
             "repository and run the command there."
         ) from error
     if not run_options.names and not run_options.show:
-        _list_experiments()
+        table = Table("experiment", "what it measures", box=None)
+        for each in every_experiment().values():
+            table.add_row(each.name, each.title)
+        console.print(table)
         return
     if len(run_options.names) != 1:
         number = len(run_options.names)
@@ -64,15 +67,8 @@ def bench(run_options: BenchRunOptions, options: BenchOptions) -> None:
         _print_run(experiment, newest)
         return
     first_words(f"Measuring {experiment.name}: {experiment.title}")
-    with progress_bars() as bars:
-        task = bars.add_task("trials", total=None, note=experiment.name)
-        result = run(
-            experiment,
-            scale,
-            options,
-            out,
-            lambda done, total: bars.update(task, completed=done, total=total),
-        )
+    with progress("trials") as on_trial:
+        result = run(experiment, scale, options, out, on_trial)
     _print_run(experiment, result)
     console.print(f"Written: {out} and {out.with_suffix('.png').name}", style="bold")
 
@@ -103,12 +99,3 @@ def _print_run(experiment: "Experiment", run: "Run") -> None:
     ]
     for note in filter(None, notes):
         console.print(Text(note), soft_wrap=True)
-
-
-def _list_experiments() -> None:
-    from infra.bench.experiment import every_experiment
-
-    table = Table("experiment", "what it measures", box=None)
-    for experiment in every_experiment().values():
-        table.add_row(experiment.name, experiment.title)
-    console.print(table)

@@ -6,7 +6,7 @@ import os
 import re
 import shlex
 import time
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from types import MappingProxyType, TracebackType
 from typing import Any, Literal
 
@@ -205,6 +205,17 @@ def progress_bars() -> Bars:
         console=console,
         speed_estimate_period=300,
     )
+
+
+@contextlib.contextmanager
+def progress(noun: str) -> Iterator[Callable[..., None]]:
+    """Draw a bar of things called `noun` during the block; yield what moves it.
+
+    That takes the number of finished ones, of all, and a note.
+    """
+    with progress_bars() as bars:
+        task = bars.add_task(noun, total=None, note="")
+        yield lambda done, total, note="": bars.update(task, completed=done, total=total, note=note)
 
 
 def print_rows(title: str, rows: Sequence[tuple[str, str]]) -> None:

@@ -1,11 +1,22 @@
-"""`trilight convert`: writes a scene, a sample or a shard in another format."""
+"""`trilight convert`, `export` and `push`: scenes and datasets for other programs and people."""
 
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Literal
 
-from infra.cli.console import first_words, print_result, progress_bars
+from infra.cli.console import (
+    first_words,
+    next_step,
+    print_json,
+    print_result,
+    print_rows,
+    progress,
+    progress_bars,
+    suggest_look,
+)
 from infra.cli.options import command
+from pipeline.exchange.exports.export import ExportForm
 from pipeline.exchange.from_description import AlbedoOverOne
+from storage.remote.safe_url import safe_url
 from storage.settings.described import checked
 from storage.settings.ranges import Within
 
@@ -39,17 +50,104 @@ def convert(options: ConvertOptions) -> None:
         usd_folder=options.usd_folder,
         albedo_over_one=options.albedo_over_one,
     )
-    with progress_bars() as bars:
-        task = bars.add_task("files", total=None, note="")
-        result = convert_scene(
-            scene,
-            options.target,
-            budget=options.budget,
-            done=lambda now, total: bars.update(task, completed=now, total=total),
-        )
+    with progress("files") as done:
+        result = convert_scene(scene, options.target, budget=options.budget, done=done)
     files = [str(path) for path in result.files]
     record = {"files": files, "notes": list(result.notes), "triangles": result.triangles}
     more = len(files) - 1
     written = files[0] + (f" and {more} {'files' if more > 1 else 'file'} more" if more else "")
     rows = [("written", written), ("triangles", f"{result.triangles}")]
     print_result("Converted", rows, record, notes=result.notes)
+
+
+@checked()
+class ExportOptions:
+    """Source and format."""
+
+    source: str
+    """Dataset, a folder or a URL."""
+    form: ExportForm
+    """Format of the files. nerfstudio: transforms.json, images and depth. coco: masks and boxes.
+    huggingface: images, depth and ids for datasets.load_dataset. hypersim: HDF5 of reflectance,
+    illumination, residual and geometry (needs renders.split_lobes=true). energon: the shards as
+    they are, with NVIDIA Energon's metadata. h5, json, usd: each scene
+    as RenderFormer's HDF5, as its JSON with meshes, or as USD. exr: images as OpenEXR. benchmark:
+    the last four, each in its folder, with a table of views."""
+    out: Path
+    """Folder to write, which must be empty or not exist."""
+    split: Literal["train", "validation", "test"] | None = None
+    """Write only the scenes of this split; by default all."""
+    scene: str | None = None
+    """Key of the only scene to write; by default all."""
+
+
+@command("source")
+def export(options: ExportOptions) -> None:
+    first_words(f"Exporting {safe_url(options.source)} to {options.out}")
+    from pipeline.exchange.exports.export import export_dataset  # slow: Pillow
+
+    views: list[int] = []
+    """Number of views of each written scene."""
+    with progress_bars() as bars:
+        task = bars.add_task("scenes", total=None, note="")
+
+        def on_scene(num_views: int) -> None:
+            views.append(num_views)
+            bars.advance(task)
+
+        notes = export_dataset(
+            options.source,
+            options.form,
+            options.out,
+            split=options.split,
+            scene=options.scene,
+            done=on_scene,
+        )
+    about = {"form": options.form, "out": str(options.out)}
+    record = {**about, "scenes": len(views), "views": sum(views), "notes": list(notes)}
+    rows = [*about.items(), ("written", f"{len(views)} scenes, {sum(views)} views")]
+    print_result("Exported", rows, record, notes=notes)
+
+
+@checked()
+class PushOptions:
+    """Upload."""
+
+    folder: Path
+    """Finished dataset, folder with model.safetensors, or page with index.html."""
+    repository: str
+    """Repository USER/NAME, which is created if it is missing."""
+    private: bool = False
+    """Make a new repository private; refuse one that is public."""
+    dry_run: bool = False
+    """Check the folder and print the upload, but upload nothing."""
+
+
+@command("folder", "repository")
+def push(options: PushOptions) -> None:
+    first_words(f"Looking through {options.folder}")
+    from infra.release.push_to_hub import planned_upload
+    from infra.release.push_to_hub import push as upload_all
+
+    upload = planned_upload(options.folder, options.repository)
+    facts: dict[str, str | int] = {
+        "folder": str(upload.folder),
+        "repository": upload.repository,
+        "kind": upload.kind,
+        "files": upload.files,
+        "bytes": upload.num_bytes,
+    }
+    if not options.dry_run:
+        first_words(f"Uploading to {upload.repository}")
+        facts["address"] = upload_all(upload, private=options.private)
+    print_json(facts)
+    rows = [(name, str(value)) for name, value in facts.items() if name != "bytes"]
+    title = "Would be uploaded" if options.dry_run else "Uploaded"
+    print_rows(title, [*rows, ("size", f"{upload.num_bytes / 1e6:.1f} MB")])
+    if options.dry_run:
+        private = ["--private"] if options.private else []
+        next_step(["push", str(options.folder), options.repository, *private])
+    elif upload.kind == "dataset":
+        next_step(["verify", f"hf://datasets/{upload.repository}"])
+    else:
+        suggest_look(f"Look at {facts['address']}")

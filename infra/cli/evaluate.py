@@ -1,4 +1,4 @@
-"""`trilight evaluate`: compares a network, or all methods, with the pictures of a dataset."""
+"""`trilight evaluate` and `leaderboard`: compare a network, or all methods, with a dataset."""
 
 import dataclasses
 from pathlib import Path
@@ -7,11 +7,24 @@ from typing import Any
 from rich.table import Table
 from rich.text import Text
 
-from infra.cli.console import console, first_words, print_json, progress_bars, suggest_look
-from infra.cli.leaderboard import judge_methods
+from infra.cli.console import (
+    console,
+    first_words,
+    note,
+    print_json,
+    print_table,
+    progress,
+    suggest_look,
+)
 from infra.cli.options import command
 from infra.torch_library import require_torch
-from train.evaluation.options import EvaluationOptions
+from storage.remote.safe_url import safe_url
+from train.evaluation.options import EvaluationOptions, LeaderboardOptions
+
+_JUDGED_BY = (
+    "data", "split", "resolution", "most_scenes", "tracer_views", "lpips", "device"
+)  # fmt: skip
+"""Options that the evaluation of a network takes as they are."""
 
 
 @command("checkpoint")
@@ -20,9 +33,10 @@ def evaluate(options: EvaluationOptions) -> None:
     board = options.leaderboard()
     if options.checkpoint:
         if board:
-            from infra.leaderboard import check_leaderboard
+            from infra.judging import open_board
 
-            check_leaderboard(board)  # the evaluation before it may take hours
+            with open_board(board):  # checked first: the evaluation before it may take hours
+                pass
         record, out = _judge_network(options, options.checkpoint)
         board = board and dataclasses.replace(board, out=out)
     if board:
@@ -37,19 +51,12 @@ def _judge_network(options: EvaluationOptions, checkpoint: str) -> tuple[dict[st
     require_torch("evaluate")
     from infra.judging import judge_network, write_judgement
 
-    with progress_bars() as bars:
-        task = bars.add_task("scenes", total=None, note="")
+    with progress("scenes") as done:
         judgement = judge_network(
             checkpoint,
-            data=options.data,
-            split=options.split,
             train_data=options.train_data or None,
-            resolution=options.resolution,
-            most_scenes=options.most_scenes,
-            tracer_views=options.tracer_views,
-            lpips=options.lpips,
-            device=options.device,
-            done=lambda now, total: bars.update(task, completed=now, total=total),
+            done=done,
+            **{name: getattr(options, name) for name in _JUDGED_BY},
         )
     first_words("Drawing the sheets")
     record = judgement.record
@@ -59,7 +66,7 @@ def _judge_network(options: EvaluationOptions, checkpoint: str) -> tuple[dict[st
 
 
 def _report(record: dict[str, Any], out: Path) -> None:
-    from train.evaluation.equal_time import sentences
+    from train.evaluation.evaluate import sentences
     from train.evaluation.metrics import METRICS
 
     contestants = record["contestants"]
@@ -80,3 +87,53 @@ def _report(record: dict[str, Any], out: Path) -> None:
     for sentence in sentences(record["path tracer"]):
         console.print(sentence, soft_wrap=True)
     suggest_look(f"Read {out / 'evaluation.md'}, look at {out / 'worst.png'}")
+
+
+@command("source")
+def leaderboard(options: LeaderboardOptions) -> None:
+    print_json(judge_methods(options))
+
+
+def judge_methods(options: LeaderboardOptions) -> dict[str, Any]:
+    """Make a leaderboard and print it as text; return it as JSON values."""
+    first_words(f"Judging on {safe_url(options.source)}, into {options.out}")
+    require_torch("leaderboard")
+    from infra.judging import make_leaderboard
+
+    with progress("scenes") as on_progress:
+        board = make_leaderboard(options, on_progress)
+    for one in board.widths:
+        title = f"{one.width} x {one.width} pixels: median psnr_log_db of {one.num_views} views"
+        rows = [_row(each) for each in one.standings]
+        print_table(f"{title}, lead over {board.rival}", rows)
+    for text in board.notes:
+        note(text)
+    out = options.out
+    suggest_look(f"Read {out / 'leaderboard.md'}, look at {out / 'leaderboard.png'}")
+    widths = [
+        {
+            "width": one.width,
+            "views": one.num_views,
+            "scenes": one.num_scenes,
+            "standings": [dataclasses.asdict(each) for each in one.standings],
+        }
+        for one in board.widths
+    ]
+    return {"out": str(out), "rival": board.rival, "widths": widths}
+
+
+def _row(standing: Any) -> dict[str, str]:
+    from train.evaluation.cost_charts import number_text
+    from train.evaluation.metrics import METRIC, interval_text
+
+    lead = standing.lead
+    scores = standing.scores[METRIC]
+    ends = interval_text(lead.low, lead.high, 1) if lead is not None else ""
+    return {
+        "": standing.name,
+        "first, s": "" if standing.first_s is None else number_text(standing.first_s),
+        "further": "" if standing.further_s is None else number_text(standing.further_s),
+        "dB": f"{scores['median']:.1f}",
+        "5th": f"{scores['worse_5_percent']:.1f}",
+        "lead, dB": "" if lead is None else f"{lead.mean:+.1f}" + (f" ({ends})" if ends else ""),
+    }

@@ -81,7 +81,9 @@ def inspect(options: InspectOptions) -> None:
         task = bars.add_task("shards", total=total, note="")
         statistics = dataset_statistics(opened)
         distributions = dataset_distributions(opened, shard_done=lambda _: bars.advance(task))
-    folder = _folder_of_documents(opened, options.out)
+    folder = DatasetFolder(options.out) if options.out else opened.local
+    if folder and not options.out and not os.access(folder.root, os.W_OK | os.X_OK):
+        folder = None
     if folder is not None:
         _write(opened, statistics, distributions, folder, options)
     print_json(_as_json(opened, statistics, distributions))
@@ -101,21 +103,12 @@ def _inspect_run(root: Path) -> None:
 
 
 def _fact_rows(facts: Mapping[str, Any]) -> list[tuple[str, str]]:
-    return [(name.replace("_", " "), _fact_text(value)) for name, value in facts.items()]
+    def to_text(value: Any) -> str:
+        if isinstance(value, bool):
+            return "yes" if value else "no"
+        return f"{value:.4g}" if isinstance(value, float) and abs(value) < 1e4 else str(value)
 
-
-def _fact_text(value: Any) -> str:
-    if isinstance(value, bool):
-        return "yes" if value else "no"
-    return f"{value:.4g}" if isinstance(value, float) and abs(value) < 1e4 else str(value)
-
-
-def _folder_of_documents(opened: Dataset, out: Path | None) -> DatasetFolder | None:
-    """Return the folder for report and sheet; None where --out is missing and no folder fits."""
-    if out is not None:
-        return DatasetFolder(out)
-    folder = opened.local
-    return folder if folder and os.access(folder.root, os.W_OK | os.X_OK) else None
+    return [(name.replace("_", " "), to_text(value)) for name, value in facts.items()]
 
 
 def _inspect_scene(source: str, turntable: Path | None) -> None:

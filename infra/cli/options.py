@@ -109,10 +109,18 @@ def _parameter(field: FieldDescription, group: Group, *, by_place: bool) -> insp
     several = is_repeated(field.hint) or takes_names(field.hint)
     choices = choices_of(field.hint)
     kind = kind_of(field.hint)
-    complete = (lambda _: _known_names(field.name)) if field.name in NAMES else None
+    module, constant = NAMES.get(field.name, ("", ""))
+    complete = (
+        (lambda _: list(getattr(import_module(module_name(module)), constant))) if module else None
+    )
     word: Any = bool if kind is bool else str  # numbers are read when the class is made
     if kind is str and not (choices or complete or takes_names(field.hint)):
         word = FileName
+
+    def words_of(_: Any, tokens: tuple[Token, ...]) -> Any:
+        words = [token.value for token in tokens]
+        return words if several else words[0]
+
     names = dict.fromkeys([shown_name(field), option_of(field.name)])
     metavar = "CHOICE" if choices else _METAVARS.get(kind, "TEXT")
     declared = Parameter(
@@ -126,7 +134,7 @@ def _parameter(field: FieldDescription, group: Group, *, by_place: bool) -> insp
         choices=choices or None,
         json_list=False,
         completer=complete,
-        converter=None if kind is bool else _all_words if several else _first_word,
+        converter=None if kind is bool else words_of,
     )
     return inspect.Parameter(
         field.name,
@@ -156,14 +164,6 @@ def _help(
         sentence = f"{sentence[: clause.start()]}.{sentence[clause.end() :]}"
         facts.append(f"default: {_NONE.sub('none', clause[1])}")
     return f"{sentence} [{'; '.join(facts)}]" if facts else sentence
-
-
-def _first_word(_: Any, tokens: tuple[Token, ...]) -> str:
-    return tokens[0].value
-
-
-def _all_words(_: Any, tokens: tuple[Token, ...]) -> list[str]:
-    return [token.value for token in tokens]
 
 
 def _settings(kind: type, words_by_name: Mapping[str, Any]) -> Any:
@@ -244,8 +244,3 @@ NAMES = {
 }
 """Module and constant with the known names, by the field that takes one; a field may also take a
 name that is not listed."""
-
-
-def _known_names(field: str) -> list[str]:
-    module, constant = NAMES[field]
-    return list(getattr(import_module(module_name(module)), constant))

@@ -24,17 +24,58 @@ def presets(options: PresetOptions) -> None:
     if options.build is not None:
         _print_settings(options.build)
         return
-    tables = {
-        "Datasets: trilight generate PRESET": _datasets(),
-        "Trainings: trilight train PRESET": _trainings(),
-        "Networks: --checkpoint NAME": _networks(),
-        "Network sizes: --set model=SIZE": _sizes(),
-        "Objects: --objects SOURCE": _sources(),
-    }
+    tables = _names()
     print_json({title.split(":")[0].lower(): rows for title, rows in tables.items()})
     for title, rows in tables.items():
         print_table(title, rows)
         console.print()
+
+
+def _names() -> dict[str, list[dict[str, Any]]]:
+    """Return rows with each name that a command takes, by title."""
+    from infra.render.methods import BUILTIN_NETWORKS
+    from model.config import SIZES
+    from pipeline.objects.sources import SOURCES
+    from pipeline.presets.registry import DATASET_PRESETS
+    from train.presets import TRAINING_PRESETS
+
+    datasets = {name: (preset, preset.settings()) for name, preset in DATASET_PRESETS.items()}
+    trainings = {name: preset() for name, preset in TRAINING_PRESETS.items()}
+    sizes = {name: size() for name, size in SIZES.items()}
+    sources = ("FOLDER", *(f"{name}:" for name in SOURCES))
+    return {
+        "Datasets: trilight generate PRESET": [
+            {
+                "name": _name_for_people(name, PRESET_ALIASES),
+                "scenes": preset.num_scenes,
+                "views": settings.scenes.num_views,
+                "pixels": settings.renders.resolution,
+                "dB": settings.renders.noise_floor_db or "",
+                "triangles": settings.scenes.max_triangles,
+            }
+            for name, (preset, settings) in datasets.items()
+        ],
+        "Trainings: trilight train PRESET": [
+            {
+                "name": _name_for_people(name, PRESET_ALIASES),
+                "pixels": run.resolution,
+                "steps": run.num_steps,
+                "scenes a step": run.scenes_per_step,
+                "triangles": run.most_triangles or "",
+            }
+            for name, run in trainings.items()
+        ],
+        "Networks: --checkpoint NAME": [
+            {"name": _name_for_people(name, NETWORKS)} for name in BUILTIN_NETWORKS
+        ],
+        "Network sizes: --set model=SIZE": [
+            {"name": name, "width": size.width, "kind": size.view_stage}
+            for name, size in sizes.items()
+        ],
+        "Objects: --objects SOURCE": [
+            {"name": _name_for_people(name, OBJECTS)} for name in sources
+        ],
+    }
 
 
 def _print_settings(name: str) -> None:
@@ -73,62 +114,3 @@ def _name_for_people(name: str, aliases: Mapping[str, str]) -> str:
     """Return the name for people of a stored one, and the stored one where it is another."""
     alias = name_for_people(name, aliases)
     return name if alias == name else f"{alias} (stored: {name})"
-
-
-def _datasets() -> list[dict[str, Any]]:
-    from pipeline.presets.registry import DATASET_PRESETS
-
-    rows = []
-    for name, preset in DATASET_PRESETS.items():
-        settings = preset.settings()
-        rows.append(
-            {
-                "name": _name_for_people(name, PRESET_ALIASES),
-                "scenes": preset.num_scenes,
-                "views": settings.scenes.num_views,
-                "pixels": settings.renders.resolution,
-                "dB": settings.renders.noise_floor_db or "",
-                "triangles": settings.scenes.max_triangles,
-            }
-        )
-    return rows
-
-
-def _trainings() -> list[dict[str, Any]]:
-    from train.presets import TRAINING_PRESETS
-
-    rows = []
-    for name, preset in TRAINING_PRESETS.items():
-        settings = preset()
-        rows.append(
-            {
-                "name": _name_for_people(name, PRESET_ALIASES),
-                "pixels": settings.resolution,
-                "steps": settings.num_steps,
-                "scenes a step": settings.scenes_per_step,
-                "triangles": settings.most_triangles or "",
-            }
-        )
-    return rows
-
-
-def _networks() -> list[dict[str, Any]]:
-    from infra.render.methods import BUILTIN_NETWORKS
-
-    return [{"name": _name_for_people(name, NETWORKS)} for name in BUILTIN_NETWORKS]
-
-
-def _sizes() -> list[dict[str, Any]]:
-    from model.config import SIZES
-
-    return [
-        {"name": name, "width": size().width, "kind": size().view_stage}
-        for name, size in SIZES.items()
-    ]
-
-
-def _sources() -> list[dict[str, Any]]:
-    from pipeline.objects.sources import SOURCES
-
-    names = ("FOLDER", *(f"{name}:" for name in SOURCES))
-    return [{"name": _name_for_people(name, OBJECTS)} for name in names]

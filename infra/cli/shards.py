@@ -6,6 +6,7 @@ from typing import Annotated, Literal
 
 from cyclopts import App, Group
 
+from infra.cli.commands import HELP_FLAGS
 from infra.cli.console import (
     first_words,
     next_step,
@@ -13,9 +14,8 @@ from infra.cli.console import (
     print_json,
     print_result,
     print_table,
-    progress_bars,
+    progress,
 )
-from infra.cli.everyday import HELP_FLAGS
 from infra.cli.options import command
 from pipeline.generation.derive_dataset import DeriveOptions, Selection
 from pipeline.generation.derive_dataset import list_scenes as read_scene_rows
@@ -106,14 +106,9 @@ def select(options: SelectOptions, new: NewDatasetOptions) -> None:
 @command("dataset")
 def list_scenes(chosen: SelectOptions) -> None:
     first_words(f"Reading {chosen.dataset}")
-    with progress_bars() as bars:
-        task = bars.add_task("shards", total=None, note="")
+    with progress("shards") as done:
         source = open_finished(str(chosen.dataset))
-        rows = read_scene_rows(
-            source,
-            chosen.selection,
-            progress=lambda done, total: bars.update(task, completed=done, total=total),
-        )
+        rows = read_scene_rows(source, chosen.selection, progress=done)
     of = source.manifest.num_samples
     print_json({"of": of, "scenes": rows})
     print_table(
@@ -138,14 +133,8 @@ def _run(datasets: Sequence[Path], derive: DeriveOptions, out: Path) -> None:
     from pipeline.generation.derive_dataset import derive_dataset  # slow: matplotlib
 
     places = [str(path) for path in datasets]
-    with progress_bars() as bars:
-        task = bars.add_task("shards", total=None, note="")
-        digest, statistics = derive_dataset(
-            places,
-            derive,
-            out,
-            progress=lambda done, total: bars.update(task, completed=done, total=total),
-        )
+    with progress("shards") as done:
+        digest, statistics = derive_dataset(places, derive, out, progress=done)
     record = {
         "bytes": statistics.num_bytes,
         "dataset_digest": digest,

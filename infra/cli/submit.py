@@ -7,6 +7,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 from cyclopts import App, Group
 
+from infra.cli.commands import HELP_FLAGS
 from infra.cli.console import (
     console,
     first_words,
@@ -16,11 +17,9 @@ from infra.cli.console import (
     print_rows,
     progress_bars,
 )
-from infra.cli.everyday import HELP_FLAGS
 from infra.cli.options import command
 from infra.cli.overrides import BaseSettings, with_base_settings
 from pipeline.executors.slurm_and_kubernetes import (
-    ArrayJob,
     DatasetByArray,
     KubernetesOptions,
     array_job,
@@ -174,7 +173,11 @@ def submit_to_array(
     record: dict[str, Any] = {"array": numbers, "shards_per_task": job.per_task}
     if isinstance(scheduler, SlurmOptions):
         name = None if array.dry_run else submit_slurm_array(job, scheduler.sbatch)
-        line = _slurm_line(job, scheduler.sbatch)
+        variables = sbatch_environment(job).items()
+        words = sbatch_command(job, scheduler.sbatch)
+        set_all = [f"{name}={shlex.quote(value)}" for name, value in variables]
+        # without the folder of the logs all tasks fail
+        line = " ".join(["mkdir -p logs &&", *set_all, shlex.join(words)])
     else:
         manifest = (write_job_file if array.dry_run else submit_job)(job, scheduler)
         name = manifest.parent.name
@@ -190,13 +193,6 @@ def submit_to_array(
         return
     note("the same command submits again what is missing then, once no task is left in the queue")
     next_step(["status", options.place])
-
-
-def _slurm_line(job: ArrayJob, options: Sequence[str]) -> str:
-    """Return the shell command; it makes the folder of the logs, without which all tasks fail."""
-    variables = sbatch_environment(job).items()
-    settings = [f"{name}={shlex.quote(value)}" for name, value in variables]
-    return " ".join(["mkdir -p logs &&", *settings, shlex.join(sbatch_command(job, options))])
 
 
 def run_flow(flow: str, parameters: Mapping[str, Any], runs: FlowRunOptions, *, where: str) -> bool:

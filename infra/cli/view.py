@@ -50,7 +50,8 @@ def view(options: ViewOptions) -> None:
     threading.Thread(target=server.serve_forever, daemon=True).start()
     suggest_look(f"Look at {server.address}")
     console.print("Only this machine reaches it, with this address. Ctrl-C ends it.", style="dim")
-    if not options.no_browser and _has_screen():
+    screens = ("DISPLAY", "WAYLAND_DISPLAY")  # without one a browser takes over the terminal
+    if not options.no_browser and (sys.platform != "linux" or any(map(os.environ.get, screens))):
         webbrowser.open(server.address)
     room = open_handlers(options.source, checkpoint=options.checkpoint, threads=options.threads)
     for number in (signal.SIGINT, signal.SIGTERM):
@@ -62,9 +63,3 @@ def view(options: ViewOptions) -> None:
     server.shutdown()
     server.server_close()
     console.print("Ended.", style="dim")
-
-
-def _has_screen() -> bool:
-    """Return whether a browser would open a window instead of taking over the terminal."""
-    screens = ("DISPLAY", "WAYLAND_DISPLAY")
-    return sys.platform != "linux" or any(os.environ.get(name) for name in screens)

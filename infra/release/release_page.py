@@ -23,7 +23,7 @@ from storage.markdown import front_matter
 from storage.records.sample import Sample
 from storage.renderer import Camera, Renderer
 from train.evaluation.evaluate import judge_view
-from train.evaluation.judged_view import METRIC
+from train.evaluation.metrics import METRIC
 from train.evaluation.sheet import ERROR_WHITE, error_picture
 from train.evaluation.validation import validation_scene
 

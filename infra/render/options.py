@@ -5,10 +5,9 @@ from typing import Annotated, Literal
 
 from infra.render.quality import (
     MOST_TRACED_SPP,
-    ErrorBudget,
+    Budget,
     FixedSamples,
     Quality,
-    TimeBudget,
     ToStatedError,
 )
 from infra.render.tone_mapping import ToneMap
@@ -117,9 +116,9 @@ class RenderOptions:
     def quality(self) -> Quality:
         """Quality of traced images, or the budget that chooses it."""
         if self.seconds is not None:
-            return TimeBudget(seconds=self.seconds)
+            return Budget("--seconds", self.seconds)
         if self.error_db is not None:
-            return ErrorBudget(error_db=self.error_db)
+            return Budget("--error", self.error_db)
         if self.spp is not None:
             return FixedSamples(spp=self.spp, denoiser=self.denoiser or usual_filter(self.spp))
         return ToStatedError(

@@ -16,6 +16,7 @@ from typing import Any
 from infra.render.quality import FixedSamples, ToStatedError
 from pipeline.isolation import ChildFailed, ChildLimits, IsolatedChild, Result, with_retries
 from pipeline.renders.mitsuba_variant import Variant, activate, environment
+from pipeline.renders.noise_floor import MeasuredFloor
 from pipeline.renders.preview import Preview, PreviewRenderer, PreviewSettings
 from pipeline.renders.renderer import SceneRenderer, set_threads
 from pipeline.renders.results import GrowingPicture, RenderedView
@@ -241,31 +242,27 @@ def image_of(picture: GrowingPicture | RenderedView | Preview) -> Image:
     )
 
 
-def _expected_facts(view: RenderedView) -> dict[str, Fact]:
-    """Return the expected errors; empty where the stated ones are bounds."""
-    expected = view.expected_error
-    if expected is None:
-        return {}
-    return {
-        "expected_error_db": round(expected.log_db, 3),
-        "expected_error_linear_db": round(expected.linear_db, 3),
-        "object_expected_error_db": round(expected.object_log_db, 3),
-    }
-
-
 def _measured_facts(view: RenderedView) -> Mapping[str, Fact]:
-    facts: dict[str, Fact] = {
-        "noise_floor_db": round(view.noise_floor_db, 3),
-        "noise_floor_linear_db": round(view.noise_floor_linear_db, 3),
-        "object_noise_floor_db": round(view.object_noise_floor_db, 3),
-        **_expected_facts(view),
-        "at_cap": int(view.at_cap),
-        "mean_radiance": float(f"{view.radiance_rgb.mean(dtype='float64'):.6g}"),
-    }
+    stated = MeasuredFloor(
+        log_db=view.noise_floor_db,
+        linear_db=view.noise_floor_linear_db,
+        object_log_db=view.object_noise_floor_db,
+    )
+    facts = _floor_facts(stated)
+    if view.expected_error is not None:
+        facts |= _floor_facts(view.expected_error, "expected_error")
+    facts["at_cap"] = int(view.at_cap)
+    facts["mean_radiance"] = float(f"{view.radiance_rgb.mean(dtype='float64'):.6g}")
     for part, floor in (view.part_floors or {}).items():
-        facts |= {
-            f"{part}.noise_floor_db": round(floor.log_db, 3),
-            f"{part}.noise_floor_linear_db": round(floor.linear_db, 3),
-            f"{part}.object_noise_floor_db": round(floor.object_log_db, 3),
-        }
+        facts |= _floor_facts(floor, prefix=f"{part}.")
     return facts
+
+
+def _floor_facts(
+    floor: MeasuredFloor, name: str = "noise_floor", prefix: str = ""
+) -> dict[str, Fact]:
+    return {
+        f"{prefix}{name}_db": round(floor.log_db, 3),
+        f"{prefix}{name}_linear_db": round(floor.linear_db, 3),
+        f"{prefix}object_{name}_db": round(floor.object_log_db, 3),
+    }

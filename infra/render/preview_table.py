@@ -20,7 +20,7 @@ from typing import Annotated, Any, Literal
 import numpy as np
 
 from infra.processor import processor
-from infra.render.quality import Budget, FixedSamples, TimeBudget
+from infra.render.quality import Budget, FixedSamples
 from pipeline.renders.mitsuba_variant import Variant
 from pipeline.renders.preview import MOST_SPP, SCENE, preview_parts, seconds_of
 from pipeline.renders.settings import Filtered, Resolution
@@ -273,44 +273,31 @@ def price_all(
     return priced
 
 
-def choose_within(candidates: Sequence[Priced], seconds: float) -> tuple[Priced, bool]:
-    """Return the candidate of least error within the seconds, the cheaper of equals, and True.
-
-    Where none fits, return the fastest candidate and False.
-    """
-    fitting = [one for one in candidates if one.seconds <= seconds]
-    if not fitting:
-        return min(candidates, key=lambda one: (one.seconds, -one.db)), False
-    return max(fitting, key=lambda one: (one.db, -one.seconds)), True
-
-
-def choose_reaching(candidates: Sequence[Priced], db: float, width: int) -> Priced:
-    """Return the fastest candidate whose median error reaches `db`, the better of equals.
-
-    Raises:
-        TrilightError: none reaches it.
-    """
-    good = [one for one in candidates if one.db >= db]
-    if not good:
-        most = max(one.db for one in candidates)
-        raise TrilightError(
-            f"--error is {db:g}; expected at most {math.floor(10 * most) / 10} dB at {width} "
-            f"pixels, the most that previews reach; --noise-floor {db:g} samples until the error "
-            "is measured to be that."
-        )
-    return min(good, key=lambda one: (one.seconds, -one.db))
-
-
 def choose(
     budget: Budget, candidates: Sequence[Priced], *, scenes: int, costs: str, width: int
 ) -> Choice:
-    """Return the choice for a budget; raises TrilightError as `choose_reaching`."""
-    if isinstance(budget, TimeBudget):
-        priced, fits = choose_within(candidates, budget.seconds)
+    """Return the candidate of least error within the seconds, or the fastest with the error.
+
+    Of equals it is the cheaper or the better one. Where none is as quick, it is the fastest one.
+
+    Raises:
+        TrilightError: none reaches the error.
+    """
+    limit = budget.limit
+    by_time = budget.option == "--seconds"
+    good = [one for one in candidates if (one.seconds <= limit if by_time else one.db >= limit)]
+    if not good and not by_time:
+        most = max(one.db for one in candidates)
+        raise TrilightError(
+            f"--error is {limit:g}; expected at most {math.floor(10 * most) / 10} dB at {width} "
+            f"pixels, the most that previews reach; --noise-floor {limit:g} samples until the "
+            "error is measured to be that."
+        )
+    if good and by_time:
+        priced = max(good, key=lambda one: (one.db, -one.seconds))
     else:
-        priced = choose_reaching(candidates, budget.error_db, width)
-        fits = True
-    return Choice(budget=budget, priced=priced, fits=fits, scenes=scenes, costs=costs)
+        priced = min(good or candidates, key=lambda one: (one.seconds, -one.db))
+    return Choice(budget=budget, priced=priced, fits=bool(good), scenes=scenes, costs=costs)
 
 
 def _part_seconds(costs: PictureCosts, width: int, threads: int) -> dict[str, float]:

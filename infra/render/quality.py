@@ -2,7 +2,7 @@
 
 from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, Literal
 
 from pipeline.renders.preview import PreviewSettings
 from pipeline.renders.settings import (
@@ -82,28 +82,18 @@ class FixedSamples:
         return PreviewSettings(resolution=resolution, spp=self.spp, denoiser=self.denoiser)
 
 
-@dataclass(frozen=True, kw_only=True)
-class TimeBudget:
-    """The least expected error within wall-clock seconds a picture."""
+@dataclass(frozen=True)
+class Budget:
+    """The least expected error in some seconds a picture, or the least time to a median error."""
 
-    seconds: float
-
-    def __str__(self) -> str:
-        """Return the option of the command line."""
-        return f"--seconds {self.seconds:g}"
-
-
-@dataclass(frozen=True, kw_only=True)
-class ErrorBudget:
-    """The least expected time to an expected median error as psnr_log_db."""
-
-    error_db: float
+    option: Literal["--seconds", "--error"]
+    limit: float
+    """Wall-clock seconds a picture, or dB of psnr_log_db."""
 
     def __str__(self) -> str:
         """Return the option of the command line."""
-        return f"--error {self.error_db:g}"
+        return f"{self.option} {self.limit:g}"
 
 
 Traced = ToStatedError | FixedSamples
-Budget = TimeBudget | ErrorBudget
 Quality = Traced | Budget

@@ -7,19 +7,18 @@ pixels is hardly seen; one that jumps is (storage.metrics.flicker_log_db).
 
 import itertools
 import time
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from contextlib import ExitStack, closing
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, Protocol
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 from PIL import Image as Picture
 from PIL import ImageDraw, ImageFont
 
-from infra.render.output_paths import write_video
-from infra.render.plan import RenderPlan, Shot
+from infra.render.plan import RenderPlan, Shot, write_video
 from infra.render.preview_table import Choice
 from infra.render.sources import own_camera
 from infra.render.tone_mapping import Look, display_pixels, enlarge
@@ -37,7 +36,7 @@ from storage.records.lights import num_lights, rounded_to_half
 from storage.records.safe_read import read_plain
 from storage.records.scene import Scene
 from storage.records.scene_file import scene_digest
-from storage.renderer import Camera, Fact, Facts, Image, OnProgress, ReadyScene, Renderer, Sampling
+from storage.renderer import Camera, Fact, Facts, Image, OnProgress, ReadyScene, Renderer
 from train.evaluation.error_colors import ERROR_WHITE, error_picture
 
 _CAPTION_PX = 24
@@ -58,18 +57,12 @@ class Frame:
     """Stated error of the traced picture as psnr_log_db."""
 
 
-@dataclass(frozen=True, kw_only=True)
-class Flicker:
-    """Change of the network's error between two consecutive frames; at most 100 dB."""
+def flicker(before: Frame | None, now: Frame) -> Mapping[str, float] | None:
+    """Return the change of the network's error between two consecutive frames, at most 100 dB.
 
-    db: float
-    """Flicker in dB; a higher value is calmer."""
-    noise_db: float
-    """Flicker in dB of the traced pictures' noise alone, an upper bound for any network."""
-
-
-def flicker(before: Frame | None, now: Frame) -> Flicker | None:
-    """Return the flicker from one frame to the next; None where their scenes do not belong."""
+    `db` is higher where it is calmer; `noise_db` is that of the traced pictures' noise alone, an
+    upper bound for any network. None where the scenes do not belong together.
+    """
     if before is None:
         return None
     # one scene or frames of one stage, unlike the scenes of a shard
@@ -78,7 +71,7 @@ def flicker(before: Frame | None, now: Frame) -> Flicker | None:
         return None
     noise = 10 ** (-before.noise_floor_db / 10) + 10 ** (-now.noise_floor_db / 10)
     noise_db = float(-10 * np.log10(max(noise, 1e-10)))
-    return Flicker(db=flicker_log_db(before.error_RR3, now.error_RR3), noise_db=noise_db)
+    return {"db": flicker_log_db(before.error_RR3, now.error_RR3), "noise_db": noise_db}
 
 
 def comparison_sheet(
@@ -217,32 +210,24 @@ class FinishedShot:
     """Files by the name of their renderer."""
     psnr_log_db: float | None
     """PSNR of the network's picture against the traced one; None without both."""
-    flicker: Flicker | None
+    flicker: Mapping[str, float] | None
     """Flicker since the preceding picture of the scene or stage; None without both renderers."""
 
 
-@dataclass(frozen=True, kw_only=True, eq=False)
-class RenderResult:
-    """Result of a plan."""
-
-    plan: RenderPlan
-    shots: Sequence[FinishedShot]
-    notes: Sequence[str]
-    """Warnings about scenes and pictures, each once."""
-
-
-class RenderProgress(Protocol):
-    """Callbacks on the progress of a render."""
-
-    def on_picture(self, done: int, total: int) -> None:
-        """Report the number of finished pictures and of all."""
-
-    def on_samples(self, now: Sampling | Image) -> None:
-        """Report a finished pass of the path tracer."""
-
-
-def run_plan(plan: RenderPlan, reader: SceneReader, watcher: RenderProgress) -> RenderResult:
+def run_plan(
+    plan: RenderPlan,
+    reader: SceneReader,
+    on_picture: Callable[[int, int], None],
+    on_samples: OnProgress,
+) -> tuple[list[FinishedShot], list[str]]:
     """Render every picture of a plan, and write the video.
+
+    Args:
+        on_picture: called with the number of finished pictures and of all.
+        on_samples: called after each pass of the path tracer.
+
+    Returns:
+        The pictures, and warnings about scenes and pictures, each once.
 
     Raises:
         TrilightError: a network or a scene cannot be loaded or rendered, or a file cannot be
@@ -254,21 +239,21 @@ def run_plan(plan: RenderPlan, reader: SceneReader, watcher: RenderProgress) -> 
     with ExitStack() as stack:
         for renderer in plan.renderers:
             stack.enter_context(closing(renderer))
-        watcher.on_picture(0, len(plan.shots))
+        on_picture(0, len(plan.shots))
         for source, shots in itertools.groupby(plan.shots, key=lambda shot: shot.source):
             source_scene = reader.load(source)
-            scene = _SceneAtHand(source, source_scene.scene, plan.choice, watcher.on_samples)
+            scene = _SceneAtHand(source, source_scene.scene, plan.choice, on_samples)
             for shot in shots:
                 made = {each.name: scene.picture(shot, each) for each in plan.renderers}
                 done, before = _finish(shot, scene, made, plan.look, before)
                 finished.append(done)
-                watcher.on_picture(len(finished), len(plan.shots))
+                on_picture(len(finished), len(plan.shots))
             notes |= dict.fromkeys([*source_scene.notes, *scene.notes])
     if plan.output.video is not None:
         write_video(plan.output.video, [done.shot.png for done in finished], plan.fps)
     for renderer in plan.renderers:
         notes |= dict.fromkeys(_caveats(renderer, finished))
-    return RenderResult(plan=plan, shots=finished, notes=list(notes))
+    return finished, list(notes)
 
 
 class _SceneAtHand:

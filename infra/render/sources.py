@@ -28,25 +28,23 @@ def scene_sources(text: str, reader: SceneReader) -> list[SceneSource]:
         TrilightError: a file is unusable, or there is no scene.
     """
     if "://" not in text and Path(text).is_dir():
-        return [scene_source(str(path)) for path in _scene_files(Path(text))]
+        paths = [
+            path for path in Path(text).iterdir() if path.suffix.lower() in readable_suffixes()
+        ]
+        if not paths:
+            raise TrilightError(
+                f"{text}: holds no scene file; expected files that end in "
+                f"{' '.join(readable_suffixes())}."
+            )
+        return [scene_source(str(path)) for path in sorted(paths, key=_by_number)]
     names = expand_pattern(text, "scenes") if "{" in text else [text]
     files = [scene_source(name, many=True) for name in names]
     return [scene for source in files for scene in reader.scenes_of(source)]
 
 
-def _scene_files(folder: Path) -> list[Path]:
-    paths = [path for path in folder.iterdir() if path.suffix.lower() in readable_suffixes()]
-    if not paths:
-        raise TrilightError(
-            f"{folder}: holds no scene file; expected files that end in "
-            f"{' '.join(readable_suffixes())}."
-        )
-    return sorted(paths, key=lambda path: _by_number(path.name))
-
-
-def _by_number(name: str) -> list[tuple[int, str]]:
+def _by_number(path: Path) -> list[tuple[int, str]]:
     """Return a key that sorts frame9 before frame10."""
-    parts = re.split(r"([0-9]+)", name)
+    parts = re.split(r"([0-9]+)", path.name)
     return [(int(part), part) if part.isdecimal() else (-1, part) for part in parts]
 
 

@@ -24,8 +24,8 @@ from storage.dataset.dataset import Dataset, open_dataset
 from storage.digests import sha256_hex
 from storage.errors import TrilightError
 from storage.records.objects import read_objects_lock
-from train.evaluation.equal_time import sentences
-from train.evaluation.judged_view import NETWORK
+from train.evaluation.evaluate import sentences
+from train.evaluation.metrics import NETWORK
 from train.evaluation.report_pages import scores_table, swapped_text
 from train.folder import RunFolder
 

@@ -7,7 +7,7 @@ from pathlib import Path
 
 import pytest
 
-from infra.leaderboard import _bytes_of
+from infra.judging import _bytes_of
 from model.weights import read_metadata, read_tensors
 from pipeline.objects.local.folder import file_text
 from storage.dataset.manifest import index_shard, read_head, read_manifest

@@ -12,8 +12,8 @@ import numpy as np
 import pytest
 import torch
 
-from infra import leaderboard as run_module
-from infra.leaderboard import (
+from infra import judging as run_module
+from infra.judging import (
     NEAREST_OTHER,
     NEAREST_TRAINED,
     Leaderboard,
@@ -34,23 +34,22 @@ from tests.for_each import case
 from tests.model.kit import awake, publishable
 from tests.train.toy import VIEWS, toy_sample, write_toy_dataset
 from train.evaluation import leaderboard as board_module
-from train.evaluation.chart import plot_leaderboard
-from train.evaluation.equal_time import Price
-from train.evaluation.judged_view import METRIC, NETWORK
+from train.evaluation.evaluate import Price
 from train.evaluation.leaderboard import (
     NOISE,
     UNKNOWN_MACHINE,
     Row,
     RowKey,
     Rows,
-    Standing,
-    WidthStandings,
 )
+from train.evaluation.metrics import NETWORK
 from train.evaluation.options import LeaderboardOptions
 from train.evaluation.validation import PictureSource, nearest_view
 
 PX = 16
 SHIPPED = {"network builtin:", "network builtin:tokens"}
+PERFECT = r"perfect $\nothing$"
+"""Folder of the targets; matplotlib would refuse the end of its name as a formula."""
 
 
 @pytest.fixture(scope="module")
@@ -59,7 +58,7 @@ def root(tmp_path_factory: pytest.TempPathFactory) -> Path:
     root = tmp_path_factory.mktemp("board")
     write_toy_dataset(root / "toy", train=3, validation=3, per_shard=3, resolution=PX)
     export_dataset(
-        str(root / "toy"), "exr", root / "perfect", split=None, scene=None, done=lambda _: None
+        str(root / "toy"), "exr", root / PERFECT, split=None, scene=None, done=lambda _: None
     )
     save_published(awake(publishable("dpt"), torch.float32), root / "renderformer-v1-base")
     return root
@@ -105,23 +104,23 @@ def test_who_is_asked_for_stands_beside_those_who_never_lack(
     order: LeaderboardOptions, root: Path
 ) -> None:
     asked = dataclasses.replace(
-        order, pictures=(root / "perfect",), checkpoint=(str(root / "renderformer-v1-base"),)
+        order, pictures=(root / PERFECT,), checkpoint=(str(root / "renderformer-v1-base"),)
     )
     board = board_of(asked)
     (one,) = board.widths
     assert (one.width, one.num_scenes, one.num_views) == (PX, 2, 2 * VIEWS)
     names = [each.name for each in one.standings]
-    assert names[:2] == [NOISE, "pictures of perfect"], "the best comes first"
+    assert names[:2] == [NOISE, f"pictures of {PERFECT}"], "the best comes first"
     assert set(names[2:]) == SHIPPED | {
         DIRECT_LIGHT, TRACED_LIGHT, NEAREST_TRAINED, "network renderformer-v1-base",
     }  # fmt: skip
     assert board.rival == "network renderformer-v1-base"
     rows = {row["name"]: row for row in tables(asked.out, "leaderboard.csv")}
-    assert float(rows["pictures of perfect"]["psnr_log_db_median"]) > 60, "half floats aside"
+    assert float(rows[f"pictures of {PERFECT}"]["psnr_log_db_median"]) > 60, "half floats aside"
     assert rows[NOISE]["psnr_log_db_median"] == "100.0" and rows[NOISE]["lead_mean_db"] == ""
     for name in SHIPPED | {DIRECT_LIGHT, TRACED_LIGHT}:
         assert float(rows[name]["first_core_s"]) > 0 < float(rows[name]["further_core_s"]), name
-    assert rows["pictures of perfect"]["first_core_s"] == ""
+    assert rows[f"pictures of {PERFECT}"]["first_core_s"] == ""
     pairs = {(row["name"], row["than"]): row for row in tables(asked.out, "pairs.csv")}
     lead = pairs[DIRECT_LIGHT, board.rival]
     assert float(lead["mean_db"]) == float(rows[DIRECT_LIGHT]["lead_mean_db"])
@@ -136,7 +135,7 @@ def test_who_is_asked_for_stands_beside_those_who_never_lack(
 def test_nothing_is_judged_twice_and_what_changed_is_judged_again(
     short: LeaderboardOptions, root: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    mine = shutil.copytree(root / "perfect", tmp_path / "mine")
+    mine = shutil.copytree(root / PERFECT, tmp_path / "mine")
     asked = dataclasses.replace(short, pictures=(mine,))
     before = board_of(asked)
     lines = (asked.out / "rows.jsonl").read_text().splitlines()
@@ -280,7 +279,7 @@ def test_mistakes_are_one_line(order: LeaderboardOptions, root: Path) -> None:
     with pytest.raises(TrilightError, match=r"is there twice"):
         board_of(twice)
     with pytest.raises(TrilightError, match="another folder has the same name"):
-        board_of(dataclasses.replace(order, pictures=(root / "perfect",) * 2))
+        board_of(dataclasses.replace(order, pictures=(root / PERFECT,) * 2))
     lacks = dataclasses.replace(order, pictures=(root / "toy",))
     with pytest.raises(TrilightError, match=r"4 of 4 pictures are missing"):
         board_of(lacks)
@@ -407,22 +406,3 @@ def test_a_file_of_something_else_is_refused(tmp_path: Path) -> None:
             (tmp_path / "rows.jsonl").write_text(text)
             with pytest.raises(TrilightError, match=said):
                 Rows(tmp_path / "rows.jsonl", "set a")
-
-
-FORMULA = r"runs of $\nothing$"
-"""What matplotlib refuses as a formula."""
-
-
-def test_dollar_signs_in_names_are_no_formula(tmp_path: Path) -> None:
-    priced, unpriced = (
-        Standing(
-            name=FORMULA, kind="network", price=price, timed_scenes=1,
-            scores={METRIC: {"median": 30.0}}, lead=None, on_front=None,
-        )
-        for price in (Price(first_s=0.5, further_s=0.5), None)
-    )  # fmt: skip
-    one = WidthStandings(
-        width=64, num_views=1, triangles={"a": 1}, standings=(priced, unpriced), pairs={}
-    )
-    plot_leaderboard([one], FORMULA, tmp_path / "board.png")
-    assert (tmp_path / "board.png").read_bytes().startswith(b"\x89PNG")

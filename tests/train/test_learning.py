@@ -47,7 +47,7 @@ from tests.train.toy import (
     write_toy_dataset,
 )
 from train.evaluation.evaluate import judge_views, make_baselines
-from train.evaluation.judged_view import NETWORK, summarize_views
+from train.evaluation.metrics import NETWORK, summarize_views
 from train.evaluation.validation import MEDIAN, NEAREST
 from train.loop.distributed import DistributedContext
 from train.loss.lpips import LINEAR_FILE, VGG16_FILE, load_lpips

@@ -1,15 +1,22 @@
 """Charts of errors against costs: a marker for each cost, a color for each kind, and names.
 
 A point is drawn at each of its costs, always at the height of its error, with a line between. Also
-numbers as text for tables, and the Pareto front.
+numbers as text for tables, the Pareto front, and the chart of unusual scenes. Imports no torch.
 """
 
 import itertools
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Any
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
 
 from storage.palette import METHOD_COLORS, OTHERS
+
+if TYPE_CHECKING:
+    from train.evaluation.leaderboard import WidthStandings
+    from train.evaluation.metrics import JudgedView
 
 COST_NOISE = 0.03
 """Relative difference below which costs count as equal: CPU seconds vary by that much."""
@@ -189,3 +196,93 @@ def plain_log(axis: Any) -> None:
     axis.set_major_locator(LogLocator(subs=(1, 3)))
     axis.set_major_formatter(FuncFormatter(lambda value, _: f"{value:.10g}"))
     axis.set_minor_formatter(NullFormatter())
+
+
+_PANEL = (7.4, 6.2)
+_DPI = 110
+_COSTS = ("a scene's first view", "a further view")
+
+
+def plot_leaderboard(widths: "Sequence[WidthStandings]", title: str, path: Path) -> None:
+    """Draw the panels into a PNG file; entries without a price are lines, NOISE a dashed one."""
+    from matplotlib import rc_context
+    from matplotlib.figure import Figure
+
+    from train.evaluation.leaderboard import NOISE
+    from train.evaluation.metrics import METRIC
+
+    with rc_context({"text.parse_math": False}):  # names may hold dollar signs
+        size = (_PANEL[0] * len(widths), _PANEL[1])
+        figure = Figure(figsize=size, dpi=_DPI, layout="constrained")
+        panels = figure.subplots(1, len(widths), squeeze=False)
+        groups = []
+        for axes, one in zip(panels.flat, widths, strict=True):
+            axes.set_title(f"{one.width} x {one.width} pixels, {one.num_views} views", fontsize=11)
+            axes.set_xlabel("CPU seconds, one thread", fontsize=_FONT)
+            axes.set_ylabel(f"median {METRIC}, higher is better", fontsize=_FONT)
+            groups.append(list[SeriesPoint]())
+            for each in one.standings:
+                if each.first_s is None or each.further_s is None:
+                    style = "--" if each.name == NOISE else ":"
+                    axes.axhline(each.median_db, color="0.45", linewidth=1, linestyle=style)
+                    axes.annotate(
+                        each.name,
+                        (1, each.median_db),
+                        xycoords=("axes fraction", "data"),
+                        xytext=(-4, 3),
+                        textcoords="offset points",
+                        fontsize=_FONT,
+                        color="0.3",
+                        horizontalalignment="right",
+                    )
+                    continue
+                costs = [each.first_s, each.further_s]
+                groups[-1].append(
+                    SeriesPoint(name=each.name, kind=each.kind, costs=costs, error=each.median_db)
+                )
+        figure.suptitle(title, fontsize=12)
+        draw_panels(figure, list(panels.flat), groups, _COSTS)
+        figure.savefig(path, metadata={"Software": None})
+
+
+_COLUMNS = 3
+"""Number of plots of axes in a row."""
+
+
+def plot_excursions(path: Path, views: "Sequence[JudgedView]") -> int:
+    """Plot psnr_log_db beyond the usual range of scenes; return the number of axes.
+
+    Each axis has a plot: a dot is a view, the line the median at each value, the dashed line the
+    median of the stated errors. Nothing is written if no view leaves the usual range.
+    """
+    from matplotlib.figure import Figure
+
+    from train.evaluation.metrics import NETWORK
+
+    axes: dict[str, list[JudgedView]] = {}
+    for view in views:
+        if view.excursion is not None:
+            axes.setdefault(view.excursion[0], []).append(view)
+    if not axes:
+        return 0
+    rows = -(-len(axes) // _COLUMNS)
+    figure = Figure(figsize=(4.2 * _COLUMNS, 3.2 * rows), layout="constrained")
+    grid = figure.subplots(rows, _COLUMNS, squeeze=False)
+    for place, (axis, members) in zip(grid.flat, sorted(axes.items()), strict=False):
+        at = np.array([view.excursion[1] for view in members if view.excursion is not None])
+        scores = np.array([view.scores[NETWORK]["psnr_log_db"] for view in members], float)
+        floors = np.array([view.floors["psnr_log_db"] for view in members])
+        values = np.unique(at)
+        place.plot(at, scores, ".", color="tab:blue", alpha=0.4)
+        medians = [np.median(scores[at == value]) for value in values]
+        place.plot(values, medians, "-o", color="tab:blue", label="network")
+        noise = [np.median(floors[at == value]) for value in values]
+        place.plot(values, noise, "--", color="grey", label="stated error")
+        place.set(title=axis.replace("_", " "), xlabel="value", ylabel="psnr_log_db")
+        if values[0] > 0 and values[-1] / values[0] > 8:
+            place.set_xscale("log")
+    grid.flat[0].legend()
+    for place in grid.flat[len(axes) :]:
+        place.axis("off")
+    figure.savefig(path, dpi=110)
+    return len(axes)

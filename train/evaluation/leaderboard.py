@@ -28,16 +28,18 @@ from storage.renderer import Camera, Renderer, fingerprint
 from storage.typed_json import read_json_lines
 from train.data.bad_samples import BadSampleCounter, first_samples
 from train.evaluation.cost_charts import on_front
-from train.evaluation.equal_time import Price, median_price, time_scene
-from train.evaluation.judged_view import (
+from train.evaluation.evaluate import Price, median_price, time_scene
+from train.evaluation.metrics import (
     METRIC,
+    METRICS,
     JudgedView,
     PairedLead,
+    noise_floors,
     paired_lead,
+    picture_scores,
     scene_facts,
     summarize_views,
 )
-from train.evaluation.metrics import METRICS, noise_floors, picture_scores
 from train.evaluation.validation import PictureSource, ValidationScene, validation_scene
 from train.loss.lpips import Lpips
 
@@ -303,7 +305,7 @@ def _judge(
         scores = picture_scores(picture, scene.target_VRR3[view], scene.hits_VRR[view], board.lpips)
         row = Row(scores=scores)
         if price is not None and view == 0:
-            row = Row(scores=scores, **dataclasses.asdict(price), machine=board.machine)
+            row = Row(scores=scores, **asdict(price), machine=board.machine)
         board.rows.add(board.key_of(method, sample.key, view), row)
 
 
@@ -343,12 +345,14 @@ class Standing:
     """Name of the method, or NOISE."""
     kind: str
     """Kind of method; empty for NOISE."""
-    price: Price | None
-    """Median CPU seconds; None without times."""
+    first_s: float | None = None
+    """Median CPU seconds of a scene's first view, loading included; None without times."""
+    further_s: float | None = None
+    """Median CPU seconds of a further view; None without times."""
     timed_scenes: int
     """Number of scenes behind these medians."""
     scores: Mapping[str, Any]
-    """Summary of each metric by name (train.evaluation.judged_view.summarize_views)."""
+    """Summary of each metric by name (train.evaluation.metrics.summarize_views)."""
     lead: PairedLead | None
     """Paired difference from the rival; None for the rival and for NOISE."""
     on_front: bool | None
@@ -390,9 +394,9 @@ def standings_of(board: Board, width: int, rival: str) -> WidthStandings | None:
     pairs = {two: paired_lead(views, *two) for two in itertools.permutations(names, 2)}
     scores = {name: summarize_views(views, name) for name in [NOISE, *names]}
     prices = board.prices(width)
-    costs = {name: median_price(each) for name, each in prices.items()}
+    costs = {name: asdict(median_price(each)) for name, each in prices.items()}
     figures = [
-        (-float(scores[name][METRIC]["median"]), (cost.first_s, cost.further_s))
+        (-float(scores[name][METRIC]["median"]), tuple(cost.values()))
         for name, cost in costs.items()
     ]
     front = dict(zip(costs, on_front(figures), strict=True))
@@ -400,11 +404,11 @@ def standings_of(board: Board, width: int, rival: str) -> WidthStandings | None:
         Standing(
             name=name,
             kind=board.kinds.get(name, ""),
-            price=costs.get(name),
             timed_scenes=len(prices.get(name, ())),
             scores=summary,
             lead=pairs.get((name, rival)),
             on_front=front.get(name),
+            **costs.get(name, {}),
         )
         for name, summary in scores.items()
     ]

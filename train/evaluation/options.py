@@ -17,7 +17,24 @@ SceneCount = Annotated[int, Within(1, 10**9, unit="scenes")]
 
 
 @checked()
-class LeaderboardOptions:
+class JudgeOptions:
+    """Data of an evaluation or a leaderboard."""
+
+    pictures: tuple[Path, ...] = ()
+    """Folders of OpenEXR images from elsewhere for the leaderboard, named as export names them; by
+    default none. Each has one image a view, such as 000000003_view_0.exr."""
+    split: Literal["train", "validation", "test"] = "test"
+    """Split of the dataset to evaluate on."""
+    train_data: tuple[str, ...] = ()
+    """Datasets whose training images the baselines use; by default those of the dataset itself. A
+    leaderboard looks up the other scenes of the split where there are none."""
+    lpips: str | None = None
+    """Folder of the LPIPS weights, or hub to download them; by default the value of TRILIGHT_LPIPS,
+    and without either LPIPS is n/a."""
+
+
+@checked()
+class LeaderboardOptions(JudgeOptions):
     """Dataset, networks and images."""
 
     source: str
@@ -26,9 +43,6 @@ class LeaderboardOptions:
     """Networks in addition to the built-in ones; by default none. A network is a run, weights, or a
     name on the Hugging Face hub such as microsoft/renderformer-v1-base. All other rows are compared
     with the first one."""
-    pictures: tuple[Path, ...] = ()
-    """Folders of OpenEXR images from elsewhere, named as export names them; by default none. Each
-    has one image a view, such as 000000003_view_0.exr."""
     width: tuple[Width, ...] = ()
     """Widths of images in pixels, divisors of the dataset's; by default those of 64, 256 and 512
     that divide it, else the dataset's own."""
@@ -36,14 +50,6 @@ class LeaderboardOptions:
     """Maximum number of scenes, from the start of the split."""
     timed_scenes: Annotated[int, Within(1, 10**6, unit="scenes")] = 20
     """Maximum number of scenes on which CPU seconds are measured."""
-    split: Literal["train", "validation", "test"] = "test"
-    """Split of the dataset for the evaluation."""
-    train_data: tuple[str, ...] = ()
-    """Datasets whose training images are looked up; by default the set itself, else the other
-    scenes of the split."""
-    lpips: str | None = None
-    """Folder of the LPIPS weights, or hub; by default the value of TRILIGHT_LPIPS. Without weights
-    LPIPS is n/a."""
     out: Path = Path("leaderboard")
     """Folder for table, chart and rows; with existing rows a run resumes."""
 
@@ -53,7 +59,7 @@ class LeaderboardOptions:
 
 
 @checked()
-class EvaluationOptions:
+class EvaluationOptions(JudgeOptions):
     """Network to evaluate, and the data to use."""
 
     checkpoint: str | None = None
@@ -64,13 +70,6 @@ class EvaluationOptions:
     other_networks: tuple[str, ...] = ()
     """Networks to compare it with on a leaderboard of all methods, which is written into the same
     folder; by default none."""
-    pictures: tuple[Path, ...] = ()
-    """Folders of OpenEXR images from elsewhere for that leaderboard; by default none."""
-    split: Literal["train", "validation", "test"] = "test"
-    """Split of the dataset to evaluate on."""
-    train_data: tuple[str, ...] = ()
-    """Datasets whose training images the baselines use; by default those of --data, if they have
-    any."""
     resolution: Width | None = None
     """Width of an image in pixels, which divides the dataset's; by default the run's if known,
     else the dataset's."""
@@ -79,9 +78,6 @@ class EvaluationOptions:
     tracer_views: Annotated[int, Within(0, 10**6, unit="views")] = 64
     """Maximum number of views on which the denoised path tracer is judged in the network's own
     time; 0 leaves it out."""
-    lpips: str | None = None
-    """Folder of the LPIPS weights, or hub to download them; by default the value of TRILIGHT_LPIPS,
-    and without either LPIPS is n/a."""
     device: Literal["cpu", "cuda"] | None = None
     """Device to compute on; by default cuda if there is one, else cpu."""
     out: Path | None = None
@@ -119,11 +115,8 @@ class EvaluationOptions:
         return LeaderboardOptions(
             source=self.data[0],
             checkpoint=(*filter(None, [self.checkpoint]), *self.other_networks),
-            pictures=self.pictures,
             width=(self.resolution,) if self.resolution else (),
             scenes=self.most_scenes,
-            split=self.split,
-            train_data=self.train_data,
-            lpips=self.lpips,
             out=self.report_folder,
+            **{name: getattr(self, name) for name in JudgeOptions.__annotations__},
         )

@@ -2,18 +2,20 @@
 
 import csv
 import io
-from collections.abc import Mapping, Sequence
-from dataclasses import asdict, astuple
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import asdict
 from typing import Any
 
 import numpy as np
 
 from storage.markdown import inert, table, text
 from train.evaluation.cost_charts import number_text
-from train.evaluation.equal_time import TRACER, sentences
-from train.evaluation.judged_view import (
+from train.evaluation.evaluate import TRACER, sentences
+from train.evaluation.leaderboard import NOISE, WidthStandings
+from train.evaluation.metrics import (
     GROUPED,
     METRIC,
+    METRICS,
     NEAR_DB,
     NETWORK,
     JudgedView,
@@ -22,8 +24,6 @@ from train.evaluation.judged_view import (
     interval_text,
     summarize_views,
 )
-from train.evaluation.leaderboard import NOISE, WidthStandings
-from train.evaluation.metrics import METRICS
 
 BENCHMARK = "benchmark-v1"
 """Name of our public test set (pipeline.presets.frozen_v1)."""
@@ -64,7 +64,7 @@ def record(
 
     Args:
         about: network, data, split and resolution, as the report shows them.
-        traced: comparison at equal time (evaluation.equal_time); None if it was not measured.
+        traced: comparison at equal time (evaluation.evaluate); None if it was not measured.
     """
     ours = summarize_views(views)
     both = [view for view in views if GROUPED in view.scores]  # one pass, and groups of lights
@@ -241,7 +241,7 @@ def _standings_table(one: WidthStandings) -> str:
     rows = [
         [
             text(standing.name),
-            *(map(number_text, astuple(standing.price)) if standing.price else ("", "")),
+            *("" if s is None else number_text(s) for s in (standing.first_s, standing.further_s)),
             *(_with_tail(name, standing.scores) for name in METRICS),
             {True: "yes", False: "no", None: ""}[standing.on_front],
         ]
@@ -299,48 +299,45 @@ def standings_csv(widths: Sequence[WidthStandings], machine: str) -> bytes:
 
     Each row names the machine of its times, since tables of several machines may be merged.
     """
-    columns = [f"{metric}_{part}" for metric in METRICS for part in _PARTS]
-    head = [
-        "width",
-        "name",
-        "kind",
-        "scenes",
-        "views",
-        "first_core_s",
-        "further_core_s",
-        "processor",
-    ]
-    lead = ["lead_mean_db", "lead_low_db", "lead_high_db", "lead_share_better", "on_front"]
-    rows = [
-        [
-            one.width, inert(each.name), each.kind, one.num_scenes, one.num_views,
-            *((*astuple(each.price), inert(machine)) if each.price else (None, None, None)),
-            *(each.scores[metric][part] for metric in METRICS for part in _PARTS),
-            *_lead_cells(each.lead), each.on_front,
-        ]
-        for one in widths for each in one.standings
-    ]  # fmt: skip
-    return _csv([*head, *columns, *lead], rows)
+    return _csv(
+        {
+            "width": one.width,
+            "name": inert(each.name),
+            "kind": each.kind,
+            "scenes": one.num_scenes,
+            "views": one.num_views,
+            "first_core_s": each.first_s,
+            "further_core_s": each.further_s,
+            "processor": None if each.first_s is None else inert(machine),
+            **{f"{name}_{part}": each.scores[name][part] for name in METRICS for part in _PARTS},
+            **{f"lead_{name}": value for name, value in _lead_cells(each.lead).items()},
+            "on_front": each.on_front,
+        }
+        for one in widths
+        for each in one.standings
+    )
 
 
 def pairs_csv(widths: Sequence[WidthStandings]) -> bytes:
     """Return pairs.csv: the difference of every method from every other one."""
-    head = ["width", "name", "than", "mean_db", "low_db", "high_db", "share_better"]
-    rows = [
-        [one.width, inert(first), inert(second), *_lead_cells(lead)]
+    return _csv(
+        {"width": one.width, "name": inert(first), "than": inert(second), **_lead_cells(lead)}
         for one in widths
         for (first, second), lead in one.pairs.items()
-    ]
-    return _csv(head, rows)
+    )
 
 
-def _lead_cells(lead: PairedLead | None) -> list[float | None]:
-    return [None] * 4 if lead is None else [lead.mean, lead.low, lead.high, lead.share_better]
+def _lead_cells(lead: PairedLead | None) -> dict[str, float | None]:
+    names = {"mean": "mean_db", "low": "low_db", "high": "high_db", "share_better": "share_better"}
+    return {column: getattr(lead, name, None) for name, column in names.items()}
 
 
-def _csv(head: Sequence[str], rows: Sequence[Sequence[object]]) -> bytes:
+def _csv(rows: Iterable[Mapping[str, object]]) -> bytes:
+    """Return rows with the same columns as CSV; None is an empty cell."""
     stream = io.StringIO(newline="")
-    writer = csv.writer(stream, lineterminator="\n")
-    writer.writerow(head)
-    writer.writerows(rows)  # None is an empty cell
+    for number, row in enumerate(rows):
+        writer = csv.DictWriter(stream, list(row), lineterminator="\n")
+        if number == 0:
+            writer.writeheader()
+        writer.writerow(row)
     return stream.getvalue().encode(errors="replace")

@@ -96,7 +96,7 @@ def _set_up(
 
 def judged_figures(renderer: Renderer, scene: Scene, reference: RawReference) -> Figures:
     """Return the figures of a picture; its decibels exclude the noise of the reference."""
-    from train.evaluation.equal_time import time_scene
+    from train.evaluation.evaluate import time_scene
     from train.evaluation.metrics import picture_scores
 
     picture = time_scene(renderer, scene, "scene", ROUNDS)

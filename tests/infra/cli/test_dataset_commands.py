@@ -56,6 +56,11 @@ from tests.scenes_by_hand import tiny_sample, tiny_scene
 pytestmark = pytest.mark.usefixtures("bare_reports", "children_here")
 
 
+def refused(*words: str | Path) -> str:
+    """Return the one line that a mistake ends in."""
+    return trilight([*map(str, words)]).mistake
+
+
 def inspect(*arguments: str | Path) -> str:
     result = trilight(["inspect", *(str(argument) for argument in arguments)])
     assert result.exit_code == 0, result.output
@@ -122,23 +127,18 @@ def test_parts_show_with_their_floors(tmp_path: Path) -> None:
     assert "view 1, indirect" in page.read_text() and "38.25" in page.read_text()
 
 
-def _refused(*words: str | Path) -> str:
-    """Return the one line that a command ends with."""
-    return trilight([*map(str, words)]).mistake
-
-
 def test_an_empty_dataset_and_a_damaged_shard_are_one_sentence(tmp_path: Path) -> None:
     write_dataset(tmp_path, {})
-    assert "the dataset is empty" in _refused("inspect", tmp_path)
+    assert "the dataset is empty" in refused("inspect", tmp_path)
     assert not (tmp_path / "report.html").exists()
     dataset = five_scenes(tmp_path / "my set")
     name = dataset.manifest.shards[0].name
     path = dataset.folder.shard(name)
     data = path.read_bytes()
     path.write_bytes(data[:600] + bytes(len(data) - 1200) + data[-600:])
-    assert f"{name}: " in _refused("inspect", tmp_path / "my set"), "of the same length"
+    assert f"{name}: " in refused("inspect", tmp_path / "my set"), "of the same length"
     path.write_bytes(data[:2000])
-    said = _refused("inspect", tmp_path / "my set")
+    said = refused("inspect", tmp_path / "my set")
     assert said.startswith(f"{name}: 2000 bytes; expected ")
     assert f"`trilight verify '{tmp_path}/my set'` says how" in said
 
@@ -173,9 +173,9 @@ def test_merge_select_and_reshard(tmp_path: Path) -> None:
     assert outcome["scenes_by_split"] == {"test": 4, "train": 8}
     assert outcome["dataset_digest"] == open_dataset(str(tmp_path / "d")).digest
     out = ("--out", tmp_path / "e")
-    assert "1 dataset; expected at least 2" in _refused("shards", "merge", a, *out)
+    assert "1 dataset; expected at least 2" in refused("shards", "merge", a, *out)
     lacking = "expected --where, --split, --template or --min-noise-floor"
-    assert lacking in _refused("shards", "select", a, *out)
+    assert lacking in refused("shards", "select", a, *out)
     assert not (tmp_path / "e").exists()
 
 
@@ -309,7 +309,11 @@ def test_objects_of_one_split_limit_the_scenes_to_that_split() -> None:
     assert words[-2:] == ["--set", "splits.one_split=true"]
 
 
-def test_the_facts_are_the_last_figures_that_are_numbers(tmp_path: Path) -> None:
+def test_the_facts_are_the_last_figures_that_are_numbers_and_damage_is_named(
+    tmp_path: Path,
+) -> None:
+    with pytest.raises(TrilightError, match="no run here; expected a folder that `trilight train`"):
+        run_facts(tmp_path)
     write_run(tmp_path / "run")
     assert is_run(tmp_path / "run") and not is_run(tmp_path)
     facts = {
@@ -324,20 +328,15 @@ def test_the_facts_are_the_last_figures_that_are_numbers(tmp_path: Path) -> None
         "views_per_s": 3.0,
     }
     assert run_facts(tmp_path / "run") == facts
-    with (tmp_path / "run/metrics.jsonl").open("a") as log:
+    metrics = tmp_path / "run/metrics.jsonl"
+    with metrics.open("a") as log:
         log.write('{"step": 12, "loss": null, "validation": {"log_l1": NaN}}\n')
     (tmp_path / "run/summary.json").write_text("{}")
     assert run_facts(tmp_path / "run") == facts | {"finished": True}
-    (tmp_path / "run/metrics.jsonl").write_text("")
+    metrics.write_text("")
     assert run_facts(tmp_path / "run")["steps"] == 0
-
-
-def test_other_folders_and_damage_are_named(tmp_path: Path) -> None:
-    with pytest.raises(TrilightError, match="no run here; expected a folder that `trilight train`"):
-        run_facts(tmp_path)
-    write_run(tmp_path / "run")
     for damaged in ("{\n", "[]\n", '{"loss": 1}\n', "3\n"):
-        (tmp_path / "run/metrics.jsonl").write_text(damaged)
+        metrics.write_text(damaged)
         with pytest.raises(TrilightError, match="is not readable .* Restore it from a copy"):
             run_facts(tmp_path / "run")
 
@@ -354,11 +353,6 @@ def said(*words: str | Path) -> dict[str, Any]:
 
 def convert(*words: str | Path) -> dict[str, Any]:
     return said("convert", *words)
-
-
-def refused(*words: str | Path) -> str:
-    """Return the one line that a mistake ends in."""
-    return trilight([*map(str, words)]).mistake
 
 
 def loaded(path: Path, key: str = "") -> Scene:
@@ -383,18 +377,14 @@ def test_a_sample_and_a_whole_shard(tmp_path: Path, shard: Path) -> None:
         "each.000000003.safetensors", "each.000000005.safetensors",
     ]  # fmt: skip
     assert encode_scene(loaded(Path(found["files"][1]))) == encode_scene(tiny_scene())
-
-
-def test_hdf5_takes_the_pictures_of_a_sample_along(tmp_path: Path, shard: Path) -> None:
-    """From a shard, and from HDF5; a scene without pictures has none there."""
+    # HDF5 takes pictures along, of a shard and of HDF5; a scene without them has none there
     convert(f"{shard}::000000003", tmp_path / "a.h5")
     convert(tmp_path / "a.h5", tmp_path / "b.h5")
     for name in ("a.h5", "b.h5"):
-        found = read_renderformer_h5(tmp_path / name).radiance_rgb
-        assert found is not None
-        assert np.array_equal(found, tiny_sample().radiance_rgb)
-    convert(f"{shard}::000000003", tmp_path / "a.usdz")
-    convert(tmp_path / "a.usdz", tmp_path / "c.h5")
+        stored_rgb = read_renderformer_h5(tmp_path / name).radiance_rgb
+        assert stored_rgb is not None
+        assert np.array_equal(stored_rgb, tiny_sample().radiance_rgb)
+    convert(tmp_path / "one.usdz", tmp_path / "c.h5")
     assert read_renderformer_h5(tmp_path / "c.h5").radiance_rgb is None
 
 

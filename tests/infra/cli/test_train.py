@@ -21,7 +21,7 @@ from infra.cli.overrides import (
     read_settings_file,
     with_base_settings,
 )
-from infra.cli.train import _BarProgress, _report, _validation_rows
+from infra.cli.train import _BarProgress, _report
 from model.checkpoint_format import saved_steps
 from pipeline.generation.generate_options import GenerateOptions
 from pipeline.presets.registry import DATASET_PRESETS, preset_settings
@@ -331,25 +331,19 @@ def test_licences_are_allowed_beside_those_of_a_file(tmp_path: Path) -> None:
         assert settings.allowed_licences == tuple(sorted({*others, "CC-BY-NC-4.0"}))
 
 
-def test_a_median_picture_without_error_divides_nothing() -> None:
+def test_a_finished_run_names_what_evaluates_it(capsys: pytest.CaptureFixture[str]) -> None:
+    """And a median picture without error divides nothing."""
     scores = {"log_l1": 0.0, "psnr_log_db_median": 99.0, "psnr_linear_db_median": 99.0}
     for log_l1, says in ((0.0, "(-0.0123, chance 0.0020)"), (0.1, "(-12.3%, chance 2.0%)")):
-        median = scores | {"log_l1": log_l1}
         lead = Lead(log_l1=-0.0123, error=0.001)
         result: Any = SimpleNamespace(
-            scores=scores, median_scores=median, lead=lead, beats_median=False
+            **{"scores": scores, "median_scores": scores | {"log_l1": log_l1}, "lead": lead},
+            **{"beats_median": False, "loss_at_start": 1.0, "loss_at_end": 1.0, "num_steps": 1},
+            **{"skipped_steps": 0, "unusable": (), "history": (), "seconds": 1.0},
+            folder=RunFolder(Path("runs/mine")),
         )
-        assert says in _validation_rows(result)[0][1]
-
-
-def test_a_finished_run_names_what_evaluates_it(capsys: pytest.CaptureFixture[str]) -> None:
-    scores = {"log_l1": 0.1, "psnr_log_db_median": 9.0, "psnr_linear_db_median": 9.0}
-    result: Any = SimpleNamespace(
-        **{"scores": scores, "median_scores": scores, "lead": Lead(log_l1=0.1, error=0.1)},
-        **{"beats_median": False, "loss_at_start": 1.0, "loss_at_end": 1.0, "num_steps": 1},
-        **{"skipped_steps": 0, "unusable": (), "history": (), "seconds": 1.0},
-        folder=RunFolder(Path("runs/mine")),
-    )
-    _report(result, ("a", "b c"))
-    shown = "Next: trilight evaluate runs/mine --data a --data 'b c' --split validation\n"
-    assert shown in capsys.readouterr().out
+        _report(result, ("a", "b c"))
+        shown = capsys.readouterr().out
+        assert says in shown
+        next_line = "Next: trilight evaluate runs/mine --data a --data 'b c' --split validation\n"
+        assert next_line in shown

@@ -23,8 +23,6 @@ from infra.render.preview_table import (
     PreviewTable,
     Priced,
     choose,
-    choose_reaching,
-    choose_within,
     keep_machine_costs,
     known_costs,
     machine_costs_path,
@@ -32,7 +30,7 @@ from infra.render.preview_table import (
     price_all,
     shipped_table,
 )
-from infra.render.quality import FixedSamples, TimeBudget
+from infra.render.quality import Budget, FixedSamples
 from infra.setup.preview_table import NETWORK, WIDTHS, ladder, part_names, table_of
 from pipeline.renders.mitsuba_variant import Variant
 from pipeline.renders.preview import all_parts
@@ -61,26 +59,33 @@ some_ways = st.lists(
 )  # fmt: skip
 
 
-@given(ways=some_ways, seconds=st.floats(1e-9, 1e9))
-def test_no_way_within_the_seconds_is_better_or_as_good_and_cheaper(
-    ways: list[Priced], seconds: float
+def within(ways: list[Priced], seconds: float) -> tuple[Priced, bool]:
+    found = choose(Budget("--seconds", seconds), ways, scenes=1, costs="", width=64)
+    return found.priced, found.fits
+
+
+def reaching(ways: list[Priced], db: float, width: int = 64) -> Priced:
+    found = choose(Budget("--error", db), ways, scenes=1, costs="", width=width)
+    assert found.fits
+    return found.priced
+
+
+@given(ways=some_ways, seconds=st.floats(1e-9, 1e9), db=st.floats(0, 100))
+def test_no_way_within_the_seconds_is_better_and_none_that_reaches_the_error_is_quicker(
+    ways: list[Priced], seconds: float, db: float
 ) -> None:
-    found, fits = choose_within(ways, seconds)
+    found, fits = within(ways, seconds)
     assert fits == any(one.seconds <= seconds for one in ways)
     for other in ways:
         if fits and other.seconds <= seconds:
             assert (other.db, -other.seconds) <= (found.db, -found.seconds)
         if not fits:
             assert (other.seconds, -other.db) >= (found.seconds, -found.db)
-
-
-@given(ways=some_ways, db=st.floats(0, 100))
-def test_no_way_that_reaches_the_error_is_quicker(ways: list[Priced], db: float) -> None:
     if all(one.db < db for one in ways):
         with pytest.raises(TrilightError, match="--noise-floor"):
-            choose_reaching(ways, db, 64)
+            reaching(ways, db)
         return
-    found = choose_reaching(ways, db, 64)
+    found = reaching(ways, db)
     assert found.db >= db
     for other in ways:
         if other.db >= db:
@@ -96,11 +101,11 @@ def test_more_than_previews_reach_is_refused_with_what_they_do() -> None:
         with pytest.raises(
             TrilightError, match=f"most that previews reach; --noise-floor {most + 1:g}"
         ):
-            choose_reaching(ways, most + 1, width)
+            reaching(ways, most + 1, width)
     ways = [priced(1.0, 38.49)]
     with pytest.raises(TrilightError, match=r"expected at most 38\.4 dB"):
-        choose_reaching(ways, 38.5, 64)
-    assert choose_reaching(ways, 38.4, 64) is ways[0]
+        reaching(ways, 38.5)
+    assert reaching(ways, 38.4) is ways[0]
 
 
 def test_prices_are_sums_of_parts_between_widths_in_logarithms() -> None:
@@ -148,9 +153,9 @@ def test_the_network_is_a_way_by_its_figures_where_it_was_judged_and_torch_is() 
     for width, network in itertools.product((8, 64, 128, 256, 512, 1024), (True, False)):
         offered = network and min(judged) <= width <= max(judged)
         ways = price_all(table, quick, width=width, threads=1, per_scene=1, network=network)
-        assert (choose_reaching(ways, 0, width).samples is None) == offered
-        assert (choose_within(ways, 1e-9)[0].samples is None) == offered
-        assert choose_within(ways, 1e9)[0].samples is not None
+        assert (reaching(ways, 0, width).samples is None) == offered
+        assert (within(ways, 1e-9)[0].samples is None) == offered
+        assert within(ways, 1e9)[0].samples is not None
 
 
 def test_a_choice_says_what_it_is_and_whether_it_fits() -> None:
@@ -158,7 +163,7 @@ def test_a_choice_says_what_it_is_and_whether_it_fits() -> None:
     ways = [priced(0.25, 30.0, spp=4)]
     for seconds, lead in ((1.0, "chosen"), (1e-9, "nothing is as quick; the quickest is chosen")):
         choice = choose(
-            TimeBudget(seconds=seconds),
+            Budget("--seconds", seconds),
             ways,
             scenes=table.scenes,
             costs="costs as shipped",
@@ -189,24 +194,17 @@ def costs_of_here() -> PictureCosts:
     return PictureCosts(machine=machine_name(VARIANT), rows=tuple(slower))
 
 
-def test_costs_that_were_measured_here_win(cache: Path) -> None:
+def test_costs_that_were_measured_here_win_and_those_of_another_machine_do_not(cache: Path) -> None:
     costs, source = known_costs(VARIANT)
     assert costs == shipped_table().costs
     assert f"costs as shipped: `{MEASURE}` measures this machine" == source
-    path = keep_machine_costs(costs_of_here())
-    assert path == machine_costs_path() and path.is_relative_to(cache)
-    costs, source = known_costs(VARIANT)
-    assert costs == costs_of_here()
-    assert source == "costs as measured here"
-
-
-@pytest.mark.usefixtures("cache")
-def test_costs_of_another_machine_are_not_used() -> None:
     keep_machine_costs(dataclasses.replace(costs_of_here(), machine="another, 128 cores"))
     costs, source = known_costs(VARIANT)
     assert costs == shipped_table().costs
     assert "is of another machine (another, 128 cores)" in source
-    keep_machine_costs(costs_of_here())
+    path = keep_machine_costs(costs_of_here())
+    assert path == machine_costs_path() and path.is_relative_to(cache)
+    assert known_costs(VARIANT) == (costs_of_here(), "costs as measured here")
     card = dataclasses.replace(VARIANT, name="cuda_ad_rgb")
     assert "of another machine" in known_costs(card)[1], "a graphics card is another machine"
 

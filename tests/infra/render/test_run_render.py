@@ -10,8 +10,7 @@ from PIL import Image as Picture
 
 from infra.render import tone_mapping as look_module
 from infra.render.networks import RendererHere, SceneHere
-from infra.render.output_paths import OutputPaths, output_paths, write_video
-from infra.render.plan import RenderPlan, shots
+from infra.render.plan import OutputPaths, RenderPlan, output_paths, shots, write_video
 from infra.render.run_render import FinishedShot, run_plan
 from infra.render.sources import orbit, own_camera, pair_cameras
 from infra.render.tone_mapping import Look, tone_mapped
@@ -52,16 +51,6 @@ class FlatRenderer(RendererHere):
         return Image(radiance_rgb=picture, cpu_seconds=0.0, facts=facts)
 
 
-class SilentProgress:
-    """Progress of a render that prints nothing."""
-
-    def on_picture(self, done: int, total: int) -> None:
-        pass
-
-    def on_samples(self, now: object) -> None:
-        pass
-
-
 Pairs = list[tuple[SceneSource, Camera | int]]
 
 
@@ -91,26 +80,20 @@ def run(
         shots=list(shots(pairs, where, [each.name for each in renderers])),
         fps=24,
     )
-    outcome = run_plan(plan, HereReader(), SilentProgress())
-    return outcome.shots, outcome.notes
+    return run_plan(plan, HereReader(), lambda done, total: None, lambda now: None)
 
 
-def test_pictures_are_numbered_and_the_scene_is_opened_once(turn: Pairs, tmp_path: Path) -> None:
-    engine = FlatRenderer()
-    finished, notes = run([engine], tmp_path / "turn", turn)
+def test_pictures_are_numbered_and_what_is_there_is_kept(turn: Pairs, tmp_path: Path) -> None:
+    """The scene is opened once, and only the rest is made."""
+    out = tmp_path / "turn"
+    engine, again, nothing = FlatRenderer(), FlatRenderer(), FlatRenderer()
+    first, notes = run([engine], out, turn)
     assert (engine.opened, engine.rendered) == (1, 4)
     assert notes == ["tiny.safetensors: it was opened"]
-    names = sorted(path.name for path in (tmp_path / "turn").iterdir())
-    assert names == [f"{at:06d}.{suffix}" for at in range(4) for suffix in ("exr", "png")]
-    expected = [5, 3, 1, 3]
-    for shot, value in zip(finished, expected, strict=True):
-        np.testing.assert_allclose(decode_exr(shot.pictures["neural"].path.read_bytes()), value)
-
-
-def test_what_is_there_is_kept_and_only_the_rest_is_made(turn: Pairs, tmp_path: Path) -> None:
-    out, again = tmp_path / "turn", FlatRenderer()
-    first, _ = run([FlatRenderer()], out, turn)
     before = {path.name: path.read_bytes() for path in out.iterdir()}
+    assert sorted(before) == [f"{at:06d}.{suffix}" for at in range(4) for suffix in ("exr", "png")]
+    for shot, value in zip(first, [5, 3, 1, 3], strict=True):
+        np.testing.assert_allclose(decode_exr(shot.pictures["neural"].path.read_bytes()), value)
     (out / "000002.exr").unlink()
     (out / "000003.exr").write_bytes(before["000003.exr"][:200])
     second, _ = run([again], out, turn)
@@ -120,7 +103,6 @@ def test_what_is_there_is_kept_and_only_the_rest_is_made(turn: Pairs, tmp_path: 
     assert kept[1].facts == first[1].pictures["neural"].facts == {"number": 2, "half": 0.5}
     for shown in ("000000.png", "000003.png"):
         assert (out / shown).read_bytes() == before[shown]
-    nothing = FlatRenderer()
     run([nothing], out, turn)
     assert (nothing.opened, nothing.rendered) == (0, 0)
 

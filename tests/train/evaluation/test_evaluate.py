@@ -27,10 +27,10 @@ from tests.train.kit import eval_config, tiny_run
 from tests.train.loss.test_training_loss import small_weights
 from tests.train.toy import toy_sample, toy_scene, write_toy_dataset
 from train.data.scenes import training_scene
-from train.evaluation.chart import plot_excursions
-from train.evaluation.equal_time import TRACER
+from train.evaluation.cost_charts import plot_excursions
 from train.evaluation.evaluate import (
     GROUPED,
+    TRACER,
     EvalConfig,
     grouped_pictures,
     judge_views,
@@ -38,8 +38,16 @@ from train.evaluation.evaluate import (
     worst_and_median,
     worst_of_each_excursion,
 )
-from train.evaluation.judged_view import NETWORK, JudgedView, by_group, scene_facts, summarize_views
-from train.evaluation.metrics import METRICS, hdr_flip, picture_scores
+from train.evaluation.metrics import (
+    METRICS,
+    NETWORK,
+    JudgedView,
+    by_group,
+    hdr_flip,
+    picture_scores,
+    scene_facts,
+    summarize_views,
+)
 from train.evaluation.options import EvaluationOptions
 from train.evaluation.report_pages import BENCHMARK, evaluation_page, record
 from train.evaluation.validation import (
@@ -293,13 +301,12 @@ def test_facts_come_from_the_scene() -> None:
 
 
 def test_the_command_writes_report_and_sheets(
-    dataset: Dataset, weights: str, tmp_path: Path
+    dataset: Dataset, weights: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     out = tmp_path / "out"
     data = ["--data", str(dataset.folder.root)]
     command = ["evaluate", weights, *data, "--split", "validation", "--out", str(out)]
-    command += ["--tracer-views", "0"]
-    done = trilight([*command, "--json", "--resolution", "16"])
+    done = trilight([*command, "--json", "--resolution", "16", "--tracer-views", "0"])
     assert done.exit_code == 0, done.output
     found = json.loads((out / "evaluation.json").read_text())
     assert found["contestants"] == json.loads(done.output[done.output.index("{") :])["contestants"]
@@ -308,24 +315,18 @@ def test_the_command_writes_report_and_sheets(
     for name in ("worst.png", "median.png"):
         with Image.open(out / name) as sheet:
             assert min(sheet.size) > 200
-    shown = trilight([*command, "--most-scenes", "1"], env={"COLUMNS": "160"}).output.splitlines()
-    (scores,) = [line.split() for line in shown if line.split()[:1] == ["psnr_log_db"]]
+    monkeypatch.setenv("TRILIGHT_VARIANT", "none_such")
+    few = [*command, "--most-scenes", "1", "--tracer-views", "1"]
+    shown = trilight(few, env={"COLUMNS": "160"}).output
+    (scores,) = [line.split() for line in shown.splitlines() if "psnr_log_db" in line.split()[:1]]
     assert len(scores) == 1 + len(found["contestants"])  # a column for each
+    assert "The path tracer in that time is not shown: TRILIGHT_VARIANT is" in shown
+    assert "is not shown: TRILIGHT" in (out / "evaluation.md").read_text()
     missing = trilight(["evaluate", str(tmp_path / "no"), *data])
     assert isinstance(missing.exception, TrilightError)
     assert "no such file or folder" in str(missing.exception)
     empty = trilight(["evaluate", weights, *data])
     assert "the test split holds no scene" in str(empty.exception)
-
-
-def test_without_a_path_tracer_the_report_says_why(
-    dataset: Dataset, weights: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.setenv("TRILIGHT_VARIANT", "none_such")
-    data = ["--data", str(dataset.folder.root), "--split", "validation", "--most-scenes", "1"]
-    told = trilight(["evaluate", weights, *data, "--out", str(tmp_path / "out")]).output
-    assert "The path tracer in that time is not shown: TRILIGHT_VARIANT is" in told
-    assert "is not shown: TRILIGHT" in (tmp_path / "out" / "evaluation.md").read_text()
 
 
 @pytest.mark.slow("references")

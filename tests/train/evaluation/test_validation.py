@@ -28,25 +28,28 @@ from tests.train.kit import eval_config
 from tests.train.loss.test_training_loss import small_weights
 from tests.train.toy import toy_sample, write_toy_dataset
 from train.data.scenes import training_scene
-from train.evaluation.equal_time import (
+from train.evaluation.error_colors import ERROR_WHITE, error_picture
+from train.evaluation.evaluate import (
     CAPTION,
     TRACER,
+    EvalConfig,
     Filter,
     Level,
     Price,
     equal_time,
+    judge_views,
     sentences,
+    sheet_views,
     spread_text,
     spread_views,
     time_both,
     time_scene,
 )
-from train.evaluation.error_colors import ERROR_WHITE, error_picture
-from train.evaluation.evaluate import EvalConfig, judge_views, sheet_views
-from train.evaluation.judged_view import NETWORK, JudgedView
 from train.evaluation.metrics import (
     METRICS,
+    NETWORK,
     VALIDATED,
+    JudgedView,
     Scores,
     fraction_better,
     lead,
