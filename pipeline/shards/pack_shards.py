@@ -160,7 +160,7 @@ def unpack_shard(folder: DatasetFolder, note: ShardNote, scenes: range, stream: 
         scenes: indices of its scenes; one that the file lacks was given up.
     """
     name = note.shard.name
-    samples = dict(ShardReader(stream, name))
+    samples = dict(iter(ShardReader(stream, name)))
     for index in scenes:
         key = sample_key(index)
         failures = [failure for failure in note.failures if failure.item == key]
