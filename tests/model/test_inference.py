@@ -409,8 +409,8 @@ def test_projecting_before_upsampling_equals_projecting_after(deepest: bool) -> 
     grid, coarse = torch.randn(2, 2, 6, 3, 3, generator=generator, dtype=torch.float64)
     with torch.no_grad():
         summed = grid if fusion.skip is None else coarse + fusion.skip(grid)
-        size = {"size": (7, 7), "mode": "bilinear", "align_corners": True}
-        published = fusion.project(interpolate(fusion.refine(summed), **size))
+        enlarged = interpolate(fusion.refine(summed), (7, 7), mode="bilinear", align_corners=True)
+        published = fusion.project(enlarged)
         found = fusion(None if deepest else coarse, grid, (7, 7))
     torch.testing.assert_close(found, published, rtol=0, atol=1e-14)
 
