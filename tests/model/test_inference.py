@@ -24,7 +24,7 @@ from model.hits.tracing import with_traced
 from model.inference import LightGroup, NeuralRenderer, light_groups
 from model.renderformer import RenderFormer, radiance
 from model.scene_tensors import SceneTensors, scene_tensors
-from model.view_decoder import BilinearUpsample
+from model.view_decoder import BilinearUpsample, Fusion
 from model.weights import RANGE_KEY, TrainedRange, encode_weights, trained_range
 from storage.conventions import look_at_c2w
 from storage.errors import TrilightError
@@ -399,3 +399,32 @@ def test_the_way_back_of_an_enlargement_is_that_of_torch(small: tuple[int, int])
     (found,) = torch.autograd.grad(BilinearUpsample.apply(x, size), x, gradient)
     # float64 sums of tens of numbers around 1
     torch.testing.assert_close(found, expected, rtol=0, atol=1e-13)
+
+
+@for_each("deepest", [False, True])
+def test_projecting_before_upsampling_equals_projecting_after(deepest: bool) -> None:
+    """The published order, to float64 sums of six channels."""
+    fusion = Fusion(6, deepest=deepest).double()
+    generator = torch.Generator().manual_seed(0)
+    grid, coarse = torch.randn(2, 2, 6, 3, 3, generator=generator, dtype=torch.float64)
+    with torch.no_grad():
+        summed = grid if fusion.skip is None else coarse + fusion.skip(grid)
+        enlarged = interpolate(fusion.refine(summed), (7, 7), mode="bilinear", align_corners=True)
+        published = fusion.project(enlarged)
+        found = fusion(None if deepest else coarse, grid, (7, 7))
+    torch.testing.assert_close(found, published, rtol=0, atol=1e-14)
+
+
+def test_the_dpt_lets_a_bundle_reach_its_neighbours_and_the_linear_head_does_not() -> None:
+    for head in ("linear", "dpt"):
+        config = tiny_config(head)
+        built = awake(config).decoder.head
+        tokens = torch.zeros(1, 9, config.width, dtype=torch.float64)
+        changed = tokens.clone()
+        changed[0, 1] += torch.linspace(-1, 1, config.width, dtype=torch.float64)
+        with torch.no_grad():
+            both = (built([each] * len(built.taps)) for each in (changed, tokens))
+            change = (next(both) - next(both)).abs()[0].amax(dim=0)
+        by_bundle = change.unflatten(1, (3, 8)).unflatten(0, (3, 8)).amax(dim=(1, 3))
+        assert by_bundle.argmax() == 1
+        assert bool(by_bundle[0, 0] > 0) == bool(by_bundle[1, 1] > 0) == (head == "dpt")

@@ -233,7 +233,8 @@ def test_the_card_is_of_these_weights(name: str) -> None:
     assert count_parameters(open_network(name)) == int(stated)
 
 
-def test_a_name_that_does_not_come_along_is_said() -> None:
+def test_a_name_that_does_not_come_along_is_said_and_the_better_one_needs_none() -> None:
+    assert find_network(BUILTIN).path == find_network("builtin:hits").path
     with pytest.raises(TrilightError, match="builtin:token: no such network comes along.*tokens"):
         find_network("builtin:token")
 

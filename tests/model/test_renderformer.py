@@ -1,22 +1,30 @@
 """Laws of the whole network, in float64 on tiny sizes, for every family; then of its parts.
 
 Tolerance 1e-11: pictures of size 1 after some twenty layers of float64 sums; a broken law changes
-them by 1e-3 and more, as the guard shows. Attention, whole and in windows, is its slow twin, and
-rays are the conventions'. Positions and normals are held by the published outputs (test_open).
+them by 1e-3 and more, as the guard shows. Attention, whole and in windows, is its slow twin; rays
+are the conventions', and angles, frequencies and encoded normals those of known numbers.
 """
 
 import dataclasses
+import math
 from functools import partial
 
 import numpy as np
+import pytest
 import torch
 from torch import Tensor, nn
 from torch.func import functional_call
 
 from model.attention import attend, attend_in_windows, cut_windows
+from model.layers import CrossAttention, SelfAttention, merge_heads, split_heads
 from model.positions import (
     Rotation,
+    TriangleRotary,
     camera_rotation,
+    encode_normals,
+    encoded_normal_width,
+    rotate,
+    to_camera,
     token_positions,
     world_rotation,
 )
@@ -24,6 +32,7 @@ from model.renderformer import RenderFormer, radiance
 from model.scene_tensors import SceneTensors, batch_scenes
 from model.view_decoder import bundle_rays, ray_directions, unbundle
 from storage.conventions import camera_rays
+from storage.errors import TrilightError
 from tests.for_each import for_each
 from tests.model.kit import (
     FAMILIES,
@@ -56,6 +65,12 @@ def test_company_and_padding_do_not_change_a_picture(family: str) -> None:
     assert together.shape == (2, 2, RESOLUTION, RESOLUTION, 3)
     close(together[0], render(model, short)[0])
     close(together[1], render(model, long)[0])
+    batch = batch_scenes([short, long])
+    triangles, normals = batch.triangles_BT33.clone(), batch.normals_BT33.clone()
+    triangles[0, 5:], normals[0, 5:] = 1e3, 7.0
+    garbage = dataclasses.replace(batch, triangles_BT33=triangles, normals_BT33=normals)
+    with torch.no_grad():
+        close(model(garbage, RESOLUTION), together)
 
 
 @for_each("family", FAMILIES)
@@ -165,6 +180,18 @@ def test_radiance_undoes_the_logarithm_and_bounds_the_dark() -> None:
     assert -2.31e-3 < darkest < -2.29e-3  # 10^-0.001 - 1
 
 
+@for_each(
+    ("family", "resolution", "multiple"),
+    [*(("linear", px, 8) for px in (0, 4, 12, -8)), *(("swin", px, 16) for px in (0, 8, 24))],
+)
+def test_a_resolution_that_bundles_or_windows_do_not_fill_is_refused(
+    family: str, resolution: int, multiple: int
+) -> None:
+    message = f"resolution is {resolution}; expected a positive multiple of {multiple}"
+    with pytest.raises(TrilightError, match=message):
+        render(model_for(family), random_scene(2), resolution=resolution)
+
+
 @for_each("family", FAMILIES)
 def test_rotation_and_vertex_order_do_change_the_picture(family: str) -> None:
     """Guards: a network without positions would pass every law above."""
@@ -205,6 +232,27 @@ def test_one_encoding_serves_every_camera_in_any_order(family: str) -> None:
             got = model.decode(encoded, batch_scenes([alone]), RESOLUTION)
             close(got[0], render(model, alone)[0])
             close(got[0, 0], together[index])
+
+
+def test_cached_cross_attention_is_the_uncached_one() -> None:
+    """Against the published order: project, norm, split, rotate for this view, attend."""
+    layer = CrossAttention(48, 2).double()
+    generator = torch.Generator().manual_seed(0)
+    context = torch.randn(2, 9, 48, generator=generator, dtype=torch.float64)
+    bundles = torch.randn(2, 3, 5, 48, generator=generator, dtype=torch.float64)
+    angles = torch.randn(2, 3, 9, 12, generator=generator, dtype=torch.float64)
+    is_key = torch.arange(9) < torch.tensor([[9], [4]])
+    with torch.no_grad():
+        for norm in (layer.context_norm, layer.q_norm, layer.k_norm):
+            norm.weight.copy_(torch.rand(48, generator=generator) + 0.5)
+        got = layer(bundles, layer.keys_values(context), (angles.cos(), angles.sin()), is_key)
+        normed = layer.context_norm(context)
+        v = split_heads(layer.v(normed), 2)
+        for index in range(3):
+            q = split_heads(layer.q_norm(layer.q(bundles[:, index])), 2)
+            k = split_heads(layer.k_norm(layer.k(normed)), 2)
+            k = rotate(k, angles[:, index].cos(), angles[:, index].sin())
+            close(got[:, index], layer.out(merge_heads(attend_reference(q, k, v, is_key))))
 
 
 @for_each("eps", [0.0, 1e-5])
@@ -340,6 +388,20 @@ def test_a_shifted_cut_has_whole_windows_strips_and_corners_and_asks_no_device()
     assert torch.equal(windows.order_Q[windows.back_Q], torch.arange(24**2))
 
 
+@for_each(("shifted", "width"), [(False, 4), (True, 2)])
+def test_a_bundle_reaches_its_own_window_only(shifted: bool, width: int) -> None:
+    layer = SelfAttention(8, 2).double()
+    windows = cut_windows(8, 4, shifted=shifted, device=CPU)
+    x = torch.randn(1, 64, 8, generator=torch.Generator().manual_seed(0), dtype=torch.float64)
+    moved = x.clone()
+    moved[0, 0] += 1
+    with torch.no_grad():
+        change = (layer(moved, windows=windows) - layer(x, windows=windows)).abs().amax(dim=-1)
+    expected = torch.zeros(8, 8, dtype=torch.bool)
+    expected[:width, :width] = True
+    assert torch.equal(change.unflatten(1, (8, 8))[0] > 0, expected)
+
+
 @for_each("resolution", [8, 24, 256])
 @for_each("fov_deg", [1.0, 30.0, 45.0, 60.0, 170.0])
 def test_rays_agree_with_the_conventions(resolution: int, fov_deg: float) -> None:
@@ -363,3 +425,56 @@ def test_a_bundle_holds_its_patch_channel_major_and_unbundling_inverts_it() -> N
             rows, columns = slice(8 * row, 8 * row + 8), slice(8 * column, 8 * column + 8)
             assert torch.equal(bundles[0, 3 * row + column], picture[0, :, rows, columns].flatten())
     assert torch.equal(unbundle(bundles, patch), picture)
+
+
+def test_angles_are_coordinate_times_frequency_coordinate_major() -> None:
+    rotary = TriangleRotary(num_freqs=2, max_freq=5.0, head_width=40)
+    cos, sin = rotary(torch.arange(1.0, 10.0).reshape(1, 1, 3, 3))
+    angles = [coordinate * frequency for coordinate in range(1, 10) for frequency in (1.0, 5.0)]
+    expected = torch.tensor([*angles, 0, 0])
+    # float32 sine of angles up to 45 radians
+    torch.testing.assert_close(cos[0, 0], expected.cos(), rtol=0, atol=1e-5)
+    torch.testing.assert_close(sin[0, 0], expected.sin(), rtol=0, atol=1e-5)
+
+
+@for_each(
+    ("num_freqs", "max_freq", "expected"),
+    [
+        (1, 5.0, [1.0]),
+        (3, 5.0, [1.0, 5.0**0.5, 5.0]),
+        # both published sets, as the documents print them
+        (6, 5.0, [1, 1.38, 1.90, 2.63, 3.62, 5.0]),
+        (6, 11.0, [1, 1.62, 2.61, 4.22, 6.81, 11.0]),
+    ],
+)
+def test_frequencies_are_log_spaced(num_freqs: int, max_freq: float, expected: list[float]) -> None:
+    rotary = TriangleRotary(num_freqs=num_freqs, max_freq=max_freq, head_width=128)
+    # two printed decimals
+    torch.testing.assert_close(rotary.freqs_F, torch.tensor(expected), rtol=0, atol=6e-3)
+
+
+def test_rotation_pairs_channel_i_with_channel_i_plus_half() -> None:
+    """As one complex number, which is turned counter-clockwise."""
+    generator = torch.Generator().manual_seed(0)
+    x = torch.randn(2, 3, 5, 8, generator=generator, dtype=torch.float64)
+    angle = torch.randn(2, 5, 4, generator=generator, dtype=torch.float64)
+    turned = rotate(x, angle.cos(), angle.sin())
+    expected = torch.complex(x[..., :4], x[..., 4:]) * torch.exp(1j * angle)[:, None]
+    close(turned, torch.cat([expected.real, expected.imag], dim=-1))
+
+
+def test_normal_encoding_of_known_numbers() -> None:
+    normals = torch.linspace(-1, 1, 9, dtype=torch.float64)
+    encoded = encode_normals(normals.reshape(1, 1, 3, 3), octaves=3)[0, 0]
+    phases = [c * 2**k for c in normals.tolist() for k in range(3)]
+    waves = [function(phase) for function in (math.sin, math.cos) for phase in phases]
+    assert len(encoded) == encoded_normal_width(3)
+    close(encoded, torch.tensor([*normals.tolist(), *waves], dtype=torch.float64))
+
+
+def test_camera_space_is_the_inverse_pose() -> None:
+    scene = random_scene(5, num_views=3)
+    inside = to_camera(scene.triangles_T33[None], scene.c2w_V44[None])[0]
+    rotation, origin = scene.c2w_V44[:, None, :3, :3], scene.c2w_V44[:, None, None, :3, 3]
+    outside = inside @ rotation.transpose(-1, -2) + origin
+    close(outside, scene.triangles_T33.expand(3, -1, -1, -1))

@@ -1,6 +1,7 @@
 """Every experiment: figures that are known beforehand, and its whole run on toy scenes."""
 
 import dataclasses
+import itertools
 import subprocess
 import sys
 import time
@@ -15,7 +16,7 @@ from infra.bench.experiments import methods
 from infra.bench.experiments.calibration import LOOKS
 from infra.bench.experiments.cycles import agreement_figures
 from infra.bench.experiments.frontier import cost_at_error
-from infra.bench.experiments.growth import WORK, measure_work, session_bytes
+from infra.bench.experiments.growth import EXPERIMENT, WORK, measure_work, session_bytes
 from infra.bench.experiments.loader import read_figures
 from infra.bench.experiments.meshes import BUDGET_GROUP, CURVE, METHOD_GROUP
 from infra.bench.experiments.paired_training import SIDE_A, SIDE_B, scene_of, settings_of
@@ -148,6 +149,14 @@ def test_steps_are_timed() -> None:
         with case(run):
             figures = step_figures(run, 1, CPU)
             assert figures["ms"] > 0 and figures["views_per_s"] > 0
+
+
+def test_sizes_grow_fourfold_up_to_the_most() -> None:
+    points = EXPERIMENT.points(dataclasses.replace(TINY, growth=12), BenchOptions())
+    for name, work in WORK.items():
+        sizes = [point.size or 0 for point in points if point.kind.startswith(f"{name},")]
+        assert sizes[0] == work.least and sizes[-1] <= work.most < 4 * sizes[-1], name
+        assert len(sizes) > 1 and all(b == 4 * a for a, b in itertools.pairwise(sizes)), name
 
 
 def test_memory_is_that_of_a_session() -> None:

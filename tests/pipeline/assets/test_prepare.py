@@ -12,7 +12,9 @@ from typing import Any
 
 import numpy as np
 import pytest
+from scipy.spatial.transform import Rotation
 
+from pipeline.assets.cleaning.clean import GRID
 from pipeline.assets.cleaning.orient import orient_outward
 from pipeline.assets.quality.measure import Surface, level_mesh
 from pipeline.assets.recipe import RECIPE, methods_of
@@ -28,13 +30,16 @@ from storage.errors import TrilightError
 from storage.records.asset import Asset, encode_asset
 from storage.records.objects import ObjectRecord
 from tests.conftest import ROOT
+from tests.for_each import for_each
 from tests.pipeline.assets.meshes_by_hand import (
     WRITERS,
     check_levels,
     cleaned,
+    flip_some,
     geometry,
     gltf_tree,
     knot,
+    moved,
     prepare,
     sphere,
     write_glb,
@@ -144,6 +149,53 @@ def test_settings_without_meaning_are_refused() -> None:
         for values in wrong:
             with pytest.raises(TrilightError, match=next(iter(values))):
                 kind(**values)
+
+
+TWO_LEVELS = AssetSettings(budgets=(1000, 500))
+
+
+@for_each(
+    ("method", "scale", "offset"),
+    [("pymeshlab_collapse", 1e-6, (-100, 3, 0.7)), ("meshoptimizer", 0.7e6, (50, -80, 20))],
+)
+def test_any_scale_place_and_winding_give_the_same_bytes(
+    tmp_path: Path, method: str, scale: float, offset: tuple[float, float, float]
+) -> None:
+    """Offsets are in extents: text keeps 17 digits, which leaves 1e-13 of the object here."""
+    source = knot(segments=60)
+    plain = prepare(write_obj(tmp_path / "a.obj", source), TWO_LEVELS, method)
+    elsewhere = moved(moved(source, 1.0, offset), scale)
+    elsewhere = flip_some(elsewhere, 0.3, np.random.default_rng(5))
+    again = prepare(write_obj(tmp_path / "b.obj", elsewhere), TWO_LEVELS, method)
+    assert geometry(again) == geometry(plain)
+    assert again.geometry_sha256 == plain.geometry_sha256
+    assert again.levels[0].record.quality == plain.levels[0].record.quality
+
+
+def test_any_turn_keeps_budgets_and_surfaces(tmp_path: Path) -> None:
+    """Turn, then prepare; or prepare, then turn: both are near the same source.
+
+    Bytes cannot agree: the unit box and its grid have the axes of the file, and edges of equal
+    cost collapse in an order that follows the coordinates.
+    """
+    turn = Rotation.from_rotvec([0.7, -1.1, 0.4]).as_matrix()
+    sources = [TriangleMesh(positions=knot().positions @ m, faces=knot().faces)
+               for m in (np.eye(3), turn)]  # fmt: skip
+    made = [prepare(write_obj(tmp_path / "a.obj", source), TWO_LEVELS) for source in sources]
+    for levels in zip(*(asset.levels for asset in made), strict=True):
+        placed = []
+        # Both boxes add half a cell of rounding in every coordinate.
+        bound = 2 * np.sqrt(3) / GRID * sources[1].diagonal
+        for level, source in zip(levels, sources, strict=True):
+            assert level.record.budget - 1 <= len(level.faces) <= level.record.budget
+            low, high = source.positions.min(axis=0), source.positions.max(axis=0)
+            placed.append(moved(level_mesh(level), (high - low).max(), (low + high) / 2))
+            bound += level.record.quality.error_p99 * source.diagonal
+        expected = TriangleMesh(positions=placed[0].positions @ turn, faces=placed[0].faces)
+        uniform = np.random.default_rng(0).random((8192, 3))
+        deviation = Surface(expected, uniform).hausdorff_deviation(placed[1])
+        # By the triangle inequality, all but 1 % + 1 % of the points are within the sum.
+        assert deviation.two_way(98) * expected.diagonal <= bound
 
 
 LICENCES = ("CC0-1.0", "LicenseRef-unknown", "LicenseRef-Stanford-3D-Scanning-Repository")

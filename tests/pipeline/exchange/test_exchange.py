@@ -16,6 +16,9 @@ from pipeline.exchange.convert import convert_scene, write_scene
 from pipeline.exchange.formats import list_lost_members
 from pipeline.exchange.open_scene import SceneSource, load_source, scene_source
 from pipeline.isolation import ChildLimits, IsolatedChild
+from pipeline.presets.registry import preset_settings
+from pipeline.scenes.triangle_budget import PooledAsset
+from scene_templates.sample_layout import scene_plan
 from storage.errors import TrilightError
 from storage.records.material import PUBLISHED_COLUMNS, columns_in_use, laid_out
 from storage.records.scene import Scene, SceneObject
@@ -30,6 +33,7 @@ from tests.pipeline.exchange.exchange_kit import (
     json_and_back,
 )
 from tests.pipeline.scenes.example_scenes import EXAMPLES, example_scene
+from tests.pipeline.scenes.small_pool import first_scene
 from tests.scenes_by_hand import FLOOR, LIGHT, tiny_scene
 from tests.textured_by_hand import sky, textured_scene
 
@@ -105,6 +109,29 @@ def test_published_scenes_come_back_and_are_written_as_the_published_converter_r
         (tmp_path / "converted").mkdir()
         described = json.loads(converted(scene, tmp_path / "converted", "a.json").read_text())
         assert_usable(described, scene, tmp_path / "converted")
+
+
+@for_each(
+    ("build", "templates"),
+    [
+        ("renderformer-v1-256", {"plane", "wall", "corner", "open_box"}),
+        ("benchmark-v1", {"open_box"}),
+    ],
+)
+def test_sampled_scenes_come_back(
+    pool: list[PooledAsset], tmp_path: Path, build: str, templates: set[str]
+) -> None:
+    """Rooms with a colour a triangle, smooth objects, emitters that reflect."""
+    settings, left, index = preset_settings(build).scenes, set(templates), 0
+    while left:
+        template = scene_plan(settings, seed=1, scene_index=index).family.template
+        if template in left:
+            left.remove(template)
+            scene = first_scene(settings, pool, seed=1, scene_index=index)
+            (folder := tmp_path / template).mkdir()
+            assert_usd_keeps_all(scene, folder, ".usdc")
+            assert_json_keeps_light(json_and_back(scene, folder)[0], scene)
+        index += 1
 
 
 NAMES = (

@@ -44,7 +44,7 @@ from pipeline.flows.prefect_runner import (
 )
 from pipeline.flows.prefect_server import GPU_LIMIT, run_to_end
 from pipeline.generation.generate_options import GenerateOptions
-from pipeline.generation.generation_run import TaskResult
+from pipeline.generation.generation_run import TaskResult, shard_ranges
 from pipeline.presets.settings import DatasetSettings
 from storage.errors import EnvironmentFailure, TrilightError
 from tests.for_each import for_each
@@ -216,6 +216,7 @@ def test_so_many_flow_runs_are_so_many_in_all(made: list[str | None]) -> None:
     made.clear()
     flow.fn(**_parameters(DatasetInRuns))
     assert made == [None]
+    assert shard_ranges(2, 5) == ["0:1", "1:2"], "no more ranges than shards"
 
 
 @for_each(

@@ -2,6 +2,7 @@
 
 import base64
 import dataclasses
+import itertools
 import json
 import struct
 from pathlib import Path
@@ -186,6 +187,19 @@ def test_a_missing_picture_leaves_the_factor(tmp_path: Path) -> None:
     assert row_at(found.scene, 0.5, 0.5)[:3] == pytest.approx([1 - F] * 3, abs=1e-6)
 
 
+@for_each("uri", ["../a.png", "http://example.com/a.png", "/etc/hostname"])
+def test_pictures_elsewhere_are_refused(tmp_path: Path, uri: str) -> None:
+    with pytest.raises(TrilightError, match=r"a\.glb: .*lies (outside|elsewhere)"):
+        read(tmp_path, uri)
+
+
+@for_each("value", [float("nan"), "red", -1, 2])
+def test_factors_that_are_no_albedo_are_said(tmp_path: Path, value: Any) -> None:
+    surface = {"metallicFactor": value, "baseColorFactor": [0.5, 0.5, 0.5, 1]}
+    found = read(tmp_path, material={"pbrMetallicRoughness": surface})
+    assert any("metallicFactor" in text for text in found.notes)
+
+
 def test_a_mesh_without_coordinates_takes_the_mean_and_one_texel_is_a_constant(
     tmp_path: Path,
 ) -> None:
@@ -320,3 +334,16 @@ def test_colours_and_triangles_come_back(tmp_path: Path) -> None:
         for column in range(3):
             before, after = seen_at(asset, *place, column), seen_at(again, *place, column)
             assert np.abs(before - after).max() < STEPS, (place, column)
+
+
+def test_metal_comes_back_as_the_same_light(tmp_path: Path) -> None:
+    """Not as a metal: what both lobes reflect is what we keep."""
+    tree, buffer = textured_tree(picture_bytes(np.array([[[9, 51, 0], [9, 204, 255]]], np.uint8)))
+    metal = tree["materials"][0]["pbrMetallicRoughness"]
+    metal |= {"metallicRoughnessTexture": metal.pop("baseColorTexture"), "metallicFactor": 1}
+    metal["baseColorFactor"] = [0.9, 0.4, 0.2, 1]
+    asset = prepare(write_glb(tmp_path / "a.glb", tree, buffer), KEEP)
+    again = prepare(glb_of(tmp_path / "b.glb", asset.levels[0]), KEEP)
+    for right, column in itertools.product((-0.25, 0.25), range(3)):
+        before, after = seen_at(asset, right, 0, column), seen_at(again, right, 0, column)
+        assert np.abs(before - after).max() < STEPS, (right, column)

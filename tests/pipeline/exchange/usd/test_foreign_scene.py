@@ -98,13 +98,18 @@ def test_a_stated_temperature_tints_a_light(
     """USD's own table for 3000 K, red over blue; Blender switches it on and states none."""
 
     def edit(stage: Any) -> None:
-        light = UsdLux.RectLight.Get(stage, "/W/rect")
-        light.CreateEnableColorTemperatureAttr(True)
-        if kelvin is not None:
-            light.CreateColorTemperatureAttr(kelvin)
+        for path in ("/W/rect", "/W/dome"):
+            light = UsdLux.LightAPI(stage.GetPrimAtPath(path))
+            light.CreateEnableColorTemperatureAttr(True)
+            if kelvin is not None:
+                light.CreateColorTemperatureAttr(kelvin)
 
-    red, _, blue = object_of(edited(tmp_path, edit).scene, "rect")[1][0, EMISSION]
+    scene = edited(tmp_path, edit).scene
+    red, _, blue = object_of(scene, "rect")[1][0, EMISSION]
     assert red / blue == pytest.approx(redder, rel=0.01)  # 6.51 in the table
+    assert scene.environment is not None
+    of_sky = scene.environment.radiance_rgb[0, 0]
+    assert of_sky[0] / of_sky[2] == pytest.approx(red / blue, rel=1e-5)
     assert (red == blue == 20) == (kelvin is None)
 
 
