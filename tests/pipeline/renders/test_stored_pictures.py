@@ -49,8 +49,8 @@ def scenes() -> dict[str, Scene]:
         "glossy": [*room, ball, block, lamp],
         "two-lamps": [quad(_FLOOR, glossy), quad(_BACK, grey), ball, *both],
     }
-    view = {"eye": (1.2, -3.2, 1.6), "target": (0, 0, 0.5), "fov_deg": 40}
-    return {name: join(each, **view) for name, each in parts.items()}
+    eye, target = (1.2, -3.2, 1.6), (0, 0, 0.5)
+    return {name: join(each, eye=eye, target=target) for name, each in parts.items()}
 
 
 def passes(scene: Scene, count: int, seed: int) -> NDArray[np.float64]:
