@@ -52,6 +52,7 @@ CHOSEN = (
     "tests/model/test_renderformer.py",
     "tests/pipeline/objects/builtin/test_builtin.py",
     "tests/laws/test_light_laws.py",
+    "tests/pipeline/renders/test_stored_pictures.py",
     "tests/pipeline/scenes/test_compose.py",
     "tests/pipeline/scenes/test_views.py",
     "tests/scene_templates/skies/test_procedural_skies.py",

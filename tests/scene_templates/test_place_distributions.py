@@ -23,6 +23,7 @@ from tests.scene_templates.statistics import (
     Table,
     alike,
     choices,
+    implausible,
     require_plausible,
     share,
     uniform,
@@ -66,6 +67,15 @@ def test_shared_rooms_are_drawn_as_stated() -> None:
     require_plausible(_shared_room_table(SharedRoom()))
     for patches in _placements(SharedRoom(), "open_box", 50):
         assert len({(one.scale, one.translation) for one in patches}) == 1
+
+
+def test_a_wrong_room_is_noticed() -> None:
+    wrong = SharedRoom(
+        square_share=0.35, scale=(1.0, 1.3), shift=0.03, raise_z=(0.0, 0.2), tilt_deg=1.5
+    )
+    rows = {"square", "floor tilt 0", "wall0 tilt 2", "wall1 tilt 1"}
+    rows |= {f"{quantity} {axis}" for quantity in ("scale", "move") for axis in "xyz"}
+    assert rows <= set(implausible(_shared_room_table(wrong)))
 
 
 def _sides_table(stage: int, policy: Policy) -> Table:
@@ -216,3 +226,10 @@ def _roll_twin(sector: Sector) -> list[float]:
 @for_each("name", TEMPLATES)
 def test_cameras_are_drawn_as_stated(name: str) -> None:
     require_plausible(_camera_table(TEMPLATES[name].cameras))
+
+
+def test_wrong_cameras_are_noticed() -> None:
+    wrong = {"fov_deg": (30.0, 54.0), "distance": (1.5, 1.85), "up_jitter": 0.2}
+    table = _camera_table(TEMPLATES["wall"].cameras, **wrong, target_jitter=0.13)
+    targets = {f"target {axis}" for axis in range(3)}
+    assert set(implausible(table)) == {"fov", "distance", "roll", *targets}

@@ -114,6 +114,13 @@ def test_background_earns_nothing() -> None:
     assert psnr_log_db(a, b) == pytest.approx(20)  # a hundredth of the pixels: 20 dB for nothing
 
 
+def test_symmetry() -> None:
+    rng = np.random.default_rng(1)
+    a, b = rng.random((2, 6, 6, 3)) * 100
+    assert psnr_log_db(a, b) == psnr_log_db(b, a)
+    assert psnr_linear_db(a, b) == psnr_linear_db(b, a)
+
+
 def test_the_interval_of_a_mean_goes_by_clusters() -> None:
     """Ten scenes of which each has the same figure 8 times know no more than ten figures."""
     figures = [float(scene < 3) for scene in range(10) for _ in range(8)]

@@ -1,7 +1,7 @@
-"""That learning happens: unseen scenes look better than any stored picture.
+"""That learning happens: a picture comes of its own scene, unseen scenes beat any stored picture.
 
-And of networks that are told hits, skies and textures: from shards to weights, and to the bit after
-a stop. What is slow takes minutes on a busy machine.
+And of networks that are told hits, skies and textures: from shards to weights, to the bit after a
+stop, and traced alike by any crew. What is slow takes minutes on a busy machine.
 
 And a step of each kind of network on a graphics card that is not there (fake_card): on tensors
 without numbers, forward, loss with LPIPS, backward, clipping, Muon, running mean, validation,
@@ -19,6 +19,7 @@ import numpy as np
 import pytest
 import torch
 
+from model.config import ModelConfig
 from model.config import smoke as smoke_model
 from model.hits.traced import INPUTS
 from model.inference import NeuralRenderer
@@ -27,6 +28,7 @@ from model.renderformer import RenderFormer
 from storage.dataset.dataset import Dataset, open_dataset
 from storage.dataset.training_data import open_training_data
 from storage.errors import TrilightError
+from storage.metrics import psnr_log_db
 from storage.records.retextured import with_textures
 from storage.records.scene import Scene
 from storage.records.texture import Texture
@@ -37,28 +39,77 @@ from tests.train.fake_card import CARD, card_process, fake_card
 from tests.train.kit import (
     eval_config,
     require_resumed_to_the_bit,
+    stepper,
     take,
     tiny_run,
     trained,
 )
 from tests.train.loss.test_training_loss import small_weights
 from tests.train.toy import (
+    toy_picture,
+    toy_sample,
     toy_scene,
     write_toy_dataset,
 )
+from train.data.buckets import collate_batch
+from train.data.scenes import TrainingScene, training_scene
 from train.evaluation.evaluate import judge_views, make_baselines
 from train.evaluation.metrics import NETWORK, summarize_views
-from train.evaluation.validation import MEDIAN, NEAREST
+from train.evaluation.validation import MEDIAN, NEAREST, predict
 from train.loop.distributed import DistributedContext
+from train.loop.train_state import TrainState, new_state
 from train.loss.lpips import LINEAR_FILE, VGG16_FILE, load_lpips
 from train.presets import override_training_preset
 from train.resume import StartOptions
 from train.run_training import run_training
-from train.settings import AugmentationSettings, TrainSettings
+from train.settings import AugmentationSettings, TrainSettings, learning_rate
 
 SMALL = dataclasses.replace(
     smoke_model(), width=64, num_heads=1, hidden_width=192, encoder_layers=2, decoder_layers=2
 )
+
+
+def memorised(scenes: list[TrainingScene], model: ModelConfig, steps: int) -> TrainState:
+    settings = tiny_run(
+        model=model,
+        resolution=scenes[0].target_VRR3.shape[1],
+        num_steps=steps,
+        warmup_steps=20,
+        learning_rate=2e-3,
+        final_rate_share=0.01,
+        augmentation=AugmentationSettings(),
+    )
+    state = new_state(settings)
+    memorising = stepper(state)
+    batches = [collate_batch([scene]) for scene in scenes]
+    for step in range(steps):
+        memorising.step(batches, learning_rate(step, settings))
+        state.step += 1
+    return state
+
+
+def score(state: TrainState, scene: TrainingScene, target: TrainingScene) -> float:
+    """Return the psnr_log_db of one scene's picture against another's."""
+    wanted = 10 ** target.target_VRR3[0].double().numpy() - 1
+    return psnr_log_db(predict(state.eval_model, scene)[0], wanted)
+
+
+@pytest.mark.slow("training")
+def test_a_picture_comes_from_its_own_scene() -> None:
+    """Four scenes under the same camera: only the tokens tell them apart."""
+    first = toy_scene(0)
+    scenes = []
+    for index in range(4):
+        seen = toy_scene(index).with_cameras(first.c2w[:1], first.fov_deg[:1])
+        sample = dataclasses.replace(
+            toy_sample(0, views=1), scene=seen, radiance_rgb=toy_picture(seen, 0, 16)[None]
+        )
+        scenes.append(training_scene(sample, 16))
+    state = memorised(scenes, SMALL, steps=400)
+    for index, scene in enumerate(scenes):
+        other = scenes[(index + 1) % len(scenes)]
+        # the tokens of another scene, judged against this one's picture
+        assert score(state, scene, scene) > score(state, other, scene) + 3
 
 
 @pytest.mark.slow("training")
@@ -98,6 +149,17 @@ HITS_AUGMENTATION = AugmentationSettings(
 def hits_run(**changes: object) -> TrainSettings:
     run = tiny_run(model=hits_config(), run="tiny-hits", augmentation=HITS_AUGMENTATION)
     return dataclasses.replace(run, **changes)  # type: ignore[arg-type]
+
+
+def test_what_is_traced_depends_on_no_thread_and_no_rank(dataset: Dataset) -> None:
+    alone = {scene.key: scene.tensors.traced for scene in take(dataset, hits_run(), 1, first=3)[0]}
+    for rank in range(3):
+        part = {"workers": 3, "rank": rank, "world_size": 3}
+        ((other,),) = take(dataset, hits_run(), 1, first=3, **part)
+        a, b = alone.pop(other.key), other.tensors.traced
+        assert a is not None and b is not None
+        for name, value in vars(a).items():
+            assert torch.equal(value, getattr(b, name)), name
 
 
 def test_views_are_traced_after_the_symmetries_and_lack_inputs_by_chance(dataset: Dataset) -> None:

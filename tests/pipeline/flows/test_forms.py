@@ -493,6 +493,18 @@ def test_who_watches_alone_asks_for_nothing_and_waits_so_long(
     assert cluster == [] and shown == []
 
 
+def test_a_page_that_cannot_be_shown_does_not_end_an_array(
+    shown: Shown,
+    cluster: list[list[int]],
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    caplog: pytest.LogCaptureFixture,
+) -> None:
+    _cannot_show(monkeypatch)
+    run(out=str(tmp_path / "set"), scenes=4)
+    assert [record.levelname for record in caplog.records].count("WARNING") == 1
+
+
 def test_machines_are_those_of_the_worker(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """Who may start a run chooses neither an image nor an account."""
     assert not _OWN & set(KubernetesOptions.__dataclass_fields__)

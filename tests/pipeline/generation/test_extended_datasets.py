@@ -6,6 +6,7 @@ import re
 from pathlib import Path
 
 import pytest
+from prefect.exceptions import ParameterTypeError
 
 from infra.repair import repair
 from pipeline.exchange.reader import file_child
@@ -168,6 +169,15 @@ def test_a_dataset_never_causes_an_import(
     for words in (["generate", "trap.py:f"], ["generate", "smoke", "--extend", "trap.py"]):
         write_asked(DatasetFolder(folder), words)
         assert read_asked(open_dataset(str(folder))) is None
+    assert not list(tmp_path.rglob("*.ran"))
+
+
+def test_a_form_cannot_name_a_file(tmp_path: Path) -> None:
+    from pipeline.flows.prefect_flows import generate_scenes
+
+    trap = written(tmp_path, TRAP)
+    with pytest.raises(ParameterTypeError, match="build"):
+        generate_scenes.validate_parameters({"build": f"{trap}:f"})
     assert not list(tmp_path.rglob("*.ran"))
 
 

@@ -133,6 +133,15 @@ def test_waiting_uses_no_processor_seconds() -> None:
         assert child.call(called.double, 4) == 8
 
 
+def test_a_retired_child_is_replaced(child: IsolatedChild) -> None:
+    first = child.call(called.process_id)
+    assert child.call(called.process_id) == first
+    child.retire()
+    child.retire()
+    assert not Path(f"/proc/{first}").exists()
+    assert child.call(called.process_id) != first
+
+
 PATIENT = ChildLimits(memory_bytes=2 << 30, wall_s=60, calls_per_child=9)
 
 
@@ -158,6 +167,13 @@ def test_a_stopped_child_is_noticed_and_its_work_done_again(
     assert record.levelno == logging.WARNING
     assert f"child process {stopped} has been stopped" in record.getMessage()
     assert f"`kill -CONT {stopped}`" in record.getMessage()
+
+
+def test_a_child_that_stays_stopped_is_the_fault_of_the_environment(watched: IsolatedChild) -> None:
+    os.kill(watched.call(called.process_id), signal.SIGSTOP)
+    with pytest.raises(ChildFailed, match="stopped: stopped from outside") as caught:
+        watched.call(called.process_id)
+    assert not caught.value.is_verdict
 
 
 def test_a_child_that_is_continued_in_time_answers_itself(

@@ -16,7 +16,7 @@ from storage.records.scene import Scene
 from tests.oracle import plugin_scene, plugin_tracer
 from tests.oracle.plugin_tracer import _NEAR_CLIP
 from tests.pipeline.renders.sampling import camera_of
-from tests.pipeline.renders.scene_kit import join, light, material, quad, sampled_like_scene
+from tests.pipeline.renders.scene_kit import flat, join, light, material, quad, sampled_like_scene
 
 RESOLUTION = 32
 CHANNELS = {
@@ -96,3 +96,18 @@ def test_a_lit_square_covers_the_pixels_that_it_should() -> None:
     np.testing.assert_allclose(features.normal, expected[..., None] * [0, -1, 0], atol=0.02)
     assert (picture[expected] > 0.2).all()
     assert (picture[~expected] < 0.02).all()
+
+
+def test_emitters_are_invisible_to_the_auxiliary_pictures() -> None:
+    floor = quad([[-1, -1, 0], [1, -1, 0], [1, 1, 0], [-1, 1, 0]], material(diffuse=0.5))
+    in_front = flat([[[-1, -1, 0.5], [1, -1, 0.5], [0, 1, 0.5]]], material(emission=1), "emitter")
+    lamp = light([[-1, -1, 3], [1, -1, 3], [0, 1, 3]], 1.0)
+    pictures = [
+        load_tracer(join(parts, eye=(0, -0.1, 2)), max_depth=2, rr_depth=5)
+        for parts in ([floor, lamp], [floor, lamp, in_front])
+    ]
+    camera = camera_of(join([floor, lamp], eye=(0, -0.1, 2)), 16)
+    without, with_emitter = (tracer.features(camera, spp=16) for tracer in pictures)
+    np.testing.assert_array_equal(without.albedo, with_emitter.albedo)
+    np.testing.assert_array_equal(without.normal, with_emitter.normal)
+    np.testing.assert_array_equal(pictures[0].hits(camera), pictures[1].hits(camera))

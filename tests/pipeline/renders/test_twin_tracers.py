@@ -300,6 +300,21 @@ def test_light_that_is_not_there_is_exactly_nothing() -> None:
     assert hidden.radiance_rgb.mean() > 0.01
 
 
+def test_what_has_no_lobe_shows_none_of_its_light_once_denoised() -> None:
+    """A metal ball on a matt floor: only pixels at its rim show both."""
+    ball = sphere([0, 0, 0.5], 0.5, material(specular=0.9, roughness=0.3), rings=8)
+    scene = join([FLOOR, ball, light(LAMP, 20.0)], eye=(0, -3, 2), target=(0, 0, 0.4))
+    found = render_view(scene, _with(SETTINGS, split=True, split_lobes=True)).parts_rgb
+    assert found is not None
+    diffuse, specular = (
+        (found[f"{lobe}_direct"] + found[f"{lobe}_indirect"]).max(axis=-1) > 0
+        for lobe in ("diffuse", "specular")
+    )
+    rim = diffuse & specular
+    # the ball is some 14 pixels wide, so that its rim is some 44 pixels long and 1 to 2 wide
+    assert rim.sum() < 90 and (diffuse & ~rim).sum() > 300 and (specular & ~rim).sum() > 90
+
+
 @pytest.mark.slow("statistics")
 def test_floors_of_parts_are_honest() -> None:
     """On average over samples; of one set of samples a floor is itself an estimate.

@@ -2,6 +2,7 @@
 
 import dataclasses
 import itertools
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -33,13 +34,15 @@ from scene_templates.rotations import rotate_points
 from scene_templates.settings import SceneSettings
 from scene_templates.surfaces.procedural_textures import SurfaceMapSettings
 from scene_templates.textures import TextureSettings
+from storage.conventions import look_at_c2w
 from storage.errors import Rejected
 from storage.records.asset import Level, LevelSkin, SkinQuality
 from storage.records.lookup import texture_values
 from storage.records.material import EMISSION, default_rows
 from storage.records.objects import locked_uids
 from storage.records.packed_maps import pack_map
-from storage.records.retextured import without_normal_maps
+from storage.records.passes.pictures import view_passes
+from storage.records.retextured import without_constant_textures, without_normal_maps
 from storage.records.scene import Scene, SceneObject
 from storage.records.scene_facts import texture_families
 from storage.records.scene_file import scene_digest
@@ -47,6 +50,14 @@ from storage.records.texture import Texture
 from storage.seeds import SceneKey
 from storage.settings.overrides import apply_overrides
 from tests.for_each import for_each
+from tests.pipeline.assets.meshes_by_hand import prepare
+from tests.pipeline.assets.source_materials.textured_kit import (
+    CORNERS,
+    KEEP,
+    QUARTERS,
+    picture_bytes,
+    textured_glb,
+)
 from tests.pipeline.scenes.small_pool import LOOK, first_scene, pooled, small_pool
 from tests.scene_templates.balls import STILL
 from tests.scene_templates.statistics import require_plausible, share
@@ -424,6 +435,30 @@ def test_subdivision_moves_no_colour() -> None:
         weights = trimesh.triangles.points_to_barycentric(corners, points)[:, None]
         off = np.abs((weights @ before)[:, 0] - found).max(axis=1)
         assert off[holds].min() < 1e-5  # float32 positions
+
+
+def test_a_picture_has_the_colours_of_a_file_in_their_corners(tmp_path: Path) -> None:
+    """Red at the lower left, as the file's picture has it; tracers follow these passes."""
+    asset = prepare(textured_glb(tmp_path / "a.glb", picture_bytes(CORNERS)), KEEP)
+    level, entry = asset.levels[0], PooledAsset(locked=small_pool()[0].locked, asset=asset)
+    (skin,) = source_skins([entry], [level], OWN.materials, SceneKey(0, 0))
+    assert skin is not None
+    shape = level.positions, level.faces
+    named, rng = SceneObject(name="square", kind="object"), np.random.default_rng(0)
+    square = apply_skin(object_piece(named, *shape, LOOK, rng, 30.0), *shape, skin)
+    scene = Scene(
+        **concatenate_pieces([square]),
+        c2w=look_at_c2w(eye=[0, -2, 0], target=[0, 0, 0], up=[0, 0, 1])[None].astype(np.float32),
+        fov_deg=np.array([30], np.float32),
+        objects=(square.entry,),
+        provenance={"template": "none"},
+    )
+    for each in (scene, without_constant_textures(scene)):
+        seen = view_passes(each, ["material_diffuse"], resolution=32)["material_diffuse"]
+        width = 16 / (2 * np.tan(np.radians(15)))  # pixels for each metre
+        for (right, up), colour in QUARTERS.items():
+            there, lit = seen[int(16 - up * width), int(16 + right * width)], np.array(colour) > 0
+            assert there[lit].min() > 4 * there[~lit].max(initial=0), (right, up, there)
 
 
 QUAD = np.array([[0, 0, 0], [1, 0, 0], [1, 1, 0], [0, 1, 0]], np.float32)

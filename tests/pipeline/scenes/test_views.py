@@ -40,7 +40,7 @@ from storage.conventions import camera_rays, look_at_c2w
 from storage.errors import Rejected
 from storage.records.material import DIFFUSE, EMISSION, SPECULAR
 from storage.records.scene import ARRAY_FIELDS, Scene
-from storage.records.scene_facts import lights
+from storage.records.scene_facts import lights, surfaces
 from storage.seeds import SceneKey
 from storage.settings.overrides import apply_overrides
 from tests.pipeline.scenes.small_pool import (
@@ -228,6 +228,19 @@ def test_new_materials_leave_shape_light_and_the_pattern_of_colours(scene: Scene
         assert len(np.unique(after[:, DIFFUSE], axis=0)) == num_colours
         sums = (after[:, DIFFUSE] + after[:, SPECULAR]).max(axis=1)
         assert sums.max() <= SMOKE.materials.albedo_sum[1] + 1e-6  # rounding of float32
+
+
+def test_draws_are_those_of_composition(scene: Scene) -> None:
+    """The means of many draws are those of the stated ranges: albedo sums, specular shares."""
+    drawn = [
+        surface
+        for attempt in range(40)
+        for surface in surfaces(with_new_materials(scene, SMOKE.materials, SceneKey(7, 3, attempt)))
+    ]
+    share = np.array([one.specular / 0.95 for one in drawn])
+    # uniform in [0, 1] times a sum within 5 % of 0.95: mean 0.5, five standard errors
+    assert abs(share.mean() - 0.5) < 5 * 0.29 / np.sqrt(len(drawn))
+    assert len({one.roughness for one in drawn}) == len(drawn)
 
 
 def test_new_lights_leave_surfaces_and_follow_the_ranges(scene: Scene) -> None:

@@ -189,6 +189,13 @@ def test_a_manifest_that_lies_is_one_sentence_within_a_second(
     assert field.rpartition(".")[2] in said or "bytes are too many" in said
 
 
+@for_each("text", ["", "[" * 100_000, "[]", "{}", "3", '{"schema_version": 3}', "\\", "{}{}"])
+def test_what_is_no_manifest_is_one_sentence(tmp_path: Path, text: str) -> None:
+    (tmp_path / "manifest.json").write_text(text)
+    with pytest.raises(TrilightError, match=r"^[^\n]*manifest.json: [^\n]*$"):
+        read_manifest(tmp_path / "manifest.json")
+
+
 def test_a_billion_planned_shards_cost_nothing(tmp_path: Path) -> None:
     dataset = five_scenes(tmp_path)
     settings = {"splits": {"scenes_per_shard": 1}}

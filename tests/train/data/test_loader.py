@@ -284,6 +284,8 @@ def test_what_is_no_half_float_is_no_row() -> None:
 
 
 SIZES = st.lists(st.integers(0, 9), min_size=1, max_size=9).filter(any)
+WORLDS = (1, 2, 3, 8)
+BATCH = 24
 
 
 def places(
@@ -327,6 +329,20 @@ def test_the_order_is_a_function_of_seed_and_epoch() -> None:
     epochs = [epoch for found in both for epoch in (found[:48], found[48:])]
     assert len({tuple((p.shard, p.row) for p in epoch) for epoch in epochs}) == 6
     assert len({tuple(p.shard for p in epoch) for epoch in epochs}) == 6
+
+
+@settings(deadline=None)  # a busy machine is no failure
+@given(SIZES, st.integers(0, 40), st.integers(1, 5))
+def test_the_ranks_share_out_every_batch(sizes: list[int], first: int, window: int) -> None:
+    """Whatever their number: each place with one rank, equally many each, nobody left out."""
+    stream = places(sizes, first, seed=1, window=window, count=3 * BATCH)
+    for batch in (stream[at : at + BATCH] for at in range(0, 3 * BATCH, BATCH)):
+        assert [place.position for place in batch] == list(range(first, first + BATCH))
+        first += BATCH
+        for world in WORLDS:
+            shares = [RankSlice(rank=r, world_size=world).of_batch(batch) for r in range(world)]
+            assert {len(share) for share in shares} == {BATCH // world}
+            assert sorted(itertools.chain(*shares), key=lambda p: p.position) == batch
 
 
 def test_each_rank_reads_few_shards_of_a_window() -> None:

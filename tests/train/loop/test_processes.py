@@ -1,4 +1,4 @@
-"""One process or several: the same training. With real processes of torchrun."""
+"""One process, several, and passes added up: the same training. With real processes of torchrun."""
 
 import contextlib
 import functools
@@ -126,6 +126,12 @@ def test_several_processes_train_as_one(dataset: Dataset, alone: Path, tmp_path:
     assert settings["processes"] == 2
     rows = [row["step"] for row in read_rows(several / "metrics.jsonl") if "loss" in row]
     assert rows == [2, 4, 6, 8], "one process writes"
+
+
+def test_passes_that_add_up_train_as_one_batch(
+    dataset: Dataset, alone: Path, tmp_path: Path
+) -> None:
+    same_to_rounding(run(dataset, tmp_path / "passes", 1, scenes_per_pass=1), alone)
 
 
 LONGER = {"num_steps": 60, "validate_every": 20, "checkpoint_every": 20, "muon_rate": 3.0}

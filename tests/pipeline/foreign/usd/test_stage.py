@@ -225,3 +225,9 @@ def test_instances_stand_in_their_order_and_too_many_are_refused_before_their_pl
     monkeypatch.setattr(placed, "MAX_PLACED", 4)
     with pytest.raises(TrilightError, match="/many: 5 instances; expected at most 4"):
         placed.placed_prims(stage_of("/many/mesh", 5), Usd.TimeCode.Default(), [])
+
+
+def test_an_instancer_within_itself_is_refused() -> None:
+    """Every level would hold the places of its instances."""
+    with pytest.raises(TrilightError, match="/many: nested more than 150 deep"):
+        placed.placed_prims(stage_of("/many", 2), Usd.TimeCode.Default(), [])

@@ -101,6 +101,40 @@ def test_the_axes_of_the_camera() -> None:
     assert seen["depth_axis_m"][0, 0] == pytest.approx(2, abs=1e-12)
 
 
+def test_a_mirrored_scene_has_mirrored_passes() -> None:
+    scene, resolution = room(0), 40
+    before, after = (view_passes(each, resolution=resolution) for each in (scene, _mirrored(scene)))
+    back = {name: picture[:, ::-1] for name, picture in after.items()}
+    # rays along a rim may fall to either triangle
+    same = (before["triangle"] == back["triangle"]) & (before["hit"] == back["hit"])
+    assert same.mean() > 0.99
+    turned = {"position_m": [-1, 1, 1], "shading_normal": [-1, 1, 1], "barycentric": [1, 1, 1]}
+    # corners run the other way round in the mirror, and (a, b, c) became (a, c, b)
+    back["barycentric"] = back["barycentric"][..., [0, 2, 1]]
+    turned |= {"geometric_normal": [-1, 1, 1], "shading_normal_camera": [-1, 1, 1]}
+    for name in ("depth_axis_m", "depth_ray_m", "material_diffuse", "material_roughness"):
+        np.testing.assert_allclose(before[name][same], back[name][same], rtol=1e-6, err_msg=name)
+    for name, signs in turned.items():
+        np.testing.assert_allclose(
+            before[name][same], (back[name] * signs)[same], atol=1e-4, err_msg=name
+        )
+
+
+def _mirrored(scene: Scene) -> Scene:
+    """Return the scene with x negated, its triangles' second and third corners exchanged."""
+    flip = np.array([-1, 1, 1], np.float32)
+    poses = scene.c2w.copy()
+    poses[:, :3] *= flip[:, None]
+    poses[:, :3, 0] *= -1  # a camera stays right-handed: its own x points to the other side
+    return dataclasses.replace(
+        scene,
+        vertex_positions=scene.vertex_positions * flip,
+        vertex_normals=scene.vertex_normals * flip,
+        faces=scene.faces[:, [0, 2, 1]],
+        c2w=poses,
+    )
+
+
 @for_each("a_side", [2, 3])
 def test_blocks_of_rows_join_to_the_same_picture(
     a_side: int, monkeypatch: pytest.MonkeyPatch
@@ -233,6 +267,16 @@ def test_a_camera_and_a_floor_that_step_aside_in_closed_form() -> None:
     later = dataclasses.replace(scene, vertex_positions=moved)
     slid = view_passes(scene, ["motion_px"], resolution=16, then=later)["motion_px"]
     np.testing.assert_allclose(slid, np.broadcast_to([4.0, 0.0], (16, 16, 2)), atol=1e-6)
+
+
+def test_it_is_the_difference_of_projections() -> None:
+    scene = room(1)
+    seen = view_passes(scene, resolution=24, view=0, then_view=1)
+    now, then = (
+        pixel_places(seen["position_m"], scene.c2w[view], float(scene.fov_deg[view]), 24)
+        for view in (0, 1)
+    )
+    np.testing.assert_allclose(seen["motion_px"], then - now, atol=1e-6)
 
 
 def test_what_is_behind_the_other_camera_does_not_move() -> None:
