@@ -77,7 +77,7 @@ def scene_list(root: Path) -> tuple[Sequence[str], bool]:
     suffixes = frozenset(readable_suffixes())
     names = list[str]()
     for folder, below, files in os.walk(root):
-        below[:] = [name for name in below if not name.startswith(".")]
+        below[:] = sorted(name for name in below if not name.startswith("."))
         paths = (Path(folder, name) for name in files if not name.startswith("."))
         scenes = (path for path in paths if path.suffix.lower() in suffixes)
         names += [path.relative_to(root).as_posix() for path in scenes]
