@@ -177,10 +177,10 @@ def _settings(kind: type, words_by_name: Mapping[str, Any]) -> Any:
     try:
         return kind(**values)
     except TrilightError as error:
-        name = re.match(r"\w+(?= is )", str(error))
-        if name is None or name[0] not in fields:
+        name = re.match(r"(\w+)(\.\d+)?(?= is )", str(error))  # perhaps one of several words
+        if name is None or name[1] not in fields:
             raise
-        raise TrilightError(shown_name(fields[name[0]]) + str(error)[name.end() :]) from error
+        raise TrilightError(shown_name(fields[name[1]]) + str(error)[name.end() :]) from error
 
 
 def value_of(words: bool | str | Sequence[str], hint: Any) -> Any:

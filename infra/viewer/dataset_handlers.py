@@ -9,11 +9,10 @@ import struct
 import threading
 import time
 import zlib
+from array import array
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
-
-import numpy as np
 
 from infra.render.path_tracer import RenderChild
 from infra.viewer.scene_handlers import (
@@ -133,7 +132,7 @@ def _row(opened: ShardReader, key: str, shard: ShardEntry) -> SceneRow:
         "lights_per_scene": sum(entry["kind"] == "emitter" for entry in record["objects"]),
     }
     for name in _OF_VIEWS:  # as single numbers, like those that `trilight shards select` compares
-        values[name] = [float(np.float32(view[name])) for view in record["views"]]
+        values[name] = array("f", [view[name] for view in record["views"]])
     facts = SceneFacts(
         shard=shard,
         key=key,

@@ -1,5 +1,6 @@
 """Opens the source of `trilight view`; its page is served before, and its requests wait."""
 
+import os
 from collections.abc import Sequence
 from concurrent.futures import Future
 from pathlib import Path
@@ -74,9 +75,15 @@ def scene_list(root: Path) -> tuple[Sequence[str], bool]:
     from pipeline.exchange.formats import readable_suffixes  # slow
 
     suffixes = frozenset(readable_suffixes())
-    below = (path.relative_to(root) for path in root.rglob("*") if path.suffix.lower() in suffixes)
-    visible = (path for path in below if not any(part.startswith(".") for part in path.parts))
-    names = sorted(path.as_posix() for path in visible if (root / path).is_file())
+    names = list[str]()
+    for folder, below, files in os.walk(root):
+        below[:] = sorted(name for name in below if not name.startswith("."))
+        paths = (Path(folder, name) for name in files if not name.startswith("."))
+        scenes = (path for path in paths if path.suffix.lower() in suffixes)
+        names += [path.relative_to(root).as_posix() for path in scenes]
+        if len(names) > MOST_FILES:
+            break
+    names.sort()
     if not names:
         raise TrilightError(
             f"{root}: no dataset, and holds no scene; expected a folder that `trilight generate` "

@@ -204,7 +204,10 @@ def expected_of(hint: Any) -> str:
     args = get_args(hint)
     if origin is Annotated:
         stated = (getattr(note, "expected", "") for note in args[1:])
-        return next(filter(None, stated), "") or expected_of(args[0])
+        plain = " ".join(
+            [expected_of(args[0]), *(str(n) for n in args[1:] if isinstance(n, Within))]
+        )
+        return next(filter(None, stated), plain)
     if origin is Literal:
         *choices, last = map(str, args)
         return f"{', '.join(choices)} or {last}" if choices else last

@@ -191,7 +191,7 @@ def leaderboard_page(
 
 
 def scores_table(contestants: Mapping[str, Mapping[str, Any]]) -> str:
-    """Return a table of summaries (judged_view.summarize_views) by method."""
+    """Return a table of summaries (metrics.summarize_views) by method."""
     metrics = [name for name in METRICS if all(name in each for each in contestants.values())]
     rows = [
         [text(who), *(_with_tail(name, scores) for name in metrics)]

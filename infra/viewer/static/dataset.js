@@ -13,7 +13,7 @@ function query(first) {
   const limits = [];
   for (const { name, value, dataset } of form.elements) {
     if (!name || value === "") continue;
-    if (dataset.limit) limits.push(`${dataset.limit} ${value}`);
+    if (dataset.limit) limits.push(`${dataset.limit} ${Number(value)}`);
     else asked.set(name, value);
   }
   if (limits.length) asked.set("where", limits.join(" and "));

@@ -141,6 +141,8 @@ REFUSED = {
     "generate smoke --scenes 0": "--scenes is 0; expected a whole number from 1 to 1000000000",
     "generate smoke --noise-floor nan": "--noise-floor is nan; expected a number above 0",
     "render x --out y.exr --exposure -99": "--exposure is -99",
+    "leaderboard set --resolution 0": "--resolution is 0; expected a list, each entry a whole "
+    "number from 1 to 8192 pixels",
     "status nowhere --price -1": "--price is -1.0; expected a number from 0 to 1000 USD per core-h",
     "status set --lines": "--lines is given; expected it only",
     "model huge": "model 'huge': neither a size nor a checkpoint here",
