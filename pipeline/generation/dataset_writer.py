@@ -359,7 +359,8 @@ class DatasetWriter:
         self.refresh()
         if (most := max(requested, *plans, 0)) > self.manifest.num_scenes:
             with self.hold_lock("manifest"):
-                self._extend(max(most, self.manifest.num_scenes))
+                if most > self.manifest.num_scenes:  # else another worker was faster
+                    self._extend(most)
         splits = self.splits
         each = self._splits.scenes_per_shard
         last = () if splits.listed_shards else {plan // each for plan in plans if plan % each}
