@@ -189,12 +189,12 @@ class RunPage:
         """Return the status of the dataset; of a run of a range, that of its shards and tasks."""
         status = read_status(self._place)
         run = self._run
-        if run is None or (asked := run.options.shard_range()) is None:
+        if run is None or (requested := run.options.shard_range()) is None:
             return status
         writer = run.publication
-        shards = range(writer.num_shards)[asked.start : asked.stop]
+        shards = range(writer.num_shards)[requested.start : requested.stop]
         missing = writer.missing_shards(shards)
-        planned, left = (
+        planned, missing_scenes = (
             sum(len(scenes_of_shard(index, writer.splits)) for index in some)
             for some in (shards, missing)
         )
@@ -203,11 +203,11 @@ class RunPage:
             status,
             shards_done=len(shards) - len(missing),
             shards_planned=len(shards),
-            scenes_done=planned - left - writer.given_up,
+            scenes_done=planned - missing_scenes - writer.given_up,
             scenes_given_up=writer.given_up,
             scenes_planned=planned,
             views_per_hour=3600 * per_s * writer.manifest.num_views,
-            remaining_s=left / per_s if per_s else None,
+            remaining_s=missing_scenes / per_s if per_s else None,
             core_hours=self._core_s / 3600,
         )
 
