@@ -156,20 +156,23 @@ def submit_slurm_array(job: ArrayJob, options: Sequence[str] = ()) -> str:
     Raises:
         TrilightError: there is no sbatch here, or it refuses.
     """
+    _require_command("slurm", "sbatch", "a login node of a Slurm cluster")
     Path("logs").mkdir(exist_ok=True)  # the script's tasks write their logs here
     said = _submit("slurm", sbatch_command(job, options), sbatch_environment(job))
     return said.strip().partition(";")[0]
+
+
+def _require_command(on: str, command: str, expected: str) -> None:
+    if shutil.which(command) is None:
+        raise TrilightError(
+            f"submit {on}: no {command} here; expected {expected}. --dry-run prints the command."
+        )
 
 
 def _submit(
     on: str, command: Sequence[str], variables: Mapping[str, str] | None = None, hint: str = ""
 ) -> str:
     """Run a scheduler's command and return what it prints; raises TrilightError if it refuses."""
-    if shutil.which(command[0]) is None:
-        raise TrilightError(
-            f"submit {on}: no {command[0]} here; expected a machine from which the cluster takes "
-            "jobs. --dry-run prints the command."
-        )
     environment = {**os.environ, **(variables or {})}
     done = subprocess.run(command, env=environment, capture_output=True, text=True, check=False)
     if done.returncode:
@@ -254,6 +257,8 @@ def submit_job(job: ArrayJob, options: KubernetesOptions) -> Path:
         TrilightError: there is no kubectl here, or it refuses; or as `write_manifest`.
     """
     path = write_job_file(job, options)
+    expected = f"it installed and logged in. The manifest is written ({path})"
+    _require_command("kubernetes", "kubectl", expected)
     hint = " Where a job of that name has ended, delete it, and submit again."
     _submit("kubernetes", create_command(path), hint=hint)
     return path

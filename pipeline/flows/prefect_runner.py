@@ -10,6 +10,7 @@ continues if they cannot be written.
 """
 
 import base64
+import dataclasses
 import io
 import logging
 import os
@@ -43,6 +44,7 @@ from pipeline.generation.generation_run import Outcome, Piece, Run, Runner, Shar
 from pipeline.generation.pipeline import make_dataset, make_task
 from storage.dataset.layout import dataset_folder
 from storage.dataset.progress import DatasetStatus, read_status
+from storage.dataset.splits import scenes_of_shard
 from storage.dataset.statistics import Statistics
 from storage.errors import EnvironmentFailure, TrilightError
 from storage.remote.safe_url import safe_text
@@ -158,6 +160,10 @@ class RunPage:
         self._place = place
         self._price = usd_per_core_hour()
         self._rows: list[tuple[str, str]] = []
+        self._run: Run | None = None
+        self._began_s = 0.0
+        self._scenes = 0
+        self._core_s = 0.0
         self._shown_s = -_EVERY_S
         self._log = get_run_logger()
         self._warned = False
@@ -167,11 +173,43 @@ class RunPage:
 
     def record_task(self, run: Run, outcome: TaskResult) -> None:
         """Log the shards of a finished task, and show the progress if it was shown long ago."""
+        now_s = time.monotonic()
+        if self._run is None:
+            self._run = run
+            self._began_s = now_s - outcome.seconds  # objects are prepared before
+        self._scenes += outcome.scenes
+        self._core_s += outcome.core_s
         for shard in outcome.shards:
             self._log.info("shard %s: %d scenes", shard.name, shard.num_samples)
-        if time.monotonic() - self._shown_s >= _EVERY_S:
-            self._shown_s = time.monotonic()
-            self._show(lambda: self.show_status(read_status(self._place)))
+        if now_s - self._shown_s >= _EVERY_S:
+            self._shown_s = now_s
+            self._show(lambda: self.show_status(self._read_status()))
+
+    def _read_status(self) -> DatasetStatus:
+        """Return the status of the dataset; of a run of a range, that of its shards and tasks."""
+        status = read_status(self._place)
+        run = self._run
+        if run is None or (requested := run.options.shard_range()) is None:
+            return status
+        writer = run.publication
+        shards = range(writer.num_shards)[requested.start : requested.stop]
+        missing = writer.missing_shards(shards)
+        planned, missing_scenes = (
+            sum(len(scenes_of_shard(index, writer.splits)) for index in some)
+            for some in (shards, missing)
+        )
+        per_s = self._scenes / max(time.monotonic() - self._began_s, 1e-3)
+        return dataclasses.replace(
+            status,
+            shards_done=len(shards) - len(missing),
+            shards_planned=len(shards),
+            scenes_done=planned - missing_scenes - writer.given_up,
+            scenes_given_up=writer.given_up,
+            scenes_planned=planned,
+            views_per_hour=3600 * per_s * writer.manifest.num_views,
+            remaining_s=missing_scenes / per_s if per_s else None,
+            core_hours=self._core_s / 3600,
+        )
 
     def show_status(self, status: DatasetStatus) -> None:
         """Show the progress of the dataset, if it has changed."""
@@ -198,7 +236,9 @@ class RunPage:
     def show_failure(self, error: Exception) -> None:
         """Show why the run ended early; finished scenes stay on disk."""
         what = safe_text(f"{type(error).__name__}: {error}".partition("\n")[0])
-        self._show(lambda: self._tell_table("summary", [("failed", what)]))
+        made = ("scenes of this run", str(self._scenes))
+        cost = ("cost of this run", self._cost(self._core_s / 3600))
+        self._show(lambda: self._tell_table("summary", [("failed", what), made, cost]))
 
     def _show(self, show: Callable[[], object]) -> object:
         """Show something and return what that returns; log the first error, and never raise."""
@@ -216,21 +256,23 @@ class RunPage:
         if self._progress is not None:
             percent = 100.0 * over / max(status.scenes_planned, 1)
             update_progress_artifact(self._progress, percent)
-        core_hours = status.core_hours or 0.0
         rows = [
             ("shards", f"{status.shards_done} of {status.shards_planned}"),
             *more,
             *((f"rejected: {why} ({stage})", str(count)) for stage, why, count in status.failures),
-            ("cost", f"{core_hours:.3f} core-hours, {core_hours * self._price:.2f} USD"),
+            ("cost", self._cost(status.core_hours or 0.0)),
         ]
         self._tell_table(key, rows)
+
+    def _cost(self, core_hours: float) -> str:
+        return f"{core_hours:.3f} core-hours, {core_hours * self._price:.2f} USD"
 
     def _tell_table(self, key: str, rows: Sequence[tuple[str, str]]) -> None:
         table = [{"what": name, "value": value} for name, value in rows]
         create_table_artifact(table, key, description=self._place)
 
     def _sum_up(self, statistics: Statistics | None) -> None:
-        status = read_status(self._place)
+        status = self._read_status()
         rows = [("dataset digest", status.digest), *(statistics.lines() if statistics else ())]
         # Prefect's page cannot show files of the worker, only their path
         report = [("report", f"{self._place}/report.html")] if status.finished else []

@@ -230,9 +230,10 @@ class DatasetWriter:
         self.refresh_plan()
         every = range(self.num_shards)
         selected = every if requested is None else every[requested.start : requested.stop]
-        return self._missing_shards(selected)
+        return self.missing_shards(selected)
 
-    def _missing_shards(self, shards: range) -> list[int]:
+    def missing_shards(self, shards: range) -> list[int]:
+        """Return the unfinished or growing ones of some shards of the plan as it is known."""
         finished = self._finished_shards(shards)
         return [index for index in shards if shard_name(index, self._splits) not in finished]
 
@@ -257,7 +258,7 @@ class DatasetWriter:
         parts = list(in_parts(range(self.num_shards)))
         if any(len(self._finished_shards(part)) < len(part) for part in parts):  # names cost more
             return False
-        return not any(map(self._missing_shards, parts))
+        return not any(map(self.missing_shards, parts))
 
     def finish(self) -> Manifest | None:
         """List all shards in the manifest if all are finished, and return it; else None.
@@ -359,7 +360,8 @@ class DatasetWriter:
         self.refresh()
         if (most := max(requested, *plans, 0)) > self.manifest.num_scenes:
             with self.hold_lock("manifest"):
-                self._extend(max(most, self.manifest.num_scenes))
+                if most > self.manifest.num_scenes:  # else another worker was faster
+                    self._extend(most)
         splits = self.splits
         each = self._splits.scenes_per_shard
         last = () if splits.listed_shards else {plan // each for plan in plans if plan % each}

@@ -242,6 +242,7 @@ def resolve_inputs(
     if options.scenes_from is not None:
         files = find_scene_files(options.scenes_from, options.albedo_over_one)
         settings = settings_for_files(settings, files, options.views)
+        map_folders(options, settings)  # refuses shares of maps: scenes of files draw none
         return settings, partial(accept_scene_files, files, licence, settings)
     source = object_source(settings, options.objects)
     if not folder.manifest.exists():

@@ -297,13 +297,13 @@ def _apart_from_program() -> Iterator[None]:
         environment = os.environ.copy()
         paths = sys.path
         temporary = tempfile.tempdir
-        if program.__spec__ is None:
-            sys.modules["__main__"] = ModuleType("__main__")
-        os.environ.update(child_environment())
-        sys.path = order_installed_first(paths)
-        if len(os.fsencode(tempfile.gettempdir())) > _LONGEST_FOLDER:
-            tempfile.tempdir = "/tmp"
         try:
+            if program.__spec__ is None:
+                sys.modules["__main__"] = ModuleType("__main__")
+            os.environ.update(child_environment())
+            sys.path = order_installed_first(paths)
+            if len(os.fsencode(tempfile.gettempdir())) > _LONGEST_FOLDER:
+                tempfile.tempdir = "/tmp"
             yield
         finally:
             sys.modules["__main__"] = program
@@ -313,7 +313,7 @@ def _apart_from_program() -> Iterator[None]:
                 if name in environment:
                     os.environ[name] = environment[name]
                 else:
-                    del os.environ[name]
+                    os.environ.pop(name, None)
 
 
 def preload(modules: list[str]) -> None:

@@ -265,10 +265,11 @@ def run_module(
 _FOLDERS = (
     "/usr/lib",
     "/usr/lib/*-linux-gnu",
+    "/usr/lib/llvm*/lib",
+    "/usr/lib/llvm/*/lib*",
     "/usr/lib64",
-    "/usr/lib64/llvm*/lib64",
-    "/usr/lib/llvm-*/lib",
-    "/usr/local/lib",
+    "/usr/lib64/llvm*/lib*",
+    "/usr/local/lib*",
     "/opt/homebrew/opt/llvm*/lib",
     "/usr/local/opt/llvm*/lib",
 )

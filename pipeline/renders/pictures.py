@@ -470,6 +470,7 @@ class ViewPictures:
         self, numbers: LookNumbers, floors: list[MeasuredFloor], expected: MeasuredFloor | None
     ) -> MeasuredLook:
         self._logs = numbers.logs
+        self._filtered = []  # memory for the passes that follow
         across = len(self.hits) // TILE_PX
         return MeasuredLook(
             floor=floors[0],

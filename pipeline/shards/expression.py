@@ -35,8 +35,6 @@ _COMPARISONS: Mapping[type, Callable[[Any, Any], Any]] = {
     ast.Eq: operator.eq, ast.NotEq: operator.ne,
 }  # fmt: skip
 _OPERATIONS: Mapping[Any, tuple[Kind, Kind, Callable[..., Any]]] = {
-    ast.And: ("truth", "truth", lambda *truths: all(truths)),
-    ast.Or: ("truth", "truth", lambda *truths: any(truths)),
     ast.Not: ("truth", "truth", operator.not_),
     ast.USub: ("number", "number", operator.neg),
     ast.Add: ("number", "number", operator.add),
@@ -139,7 +137,9 @@ class _Reader:
                 tests = [self._test(*pair) for pair in pairs]
                 return _Term(kind="truth", of=lambda values: all(test(values) for test in tests))
             case ast.BoolOp(op=op, values=parts):
-                operation = type(op)
+                truths = [self._read_kind(part, "truth").of for part in parts]
+                every = all if isinstance(op, ast.And) else any  # the first may guard the next
+                return _Term(kind="truth", of=lambda values: every(of(values) for of in truths))
             case ast.UnaryOp(op=unary, operand=part):
                 operation = type(unary)
                 parts = [part]

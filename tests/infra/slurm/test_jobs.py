@@ -186,7 +186,7 @@ def test_refusals(tools: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv("FAKE_REFUSES", "1")
     assert "kubectl refused (AlreadyExists)" in trilight(words).mistake
     monkeypatch.setenv("PATH", "/nowhere")
-    assert "no kubectl here" in trilight(words).mistake
+    assert "no kubectl here; expected it installed and logged in" in trilight(words).mistake
     assert "'--sbatch' is unknown" in trilight([*words, "--sbatch=-x"]).mistake
 
 

@@ -15,6 +15,7 @@ from pipeline.exchange.scene_files import SceneFiles, find_scene_files
 from pipeline.generation import render_workers
 from pipeline.generation.dataset_writer import begin_or_resume_dataset
 from pipeline.generation.generate_options import GenerateOptions
+from pipeline.generation.generation_run import resolve_inputs
 from pipeline.generation.scene_origins import (
     accept_scene_files,
     build_once,
@@ -251,6 +252,13 @@ def test_a_run_reads_files_in_a_confined_child(
     job.accepted.origin = NO_OBJECTS.origin
     with render_workers.job_children(job) as (_, nothing):
         assert nothing is None
+
+
+def test_shares_of_maps_that_no_scene_file_draws_are_refused(folder: Path, tmp_path: Path) -> None:
+    shares = {"scenes.textures.share": 0.5, "scenes.textures.own_share": 1.0}
+    options = GenerateOptions(scenes_from=str(folder), changes=shares)
+    with pytest.raises(TrilightError, match="textures.own_share is 1, but --textures is not given"):
+        resolve_inputs(options, DatasetFolder(tmp_path / "set"))
 
 
 @pytest.mark.usefixtures("no_child")

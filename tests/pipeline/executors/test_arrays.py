@@ -241,7 +241,9 @@ def test_refusals(cluster: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     result = trilight(words)
     assert "sbatch refused (sbatch: error: invalid partition)" in str(result.exception)
     monkeypatch.setenv("PATH", "/nowhere")
-    assert "no sbatch here" in str(trilight(words).exception)
+    (cluster / "logs").rmdir()
+    assert "no sbatch here; expected a login node" in str(trilight(words).exception)
+    assert not (cluster / "logs").exists()
     dry = trilight([*words, "--dry-run"])
     assert dry.exit_code == 0 and "sbatch --parsable --array=0-5" in dry.stdout
     result = trilight(["submit", "generate-scenes", "smoke", "--dry-run"])

@@ -2,6 +2,7 @@
 
 import base64
 import contextlib
+import dataclasses
 import io
 import json
 import logging
@@ -46,6 +47,7 @@ from pipeline.flows.prefect_server import GPU_LIMIT, run_to_end
 from pipeline.generation.generate_options import GenerateOptions
 from pipeline.generation.generation_run import TaskResult, shard_ranges
 from pipeline.presets.settings import DatasetSettings
+from storage.dataset.progress import read_status
 from storage.errors import EnvironmentFailure, TrilightError
 from tests.for_each import for_each
 from tests.pipeline.generation.tiny_scenes_kit import Undocumented, tiny_order, without_rendering
@@ -410,6 +412,23 @@ def test_a_page_shows_the_progress_the_scenes_and_where_their_report_is(
         )  # fmt: skip
 
 
+def test_a_run_of_a_range_shows_its_own_shards_and_cost(
+    tables: Shown, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    without_rendering(monkeypatch)
+    order = tiny_order(out=str(tmp_path / "set"), scenes=16)
+    make_with_page(order, Undocumented())
+    for log in (tmp_path / "set/logs").rglob("*.jsonl"):  # the other shards cost many hours
+        rows = [json.loads(line) | {"seconds": 36000.0} for line in log.read_text().splitlines()]
+        log.write_text("".join(f"{json.dumps(row)}\n" for row in rows))
+    assert (read_status(order.place).core_hours or 0) > 10
+    make_with_page(dataclasses.replace(order, scenes=24, shards="4:6"), Undocumented())
+    (_, progress), (_, summary) = tables[-2:]
+    assert (progress["shards"], progress["scenes in shards"]) == ("1 of 2", "4 of 8")
+    assert summary["shards"] == "2 of 2"
+    assert float(summary["cost"].split()[0]) < 0.5
+
+
 def test_a_run_that_fails_says_so_in_its_summary(
     tables: Shown, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -423,6 +442,7 @@ def test_a_run_that_fails_says_so_in_its_summary(
     assert key == "summary"
     assert rows["failed"].startswith("TrilightError: the disk is full")
     assert "secret" not in rows["failed"]
+    assert rows["scenes of this run"] == "0" and "core-hours" in rows["cost of this run"]
 
 
 @for_each("text", ["cheap", "-1", "nan", "inf", ""])

@@ -2,6 +2,7 @@
 
 import contextlib
 import dataclasses
+import itertools
 import json
 import os
 import shutil
@@ -193,6 +194,24 @@ def test_a_shard_that_grows_is_missing_and_readable(tmp_path: Path, made: Counte
     shutil.rmtree(root / ".staging")
     assert make(root, 9, shards="0:1") == whole
     assert verify_dataset(root).problems == []
+
+
+def test_a_larger_set_that_was_made_while_a_worker_waited_stays_finished(
+    tmp_path: Path, made: Counter[int], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    root, mutex, waits = tmp_path / "set", DatasetFolder.mutex, itertools.count(1)
+    make(root, 3)
+
+    def late(folder: DatasetFolder, what: str) -> Any:
+        if what == "manifest" and next(waits) == 2:
+            monkeypatch.setattr(DatasetFolder, "mutex", mutex)
+            make(root, 6)
+        return mutex(folder, what)
+
+    monkeypatch.setattr(DatasetFolder, "mutex", late)
+    prepare_dataset(order(root, 6, shards="0:1"))
+    assert read_manifest(root / "manifest.json").growing == ()
+    assert verify_dataset(root).is_finished
 
 
 def test_who_packs_a_growing_shard_second_without_locks_has_the_first_ones_result(

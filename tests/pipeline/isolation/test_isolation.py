@@ -6,6 +6,7 @@ import os
 import signal
 import subprocess
 import sys
+import tempfile
 import threading
 import time
 from collections.abc import Iterator
@@ -13,6 +14,7 @@ from concurrent.futures import ThreadPoolExecutor
 from contextlib import closing
 from multiprocessing import popen_forkserver
 from pathlib import Path
+from types import ModuleType
 from typing import Any
 
 import pytest
@@ -40,6 +42,22 @@ def child(tmp_path: Path) -> Iterator[IsolatedChild]:
     child = IsolatedChild(limits=LIMITS, factory=called.prepare, args=(str(tmp_path),))
     yield child
     child.close()
+
+
+def test_a_child_that_cannot_start_leaves_the_program_as_it_was(
+    child: IsolatedChild, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def full() -> str:
+        raise FileNotFoundError("no usable temporary folder")
+
+    program = ModuleType("__main__")
+    monkeypatch.setitem(sys.modules, "__main__", program)
+    monkeypatch.delenv("PYTHONSAFEPATH", raising=False)
+    monkeypatch.setattr(tempfile, "gettempdir", full)
+    before = program, sys.path, os.environ.copy()
+    with pytest.raises(Exception, match="temporary folder"):
+        child.call(called.double, 21)
+    assert (sys.modules["__main__"], sys.path, os.environ.copy()) == before
 
 
 def test_results_and_rejections_come_back(child: IsolatedChild) -> None:
