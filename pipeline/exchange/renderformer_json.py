@@ -16,7 +16,7 @@ import re
 from collections import Counter
 from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import Any, Literal, TypeVar
+from typing import Any, Literal, TypeVar, cast
 
 import numpy as np
 from numpy.typing import NDArray
@@ -107,7 +107,7 @@ def _read(kind: type[Record], data: bytes, name: str, unknown: list[str]) -> Rec
     tree = _parse_json(data, name)
     if not isinstance(tree, dict):
         raise TrilightError(f"{name}: the file is {_to_text(tree)}; expected a JSON object.")
-    for field in describe_fields(kind):
+    for field in describe_fields(cast(Any, kind)):
         if field.name not in tree:
             raise TrilightError(f"{name}: {field.name} is missing; add it.")
     known = _take_known(kind, tree, "", unknown)
