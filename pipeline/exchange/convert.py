@@ -57,7 +57,8 @@ def convert_scene(
             outputs = [(target.with_suffix(f".{one.key}{target.suffix}"), [one]) for one in sources]
         results = []
         for out, group in outputs:
-            results.append(reader.call(convert_sources, group, out, budget, name=source.name))
+            arguments = (convert_sources, group, out, budget)
+            results.append(reader.call(*arguments, name=source.name, done="converted"))
             done(len(results), len(outputs))
     return ConvertResult(
         files=tuple(path for each in results for path in each.files),

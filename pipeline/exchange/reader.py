@@ -104,12 +104,14 @@ class SceneReader(contextlib.AbstractContextManager["SceneReader"]):
                 raise
             raise type(error)(f"{source.path}{str(error).removeprefix(name)}") from error
 
-    def call(self, function: Callable[..., Result], *args: Any, name: str) -> Result:
-        """Call a function in the child; `name` begins the message if the child fails."""
+    def call(
+        self, function: Callable[..., Result], *args: Any, name: str, done: str = "read"
+    ) -> Result:
+        """Call a function in the child; `name` could not be `done` if the child fails."""
         try:
             return call_with_retries(self._child, function, *args)
         except ChildFailed as failure:
-            raise TrilightError(f"{name}: could not be read ({failure}).") from failure
+            raise TrilightError(f"{name}: could not be {done} ({failure}).") from failure
 
 
 _LIMITS = ChildLimits(memory_bytes=16 << 30, wall_s=1800, calls_per_child=1000)

@@ -16,7 +16,7 @@ import re
 from collections import Counter
 from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import Any, Literal, TypeVar
+from typing import Any, Literal, TypeVar, cast
 
 import numpy as np
 from numpy.typing import NDArray
@@ -104,11 +104,23 @@ def _read(kind: type[Record], data: bytes, name: str, unknown: list[str]) -> Rec
 
     So a misspelt option is reported instead of ignored.
     """
-    known = _take_known(kind, _parse_json(data, name), "", unknown)
+    tree = _parse_json(data, name)
+    if not isinstance(tree, dict):
+        raise TrilightError(f"{name}: the file is {_to_text(tree)}; expected a JSON object.")
+    for field in describe_fields(cast(Any, kind)):
+        if field.name not in tree:
+            raise TrilightError(f"{name}: {field.name} is missing; add it.")
+    known = _take_known(kind, tree, "", unknown)
     for what, most in (("objects", MAX_OBJECTS), ("cameras", MAX_CAMERAS)):
-        entries = known.get(what) if isinstance(known, dict) else None
+        entries = known.get(what)
         if isinstance(entries, list | dict) and not 1 <= len(entries) <= most:
             raise TrilightError(f"{name}: {len(entries)} {what}; expected 1 to {most}.")
+        for key in entries if isinstance(entries, dict) else ():
+            if not (1 <= len(key) <= 200 and key.isprintable()):
+                raise TrilightError(
+                    f"{name}: {_to_text(f'{what}.{key}')} is {_to_text(key)}; expected a printable "
+                    "name of 1 to 200 letters."
+                )
     try:
         return read_json(json.dumps(known), kind, name)
     except RecursionError as error:
@@ -125,9 +137,8 @@ def _take_known(kind: Any, value: Any, where: str, unknown: list[str]) -> Any:
     if isinstance(value, dict) and kind == Mapping[str, DescribedObject]:
         entries = {}
         for key, entry in value.items():
-            label = key if key.isprintable() and len(key) <= 200 else _to_text(key)
-            known = _take_known(DescribedObject, entry, f"{where}.{label}", unknown)
-            entries[label] = {**known, "name": key} if isinstance(known, dict) else known
+            known = _take_known(DescribedObject, entry, f"{where}.{key}", unknown)
+            entries[key] = {**known, "name": key} if isinstance(known, dict) else known
         return entries
     if not group_of(kind) or not isinstance(value, dict):
         return value
@@ -149,7 +160,7 @@ def _to_text(value: Any) -> str:
 
 def _parse_json(data: bytes, name: str) -> Any:
     if len(data) > MAX_BYTES:
-        raise TrilightError(f"{name}: too large; expected at most {MAX_BYTES} bytes.")
+        raise TrilightError(f"{name}: {len(data)} bytes; expected at most {MAX_BYTES}.")
     try:
         return json.loads(
             data.decode("utf-8-sig"),

@@ -119,7 +119,7 @@ class SourceFolder:
         is_outside = False
         extra_spellings = (f"{folder}/{plain}" for folder in extra_folders)
         for spelling in (*stated, *extra_spellings, *_list_spellings(plain)):
-            with contextlib.suppress(OSError):  # such as a name that is too long
+            with contextlib.suppress(OSError, ValueError):  # too long, or no name of a file
                 target = find_in_any_case(self.folder, spelling, self._root)
                 is_inside = target.is_relative_to(self._root)
                 if is_inside and target.is_file():

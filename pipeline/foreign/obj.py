@@ -96,7 +96,7 @@ class _Statements:
 
     def __init__(self, text: bytes) -> None:
         self._rows: dict[str, list[bytes]] = {kind: [] for kind in ("v", "vt", "vn", "f")}
-        self._before: list[tuple[int, int, int]] = []  # of each face
+        self._before: list[int] = []  # three numbers of each face, flat since tuples cost a third
         self._materials: list[int] = []  # of each face, or -1
         self._names: dict[str, int] = {}
         self.unread = Counter[str]()
@@ -115,7 +115,7 @@ class _Statements:
             rest = words[1] if len(words) > 1 else b""
             self._rows[kind].append(_COMMENT.sub(b"", b" " + rest) if b"#" in rest else rest)
             if kind == "f":
-                self._before.append((len(vertices), len(coordinates), len(normals)))
+                self._before += len(vertices), len(coordinates), len(normals)
                 self._materials.append(material)
         if kind is not None and not text.endswith(b"\n"):
             self._open = kind
@@ -174,7 +174,7 @@ class _Statements:
             raise Rejected("load_error", "a corner of a face has more than three indices")
         flat = parse_numbers(text.replace(b"/", b" "), int(num_indices.sum()), np.int64)
         start = np.cumsum(num_indices) - num_indices
-        before = np.repeat(np.array(self._before), counts, axis=0)
+        before = np.repeat(np.reshape(self._before, (-1, 3)), counts, axis=0)
         corners = np.full((len(num_indices), 3), -1)
         for column in range(3):
             has = num_indices > column

@@ -20,7 +20,7 @@ MAGIC = b"#?"
 """First bytes of a Radiance file."""
 
 _MOST_HEADER = 1 << 16
-_HEADER = re.compile(rb"#\?[^\n]*\n(?:(.*?)\n)??\r*\n([^\n]*?)\r*\n", re.DOTALL)
+_HEADER = re.compile(rb"#\?[^\n]*\n(?:(.*?)\n)??\r*\n([^\n]*)\n", re.DOTALL)
 """The lines up to an empty one, and the line of the size."""
 _SIZE = re.compile(rb"([-+])([XY])\s+(\d{1,6})\s+([-+])([XY])\s+(\d{1,6})\s*")
 _VARIABLE = re.compile(rb"\s*([A-Z]+)\s*=\s*(.*?)\s*")
@@ -83,10 +83,10 @@ def _read_header(data: bytes) -> _Header:
     header = _HEADER.match(data[:_MOST_HEADER])
     if header is None:
         raise Rejected("not_hdr", "it is cut off within its header")
-    size = _SIZE.fullmatch(header[2])
+    line = header[2].rstrip(b"\r")
+    size = _SIZE.fullmatch(line)
     if size is None or size[2] == size[5]:
-        stated = f"{header[2][:40]!r}"
-        raise Rejected("not_hdr", f"its size is {stated}; expected one such as -Y 512 +X 1024")
+        raise Rejected("not_hdr", f"its size is {line[:40]!r}; expected one such as -Y 512 +X 1024")
     factors = np.ones(3)
     primaries = _RADIANCE
     unread: dict[str, None] = {}

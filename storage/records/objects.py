@@ -168,19 +168,14 @@ def _lines(rows: Iterable[LockedObject | Failure]) -> bytes:
 
 
 def _record(row: LockedObject | Failure) -> dict[str, Any]:
-    """Return a row as JSON values; locks of objects alone know no kinds, as before."""
-    record = text_record(row)
-    return {name: value for name, value in record.items() if (name, value) != ("kind", OBJECT)}
-
-
-def text_record(row: Any) -> dict[str, Any]:
-    """Return a row of texts and numbers as JSON values.
+    """Return a row as JSON values; locks of objects alone know no kinds, as before.
 
     Lone surrogates, which texts from outside may hold and UTF-8 does not, become `?`.
     """
     return {
         name: value.encode(errors="replace").decode() if isinstance(value, str) else value
         for name, value in dataclasses.asdict(row).items()
+        if (name, value) != ("kind", OBJECT)
     }
 
 

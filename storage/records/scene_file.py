@@ -10,11 +10,13 @@ which none takes more than its part of the file; names must be exactly those of 
 laws of `Scene.check`, types and shapes among them, hold for every scene that is returned.
 """
 
+import dataclasses
+import json
 import os
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Annotated, Any, TypeVar
+from typing import Annotated, Any, TypeVar, cast
 
 import numpy as np
 from numpy.typing import NDArray
@@ -28,7 +30,6 @@ from storage.conventions import (
 from storage.digests import canonical_json, sha256_hex
 from storage.errors import TrilightError, prefix_errors
 from storage.records.material import chosen_columns, completed_rows, stored_columns, stored_names
-from storage.records.objects import text_record
 from storage.records.packed_maps import (
     MapEntry,
     Maps,
@@ -230,7 +231,7 @@ def scene_record(scene: Scene) -> dict[str, Any]:
     maps = maps_of(scene)
     return {
         "schema_version": SCHEMA_VERSION if maps is None else MAPS_VERSION,
-        "objects": [text_record(entry) for entry in scene.objects],
+        "objects": [dataclasses.asdict(entry) for entry in scene.objects],
         "provenance": dict(scene.provenance),
         **({} if maps is None else {"maps": maps.json}),
     }
@@ -241,18 +242,40 @@ def read_scene_record(
 ) -> Record:
     """Return the record of a scene from its JSON text, called `what` in messages.
 
+    Fields that are unknown here are ignored. Texts may hold lone surrogates, as names of files that
+    are no UTF-8 do; the reader of types takes none, so it sees `?` in their place.
+
     Raises:
         TrilightError: no record of this kind, another schema version, or none of MAPS_VERSION
             exactly where the record names maps.
     """
-    record = read_versioned(text, kind, what, versions)
+    try:
+        raw = json.loads(text)
+        if isinstance(raw, dict):
+            known = {field.name for field in dataclasses.fields(kind)}
+            raw = {name: value for name, value in raw.items() if name in known}
+        readable = json.dumps(raw, ensure_ascii=False).encode(errors="replace")
+    except (ValueError, RecursionError) as error:
+        raise TrilightError(f"{what} is not JSON ({error}).") from error
+    record = read_versioned(readable, kind, what, versions)
     if (record.schema_version == MAPS_VERSION) != (record.maps is not None):
         has = "does not name" if record.maps is None else "names"
         raise TrilightError(
             f"{what} {has} maps and has schema version {record.schema_version}; expected "
             f"{MAPS_VERSION} exactly where there are any."
         )
-    return record
+    with_texts = {name: raw[name] for name in ("objects", "provenance", "maps") if name in raw}
+    return cast(Record, _as_stored(record, with_texts))
+
+
+def _as_stored(checked: Any, raw: Any) -> Any:
+    """Return a checked value with what the JSON value `raw` holds in its place."""
+    if isinstance(checked, tuple):
+        return tuple(map(_as_stored, checked, raw))
+    if dataclasses.is_dataclass(checked) and not isinstance(checked, type):
+        fields = {name: _as_stored(getattr(checked, name), raw[name]) for name in raw}
+        return dataclasses.replace(checked, **fields)
+    return raw
 
 
 def scene_provenance(value: Any) -> Mapping[str, Any]:

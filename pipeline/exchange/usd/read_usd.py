@@ -408,20 +408,22 @@ def _list_specs(root: Any) -> dict[str, Any]:
     A connection or a target has a path of its own, and stands in its property.
     """
     specs = dict[str, Any]()
+    layer = root.layer
 
     def add_spec(path: Any) -> None:
         if path.IsTargetPath():
             return
-        spec = root.layer.GetObjectAtPath(path)
-        keys = set(spec.ListInfoKeys())
-        _require(path.IsPropertyPath() or keys <= _PLAIN_INFO)
+        spec = layer.GetObjectAtPath(path)
+        keys = spec.ListInfoKeys()
+        _require(path.IsPropertyPath() or _PLAIN_INFO.issuperset(keys))
         _require("timeSamples" not in keys)
-        look = {key: spec.GetInfo(key) for key in keys & _LOOKS}
-        if spec.name == "xformOpOrder":
-            look["default"] = [name.replace(_OLD_CENTER, CENTER) for name in spec.default]
-        specs[str(path).replace(_OLD_CENTER, CENTER)] = look
+        look = {key: spec.GetInfo(key) for key in keys if key in _LOOKS}
+        name = str(path).replace(_OLD_CENTER, CENTER)
+        if name.endswith(".xformOpOrder"):
+            look["default"] = [each.replace(_OLD_CENTER, CENTER) for each in spec.default]
+        specs[name] = look
 
-    root.layer.Traverse(root.path, add_spec)
+    layer.Traverse(root.path, add_spec)
     return specs
 
 

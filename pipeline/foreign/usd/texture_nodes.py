@@ -1,5 +1,6 @@
 """`TextureNode`: the file, color space and texture coordinates of a UsdUVTexture."""
 
+import zipfile
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, cast, get_args
@@ -9,7 +10,7 @@ from numpy.typing import NDArray
 
 from pipeline.foreign.numbers import Malformed, read_number, read_numbers
 from pipeline.foreign.picture import Wrap
-from pipeline.foreign.usd.stage import OpenedStage
+from pipeline.foreign.usd.stage import OpenedStage, file_and_member
 from storage.errors import TrilightError
 
 _MOST_NODES = 8
@@ -143,18 +144,23 @@ def asset_bytes(resolved: str, max_bytes: int) -> bytes | None:
     Raises:
         TrilightError: there are more than `max_bytes`.
     """
-    from pxr import Ar, Tf
-
+    name = Path(resolved).name
+    outer, member = file_and_member(resolved)
     try:
-        asset = Ar.GetResolver().OpenAsset(Ar.ResolvedPath(resolved))
-    except Tf.ErrorException:  # a compressed member
-        asset = None
-    if asset is None:
+        if member:  # packed ones too, which USD's own resolver refuses
+            with zipfile.ZipFile(outer) as archive:
+                info = archive.getinfo(member)
+                _require_size(info.file_size, max_bytes, name)
+                return archive.read(info)
+        _require_size(outer.stat().st_size, max_bytes, name)
+        return outer.read_bytes()
+    except (OSError, KeyError, zipfile.BadZipFile):
         return None
-    if asset.GetSize() > max_bytes:
-        name = Path(resolved).name
-        raise TrilightError(f"{name}: {asset.GetSize()} bytes; expected at most {max_bytes}.")
-    return bytes(asset.GetBuffer() or b"")
+
+
+def _require_size(size: int, max_bytes: int, name: str) -> None:
+    if size > max_bytes:
+        raise TrilightError(f"{name}: {size} bytes; expected at most {max_bytes}.")
 
 
 def find_sources(shader: Any, name: str) -> Any:

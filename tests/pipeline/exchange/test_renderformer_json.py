@@ -85,9 +85,10 @@ REFUSED = [
     (changed(objects={str(i): 1 for i in range(8193)}), "8193 objects; expected 1 to 8192"),
     (changed(objects=[]), "0 objects; expected 1 to 8192"),
     (changed(objects={"a": 1}), "objects.a is 1; expected names with values"),
-    (changed(objects={"a\nb": OBJECT}), "expected a printable name"),
+    # the second name is what a message calls the first
+    (changed(objects={"a\n": OBJECT, repr("a\n"): OBJECT}), "is 'a\\n'; expected a printable name"),
     (changed(cameras=[]), "0 cameras; expected 1 to 1000"),
-    (changed(scene_name=...), "scene_name is missing"),
+    (changed(scene_name=...), "scene_name is missing; add it"),
     (changed(*BOX, mesh_path="a\0b"), "objects.box.mesh_path is 'a\\x00b'; expected printable"),
     (changed(*BOX, mesh_path="\ud800"), "all of it is not JSON (unexpected end"),
     (
@@ -126,11 +127,11 @@ REFUSED = [
     ('{"a": 1}'.encode("utf-16"), "not readable as JSON in UTF-8"),
     (b'{"a":' * 100_000, "a.json: "),
     (b"[" * 100_000, "a.json: "),
-    (b"[]", "all of it is []; expected names with values"),
+    (b"[]", "the file is []; expected a JSON object"),
     (b'{"a": NaN}', "NaN is no JSON number"),
     (b'{"a": 1' + b"0" * 5000 + b"}", "not readable as JSON"),
     (b'{"a": 1, "a": 2}', "the name 'a' stands twice"),
-    (b" " * (MAX_BYTES + 1), "expected at most 4194304"),
+    (b" " * (MAX_BYTES + 1), "4194305 bytes; expected at most 4194304"),
 ]
 
 

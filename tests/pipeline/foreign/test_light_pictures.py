@@ -336,6 +336,7 @@ def test_damaged_and_foreign_radiance_files_are_refused_with_a_reason() -> None:
     cases = {
         "not_hdr": [
             b"#?RADIANCE",
+            b"#?RADIANCE\n\n" + b"\r" * 65_000,  # a search took 6 s
             radiance_hdr(_texels(2, 16), header="EXPOSURE=0\n"),
             radiance_hdr(_texels(2, 16), header="COLORCORR=1 1\n"),
             whole.replace(b"32-bit_rle_rgbe", b"32-bit_rle_xyze"),

@@ -37,7 +37,7 @@ from storage.records.scene_file import (
     read_scene_file,
     scene_digest,
 )
-from storage.records.texture import MAX_MAPS_BYTES, Texture
+from storage.records.texture import MAX_MAPS_BYTES, MapSource, Texture
 from tests.for_each import case, for_each
 from tests.pipeline.scenes.small_pool import QUALITY, SOURCE
 from tests.scenes_by_hand import FLOOR, LIGHT, tiny_sample, tiny_scene
@@ -340,6 +340,22 @@ def test_round_trip_is_exact() -> None:
     assert back.objects == scene.objects
     assert back.provenance == scene.provenance
     assert encode_scene(back) == encode_scene(scene)
+
+
+def test_names_that_are_no_utf8_and_fields_that_are_not_known_change_nothing() -> None:
+    """Names of files may hold lone surrogates: they neither meet in one name nor stop a reader."""
+    objects = (
+        SceneObject(name="x\udcfe", kind="shell"),
+        SceneObject(name="x\udcff", kind="emitter", uid="\udcff"),
+    )
+    dusk = dataclasses.replace(sky(), source=MapSource(name="dusk\udcff"))
+    scene = tiny_scene(objects=objects, provenance={"file\udcff": ["\udcff"]}, environment=dusk)
+    data = encode_scene(scene)
+    found = decode_scene_file(data, "a")
+    assert encode_scene(found) == data
+    assert (found.objects, found.provenance) == (objects, scene.provenance)
+    assert found.environment is not None and found.environment.source == dusk.source
+    assert decode_scene_file(_stating(caption="x"), "a").objects == tiny_scene().objects
 
 
 def test_the_digest_is_that_of_the_member_in_a_shard() -> None:

@@ -86,6 +86,16 @@ def test_brackets_in_the_name_of_a_folder_are_no_archive(tmp_path: Path, packed:
     assert opened.files == [opened.path, *([] if packed else [folder / "lib.usda"])]
 
 
+def test_a_compressed_picture_of_another_archive_is_read(tmp_path: Path) -> None:
+    """Archives whose layers are opened may hold none; one that only has pictures may."""
+    with zipfile.ZipFile(tmp_path / "pictures.usdz", "w", zipfile.ZIP_DEFLATED) as archive:
+        archive.writestr("a.png", b"packed")
+    name = f"{tmp_path}/pictures.usdz[a.png]"
+    assert asset_bytes(name, 6) == b"packed"
+    with pytest.raises(TrilightError, match="6 bytes; expected at most 5"):
+        asset_bytes(name, 5)
+
+
 def test_the_user_may_name_the_folder_and_the_stage_is_compared_with_it_at_last(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
