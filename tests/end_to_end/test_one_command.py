@@ -175,7 +175,7 @@ def test_a_bad_file_and_a_dark_scene_cost_themselves(
     assert json.loads(again.stdout)["dataset_digest"] == outcome["dataset_digest"]
     # it would be another set
     strict = refused("generate", "smoke", *arguments, *EXACT, "--albedo-over-one", "refuse")
-    assert "scene file crystals.json: is missing" in strict
+    assert "'crystals.json' is missing" in strict
 
 
 ONE_VIEW = ("--set", "scenes.num_views=1")
