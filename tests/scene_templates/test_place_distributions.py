@@ -18,7 +18,6 @@ from scene_templates.sample_lights import LightSettings, sample_lights
 from scene_templates.templates import TEMPLATES
 from tests.for_each import for_each
 from tests.scene_templates.balls import Drawn, drawn, template_settings
-from tests.scene_templates.published import side_row
 from tests.scene_templates.statistics import (
     Table,
     alike,
@@ -90,12 +89,13 @@ def _sides_table(stage: int, policy: Policy) -> Table:
             for part, at in zip(parts, patches, strict=True):
                 assert at.reach == 1
                 axis = SIDES[part].axis
-                spin, tilt, scale, *moves = side_row(family.name, part, policy, stage)
-                rows = [("spin", at.rotation_deg[axis], (-spin, spin))]
+                side = getattr(family.shell, part)
+                tilt, moves = side.tilt_deg, (side.shift_x, side.shift_y, side.shift_z)
+                rows = [("spin", at.rotation_deg[axis], (-side.spin_deg, side.spin_deg))]
                 others = sorted({0, 1, 2} - {axis})
                 rows += [(f"tilt {k}", at.rotation_deg[k], (-tilt, tilt)) for k in others]
                 for k in range(3):
-                    rows.append((f"scale {k}", at.scale[k], scale))
+                    rows.append((f"scale {k}", at.scale[k], side.scale))
                     rows.append((f"move {k}", at.translation[k], moves[k]))
                 for quantity, value, bounds in rows:
                     key = (family.template, part, quantity, str(bounds))

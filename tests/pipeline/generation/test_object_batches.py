@@ -195,12 +195,10 @@ def lock_of_one(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> bytes:
 
 
 def test_rejected_objects_are_not_tried_again_from_another_folder(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    mesher: Mesher, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """What is frozen is found in the batches of all objects, also without the index of the lock."""
     without_probe(monkeypatch)
-    monkeypatch.setenv("TRILIGHT_CACHE", str(tmp_path / "cache"))
-    mesher = use_mesher(monkeypatch, batch=BATCH)
     rejected = {"object 00003", "object 00017"}
     mesher.reasons = dict.fromkeys(rejected, "no_faces")
     object_records(tmp_path / "objects")
@@ -298,15 +296,13 @@ def test_a_claim_keeps_other_machines_off_until_it_ends(
         assert theirs
 
 
-OPTIONS = KubernetesOptions(image="not pulled", cores=2)
-
-
 @pytest.mark.slow("kills")
 def test_arrays_that_are_killed_end_in_the_digest_of_one_that_was_not(
     bucket: Any, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """Each array goes on where the one before was killed: four of Kubernetes, then one of Slurm."""
     order, rng, killed = tiny_order(out=OUT, scenes=12), np.random.default_rng(0), 0
+    options = KubernetesOptions(image="not pulled", cores=2)
     without_rendering(monkeypatch)
     monkeypatch.setattr("pipeline.executors.threads.ThreadRunner", Undocumented)
     alone = dataclasses.replace(order, out=str(tmp_path / "whole"))
@@ -317,7 +313,7 @@ def test_arrays_that_are_killed_end_in_the_digest_of_one_that_was_not(
         assert set(job.tasks) <= set(missing)  # only what is missing
         missing = list(job.tasks)
         for place, task in enumerate(job.tasks):
-            pod = job_manifest(job, OPTIONS)["spec"]["template"]["spec"]["containers"][0]
+            pod = job_manifest(job, options)["spec"]["template"]["spec"]["containers"][0]
             variables = {row["name"]: row["value"] for row in pod["env"]}
             if on == "slurm":
                 variables["SLURM_ARRAY_TASK_ID"] = str(task)
