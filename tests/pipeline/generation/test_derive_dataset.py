@@ -167,9 +167,11 @@ def given(shards: dict[str, list[Sample]], offset: int = 0) -> dict[str, tuple[s
     }
 
 
-def test_a_merge_holds_every_scene_under_its_raised_key(tmp_path: Path) -> None:
+def test_a_merge_holds_every_scene_under_its_raised_key_and_says_where_it_is_from(
+    tmp_path: Path,
+) -> None:
     a, b = finished(tmp_path / "a", scenes(0)), finished(tmp_path / "b", scenes(1), seed=1)
-    merged = shards_made(tmp_path / "c", MERGE, a, b)
+    merged = made(tmp_path / "c", MERGE, a, b)
     assert samples_of(merged) == given(scenes(0)) | given(scenes(1), 6)
     assert [shard.name for shard in merged.manifest.shards] == [
         "train-000000.tar", "train-000001.tar", "test-000002.tar",
@@ -177,11 +179,7 @@ def test_a_merge_holds_every_scene_under_its_raised_key(tmp_path: Path) -> None:
     ]  # fmt: skip
     for shard in open_dataset(str(a)).manifest.shards:  # the first source's shards stay as they are
         assert merged.folder.shard(shard.name).read_bytes() == (a / shard.name).read_bytes()
-
-
-def test_the_manifest_says_where_scenes_are_from(tmp_path: Path) -> None:
-    a, b = finished(tmp_path / "a", scenes(0)), finished(tmp_path / "b", scenes(1), seed=1)
-    manifest = made(tmp_path / "c", MERGE, a, b).manifest
+    manifest = merged.manifest
     derivation = derivation_of(manifest.settings)
     assert derivation is not None and derivation.operation == "merge"
     for source, root, offset in zip(derivation.sources, (a, b), (0, 6), strict=True):

@@ -50,7 +50,7 @@ from storage.records.texture import MapSource
 from storage.seeds import SceneKey, rng_for
 from tests.infra.child_here import ChildHere
 from tests.pipeline.documents.dataset_by_hand import locked
-from tests.pipeline.generation.frozen_kit import SOURCE, asked, begun, build, frozen, prepared
+from tests.pipeline.generation.frozen_kit import BUILD, SOURCE, asked, begun, frozen, prepared
 from tests.pipeline.objects.maps.test_maps import exr, noise, png, sun_map
 from tests.pipeline.scenes.small_pool import first_scene, small_pool
 from tests.scenes_by_hand import tiny_sample
@@ -101,7 +101,7 @@ def test_scenes_of_opened_objects_are_those_of_objects_in_memory(
         assert draws[0] == draws[1]
     for index in range(2):
         one, other = (
-            first_scene(build().scenes, pool, seed=1, scene_index=index) for pool in (opened, whole)
+            first_scene(BUILD.scenes, pool, seed=1, scene_index=index) for pool in (opened, whole)
         )
         assert one.objects == other.objects
         assert np.array_equal(one.vertex_positions, other.vertex_positions)

@@ -171,10 +171,13 @@ def test_inspecting(source: SceneSource, tmp_path: Path, monkeypatch: pytest.Mon
         return choose_variant(device=device)
 
     monkeypatch.setattr(inspecting, "choose_variant", kill_and_choose)
-    grey = np.full((2, 4, 3), 128, np.uint8)
-    monkeypatch.setattr(inspecting, "_turntable", lambda source, variant: grey)
+    monkeypatch.setattr(inspecting, "_turntable", _grey)
     assert inspect_scene(source, tmp_path / "sheet.png").facts["views"] > 0
     assert (tmp_path / "sheet.png").exists()
+
+
+def _grey(source: SceneSource, variant: Variant) -> NDArray[np.uint8]:
+    return np.full((2, 4, 3), 128, np.uint8)
 
 
 def test_rendering() -> None:
@@ -325,17 +328,16 @@ def _told(folder: DatasetFolder) -> list[str]:
     return [path.read_text() for path in at_work.iterdir()] if at_work.is_dir() else []
 
 
-def test_a_view_counts_in_part(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_view_counts_in_part_and_quick_passes_are_told_once_and_to_nobody(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     """Of 128 samples that are expected, and no more than the whole where there are more."""
     folder, told = DatasetFolder(tmp_path), list[float]()
-    monkeypatch.setattr(rendering, "_EVERY_S", 0.0)
-    monkeypatch.setattr(rendering, "tell_views", lambda *words: told.append(words[2]))
-    assert ViewProgress(folder, 5).render_view(2, _steps()) is DONE
+    with monkeypatch.context() as patch:
+        patch.setattr(rendering, "_EVERY_S", 0.0)
+        patch.setattr(rendering, "tell_views", lambda *words: told.append(words[2]))
+        assert ViewProgress(folder, 5).render_view(2, _steps()) is DONE
     assert told == [2.25, 2.5, 2.75, 3.0]
-
-
-def test_quick_passes_are_told_once_and_to_nobody(tmp_path: Path) -> None:
-    folder = DatasetFolder(tmp_path)
     progress = ViewProgress(folder, 5)
     assert progress.render_view(0, _steps()) is DONE
     assert progress.render_view(1, _steps()) is DONE

@@ -182,13 +182,6 @@ def test_a_folder_of_somebody_else_is_left_alone(source: Path, tmp_path: Path) -
         run(source, tmp_path / "thesis.tex")
 
 
-def test_only_bad_objects_make_a_folder_too(source: Path, tmp_path: Path) -> None:
-    report = run(source / "bad", tmp_path / "out")
-    assert not report.rows
-    assert len(report.failures) == len(BAD)
-    assert (tmp_path / "out" / "quality.html").read_text().count("<img") == 0
-
-
 @pytest.fixture(scope="module")
 def few(source: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
     """One good object and the bad ones."""
@@ -211,11 +204,17 @@ def test_the_command_prints_json_and_nothing_else(few: Path, tmp_path: Path) -> 
     assert (out / "quality.html").exists()
 
 
-def test_where_nothing_can_be_used_the_command_says_so(few: Path, tmp_path: Path) -> None:
-    result = trilight(["assets", str(few / "bad"), "--out", str(tmp_path / "out")])
+def test_where_nothing_can_be_used_the_command_says_so_and_makes_a_folder_too(
+    few: Path, tmp_path: Path
+) -> None:
+    out = tmp_path / "out"
+    result = trilight(["assets", str(few / "bad"), "--out", str(out)])
     assert result.exit_code == 1 and "No object can be used" in result.stdout
     assert "object outcome triangles p99 method or reason" in " ".join(result.stdout.split())
     assert "Next:" not in result.stdout
+    assert (out / "objects.jsonl").read_bytes() == b""
+    assert len(read_failures(out / "failures.jsonl")) == len(BAD)
+    assert (out / "quality.html").read_text().count("<img") == 0
 
 
 @pytest.mark.slow("kills")

@@ -145,7 +145,10 @@ def test_a_file_that_has_changed_is_looked_at(mesher: Mesher, tmp_path: Path) ->
         assert (max(mesher.made.values()) == 2) == is_made_again, (suffix, changed)
 
 
-def test_a_damaged_result_is_made_again(mesher: Mesher, tmp_path: Path) -> None:
+def test_a_damaged_result_or_one_of_another_user_is_made_again(
+    mesher: Mesher, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """In a cache it counts as missing; beside the dataset the error names the next step."""
     records = object_records(tmp_path / "objects", 3)
     expected = _prepare(records, tmp_path / "one")
     for number, damage in enumerate((b"", b"{}\n", b'{"uid": "x"}\n', b"\xff", b'"uid"\n')):
@@ -153,14 +156,6 @@ def test_a_damaged_result_is_made_again(mesher: Mesher, tmp_path: Path) -> None:
             path.write_bytes(damage)
         assert _prepare(records, tmp_path / f"again{number}") == expected
         assert max(mesher.made.values()) == 2 + number
-
-
-def test_a_file_of_another_user(
-    mesher: Mesher, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    """In a cache it counts as missing; beside the dataset the error names the next step."""
-    records = object_records(tmp_path / "objects", 3)
-    expected = _prepare(records, tmp_path / "one")
     read = Path.read_bytes
     unreadable = tmp_path / "cache"
 
@@ -170,7 +165,9 @@ def test_a_file_of_another_user(
         return read(path)
 
     monkeypatch.setattr(Path, "read_bytes", refused)
+    made = max(mesher.made.values())
     assert _prepare(records, tmp_path / "two") == expected
+    assert max(mesher.made.values()) == made + 1
     unreadable = tmp_path / "two"
     with pytest.raises(TrilightError, match="Permission denied; expected a file that every worker"):
         _prepare(records, tmp_path / "two")

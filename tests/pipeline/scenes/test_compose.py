@@ -25,9 +25,7 @@ from pipeline.scenes.triangle_budget import (
     levels_within,
 )
 from pipeline.scenes.views import require_valid
-from scene_templates.families import DEFAULT_FAMILIES
 from scene_templates.sample_layout import scene_plan
-from scene_templates.settings import SceneSettings
 from scene_templates.templates import TEMPLATES
 from storage.errors import Rejected, TrilightError
 from storage.licences import share_alike_camp
@@ -50,9 +48,8 @@ from tests.pipeline.scenes.small_pool import (
     small_pool,
     with_error,
 )
+from tests.scene_templates.balls import DEFAULTS as SETTINGS
 from tests.scene_templates.balls import template_settings
-
-SETTINGS = SceneSettings(families=DEFAULT_FAMILIES)
 
 TOUCH = 1e-6
 """Coordinates below 2 in float32: 1.2e-7 of rounding each, three to a height."""
@@ -205,16 +202,14 @@ def test_each_reason_is_given_where_it_holds(
     pool: list[PooledAsset], reason: str, template: str, changes: Mapping[str, Any], message: str
 ) -> None:
     settings = template_settings(template, changes)
-    found = [_rejection(settings, pool, index=0) for _ in range(2)]
+    found = []
+    for _ in range(2):
+        with pytest.raises(Rejected) as caught:
+            compose_scene(settings, pool, SceneKey(0, 0))
+        found.append(caught.value)
     assert found[0].reason == reason
     assert message in found[0].message
     assert (found[0].reason, found[0].message) == (found[1].reason, found[1].message)
-
-
-def _rejection(settings: SceneSettings, pool: Sequence[PooledAsset], index: int) -> Rejected:
-    with pytest.raises(Rejected) as caught:
-        compose_scene(settings, pool, SceneKey(0, index))
-    return caught.value
 
 
 DAMAGES: dict[str, tuple[Any, float]] = {
@@ -461,15 +456,11 @@ def test_too_little_room_is_rejected_with_the_numbers() -> None:
 LICENCES = ("CC-BY-SA-4.0", "CC-BY-SA-3.0", "CC0-1.0", "cc-by-sa-4.0", "GPL-3.0-only")
 
 
-def _under(licences: Sequence[str]) -> list[PooledAsset]:
-    return [
+def _scenes(licences: Sequence[str], count: int) -> list[Scene]:
+    pool = [
         dataclasses.replace(entry, locked=dataclasses.replace(entry.locked, licence=licence))
         for entry, licence in zip(small_pool(), licences, strict=True)
     ]
-
-
-def _scenes(licences: Sequence[str], count: int) -> list[Scene]:
-    pool = _under(licences)
     return [first_scene(SETTINGS, pool, seed=5, scene_index=index) for index in range(count)]
 
 

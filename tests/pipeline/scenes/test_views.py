@@ -31,11 +31,10 @@ from pipeline.scenes.views import (
     visibility_problem,
     with_cameras,
 )
-from scene_templates.families import DEFAULT_FAMILIES
 from scene_templates.layout import Pose
 from scene_templates.rotations import rotation_xyz, uniform_rotation
 from scene_templates.sample_layout import scene_plan
-from scene_templates.settings import SceneSettings, ViewLaws
+from scene_templates.settings import ViewLaws
 from storage.conventions import camera_rays, look_at_c2w
 from storage.errors import Rejected
 from storage.records.material import DIFFUSE, EMISSION, SPECULAR
@@ -52,12 +51,11 @@ from tests.pipeline.scenes.small_pool import (
     small_pool,
     triangles_of,
 )
+from tests.scene_templates.balls import DEFAULTS as SETTINGS
 from tests.scene_templates.balls import ROOMS
 from tests.scenes_by_hand import tiny_scene
 from tests.sky_maps import constant, one_sun
 from tests.textured_by_hand import sky, textured_scene
-
-SETTINGS = SceneSettings(families=DEFAULT_FAMILIES)
 
 
 def _slow_view(scene: Scene, view: int, grid: int) -> tuple[float, float, float]:
@@ -551,9 +549,7 @@ def test_posing_is_a_similarity_that_fills_its_sphere() -> None:
 
 
 def test_slivers_go_and_all_else_stays() -> None:
-    mesh = trimesh.creation.icosphere(1)
-    positions = mesh.vertices.astype(np.float32)
-    faces = mesh.faces.astype(np.uint32)
+    positions, faces = _arrays(trimesh.creation.icosphere(1))
     middle = (positions[0] + positions[1]) / 2
     padded = np.concatenate([positions, [middle.astype(np.float32)]])
     sliver = np.array([[0, 1, 1], [0, 0, 0]], np.uint32)
