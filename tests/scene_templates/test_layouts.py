@@ -120,9 +120,8 @@ def test_objects_that_cannot_fit_are_rejected_with_a_reason() -> None:
     changes = {"families.object_scale": [2.0, 2.0], "families.num_objects": [3, 3]}
     settings = template_settings("open_box", {**changes, "placement.overlap_share": 0.0})
     plan = scene_plan(settings, seed=0, scene_index=0)
-    with pytest.raises(Rejected) as caught:
+    with pytest.raises(Rejected, match="^no_room: "):
         sample_layout(rng_for(0, "scene", 0, 0), settings, plan, [BALL] * 3)
-    assert caught.value.reason == "no_room"
     overlapping = template_settings("open_box", {**changes, "placement.overlap_share": 1.0})
     assert len(one_drawn(overlapping, 0).layout.objects) == 3
 

@@ -248,7 +248,7 @@ def test_methods_come_nearer_with_samples_and_with_what_is_traced(
 RATE = {"learning_rate": 1e-3}
 
 
-def test_the_sides_differ_in_what_is_asked_for_alone() -> None:
+def test_sides_differ_in_what_is_asked_for_alone_and_a_scene_is_one_cluster_of_seeds() -> None:
     options = BenchOptions(changes={"scenes_per_step": 2}, set_b=RATE)
     a, b = (settings_of(side, 3, TINY, options) for side in (SIDE_A, SIDE_B))
     assert a != b and dataclasses.replace(a, learning_rate=1e-3) == b
@@ -257,9 +257,6 @@ def test_the_sides_differ_in_what_is_asked_for_alone() -> None:
     assert settings_of(SIDE_A, 0, TINY, longer).num_steps == 7
     with pytest.raises(TrilightError, match="--run names 2 presets; expected one"):
         settings_of(SIDE_A, 0, TINY, BenchOptions(run=("smoke", "pretrain")))
-
-
-def test_a_scene_is_one_cluster_with_all_seeds() -> None:
     assert scene_of("seed 0, scene 4") == scene_of("seed 1, scene 4") != scene_of("seed 1, scene 5")
 
 

@@ -172,33 +172,30 @@ def test_a_place_that_cannot_be_written_is_refused_by_name() -> None:
             options_of_form(_parameters(out=out), GenerateOptions)
 
 
-def test_only_what_can_pass_is_tried_again() -> None:
+def test_only_what_can_pass_is_tried_again_documents_too() -> None:
     errors = (EnvironmentFailure("disk"), OSError("gone"), TrilightError("wrong"), KeyError())
     for error, again in zip(errors, (True, True, False, False), strict=True):
         ended: Any = Future()
         ended.set_exception(error)
         assert is_retryable(cast(Any, None), cast(Any, None), ended) == again
+    task = cast(Any, prefect_runner.write_documents_task)
+    assert task.retries == cast(Any, prefect_runner.make_scenes).retries > 0
+    assert task.retry_condition_fn is prefect_runner.is_retryable
 
 
-@pytest.fixture
-def made(monkeypatch: pytest.MonkeyPatch) -> list[str | None]:
-    """Which ranges are made, those of other runs first; nothing is."""
-    ranges: list[str | None] = []
+def test_so_many_flow_runs_are_so_many_in_all(monkeypatch: pytest.MonkeyPatch) -> None:
+    made: list[str | None] = []
 
     def started(deployment: str, *, parameters: dict[str, Any], **options: Any) -> None:
-        ranges.append(f"{deployment} {parameters['shards']}")
+        made.append(f"{deployment} {parameters['shards']}")
 
     status = SimpleNamespace(shards_planned=10)
     monkeypatch.setattr(prefect_flows, "prepare_assets", lambda **given: None)
     monkeypatch.setattr(prefect_flows, "read_status", lambda out: status)
     monkeypatch.setattr(prefect_flows, "run_deployment", started)
     monkeypatch.setattr(
-        prefect_flows, "generate_scenes", lambda **given: ranges.append(given["shards"])
+        prefect_flows, "generate_scenes", lambda **given: made.append(given["shards"])
     )
-    return ranges
-
-
-def test_so_many_flow_runs_are_so_many_in_all(made: list[str | None]) -> None:
     flow: Any = prefect_flows.build_dataset
     flow.fn(**_parameters(DatasetInRuns, flow_runs=3, deployment="d/x"))
     assert made == ["d/x 3:6", "d/x 6:10", "0:3", None]
@@ -241,12 +238,6 @@ def test_rendering_on_a_gpu_takes_its_limit(
     job, pieces = SimpleNamespace(device=device), (SimpleNamespace(shard_index=0, first=0),)
     submit = cast(Any, prefect_runner.PrefectRunner().submit)
     assert submit(pieces, job) == (job, pieces, held)
-
-
-def test_documents_are_tried_again_where_that_can_help() -> None:
-    task = cast(Any, prefect_runner.write_documents_task)
-    assert task.retries == cast(Any, prefect_runner.make_scenes).retries > 0
-    assert task.retry_condition_fn is prefect_runner.is_retryable
 
 
 def test_a_dask_worker_that_sees_another_folder_is_named_before_any_work(tmp_path: Path) -> None:

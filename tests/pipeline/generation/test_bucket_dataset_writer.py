@@ -320,9 +320,12 @@ def test_of_those_who_end_together_one_reads_the_notes(
     """The others wait for its list; one that died over its list is waited for in vain."""
     read: list[str] = []
     fetched = pack.fetch_notes
-    monkeypatch.setattr(
-        pack, "fetch_notes", lambda how, names, at: fetched(how, _told(names, read), at)
-    )
+
+    def told(how: Any, names: Any, at: Any) -> Any:
+        read.extend(found := list(names))
+        return fetched(how, found, at)
+
+    monkeypatch.setattr(pack, "fetch_notes", told)
     monkeypatch.setattr(dataset_writer, "_PATIENCE_S", 10.0)
     with _ending_together(machines, monkeypatch) as (first, second):
         waits: list[float] = []
@@ -376,11 +379,6 @@ def test_who_waited_and_then_lists_more_writes_the_documents(
         assert not second.left_to_others
     assert len(open_dataset(OUT).manifest.shards) == 4
     assert verify_dataset(OUT).problems == []
-
-
-def _told(names: Any, read: list[str]) -> list[str]:
-    read += (found := list(names))
-    return found
 
 
 def test_what_a_killed_machine_has_prepared_is_not_prepared_again(

@@ -57,7 +57,7 @@ from tests.textured_by_hand import (
     textured_scene,
 )
 
-SETTINGS = {
+SETTINGS: dict[str, Any] = {
     "build": "smoke",
     "renders": {"noise_floor_db": 40.0, "max_spp": 256, "resolution": 16},
     "scenes": {"max_triangles": 9},
@@ -384,13 +384,6 @@ def refused(out: Path, derive: DeriveOptions, *places: Path | str) -> str:
     return message
 
 
-def changed_settings(root: Path, group: str, **values: Any) -> Path:
-    manifest = open_dataset(str(root)).manifest
-    settings = {**manifest.settings, group: {**manifest.settings.get(group, {}), **values}}
-    write_manifest(root / "manifest.json", dataclasses.replace(manifest, settings=settings))
-    return root
-
-
 @for_each("uid, sha256", [("c", "1" * 64), ("x", TEST_OBJECT.asset_sha256)])
 def test_a_leak_between_splits_is_named(tmp_path: Path, uid: str, sha256: str) -> None:
     """Of the same name with another budget; of the same file, which catalogues call otherwise."""
@@ -427,8 +420,10 @@ def test_the_same_scene_twice_is_refused(tmp_path: Path) -> None:
 def test_what_does_not_fit_together_is_named(
     tmp_path: Path, group: str, values: dict[str, Any], name: str
 ) -> None:
-    a, b = finished(tmp_path / "a", scenes(0)), finished(tmp_path / "b", scenes(1))
-    assert name in refused(tmp_path / "c", MERGE, a, changed_settings(b, group, **values))
+    settings = {**SETTINGS, group: {**SETTINGS.get(group, {}), **values}}
+    a = finished(tmp_path / "a", scenes(0))
+    b = finished(tmp_path / "b", scenes(1), settings=settings)
+    assert name in refused(tmp_path / "c", MERGE, a, b)
     other = finished(tmp_path / "other", scenes(1), num_views=3)
     assert "number of views is 3; expected 2" in refused(tmp_path / "c", MERGE, a, other)
 

@@ -60,10 +60,6 @@ def source(shared: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
     return folder
 
 
-def _nothing_to_fetch(done: int, total: int) -> None:
-    raise AssertionError("these sources lie on this machine")
-
-
 def run(
     source: Path | str, out: Path, settings: AssetSettings | None = None, workers: int = 1
 ) -> AssetReport:
@@ -75,7 +71,7 @@ def run(
         allowed_licences=DEFAULT_ALLOWED,
         licence=None,
         workers=workers,
-        on_download=_nothing_to_fetch,
+        on_download=lambda done, total: pytest.fail("these sources lie on this machine"),
         on_plan=counts.append,
         on_object=lambda: counts.append(-1),
     )

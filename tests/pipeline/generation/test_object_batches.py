@@ -174,8 +174,6 @@ def test_a_damaged_result_or_one_of_another_user_is_made_again(
 
 
 NUM_OBJECTS = 120
-WORKERS = 3
-KILL_AFTER = BATCH // 2
 
 
 @pytest.fixture
@@ -226,8 +224,8 @@ def test_workers_share_the_objects(
         request.getfixturevalue("bucket")
     out, notes = OUT if is_bucket else str(tmp_path / "set"), tmp_path / "notes"
     notes.mkdir()
-    words = [out, str(tmp_path / "objects"), str(notes), str(WORKERS)]
-    killed = _start([*words, str(KILL_AFTER)], TRILIGHT_CACHE=str(tmp_path / "killed"))
+    words = [out, str(tmp_path / "objects"), str(notes), "3"]
+    killed = _start([*words, str(BATCH // 2)], TRILIGHT_CACHE=str(tmp_path / "killed"))
     others = [_start(words, TRILIGHT_CACHE=str(tmp_path / name)) for name in "12"]
     for process in (killed, *others):
         said, _ = process.communicate(timeout=300)

@@ -43,6 +43,7 @@ from storage.records.scene_facts import lights, surfaces
 from storage.seeds import SceneKey
 from storage.settings.overrides import apply_overrides
 from tests.pipeline.scenes.small_pool import (
+    TOUCH,
     first_scene,
     level,
     points_of,
@@ -356,7 +357,7 @@ def test_a_cube_keeps_its_edges_and_a_sphere_becomes_round() -> None:
     assert np.sum(ball.normals * ball.positions, axis=1).min() > np.cos(np.radians(1))
 
 
-def test_groups_agree_with_those_of_trimesh() -> None:
+def test_groups_agree_with_those_of_trimesh_and_an_edge_of_three_faces_is_sharp() -> None:
     for positions, faces in _shapes():
         normals = face_normals(positions, faces)
         beside = trimesh.graph.face_adjacency(faces)
@@ -367,9 +368,7 @@ def test_groups_agree_with_those_of_trimesh() -> None:
             twin = trimesh.graph.connected_component_labels(joined, len(faces)).tolist()
             pairs = set(zip(groups, twin, strict=True))
             assert len(pairs) == len(set(twin)) == len(set(groups))
-
-
-def test_an_edge_of_three_faces_is_sharp() -> None:
+    # An edge of three faces is sharp.
     faces = np.array([[0, 1, 2], [1, 0, 3], [0, 1, 4]], np.uint32)
     normals = np.tile([0.0, 0.0, 1.0], (3, 1))
     assert len(set(shading_groups(faces, normals, 30.0).tolist())) == 3
@@ -500,10 +499,6 @@ def test_meshes_inside_and_beside_each_other_and_of_any_size() -> None:
     for radius in (0.5, 0.1, 0.5, 0.3, 0.5):
         assert not ball.overlaps(_at(0, radius=radius), ball, _at(radius + 0.21, radius=0.2))
         assert ball.overlaps(_at(0, radius=radius), ball, _at(radius + 0.17, radius=0.2))
-
-
-TOUCH = 1e-6
-"""Coordinates below 2 in float32: 1.2e-7 of rounding each, three to a height."""
 
 
 def _off_centre() -> NDArray[np.float32]:
