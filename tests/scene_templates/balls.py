@@ -1,6 +1,5 @@
 """Layouts without meshes: balls stand for objects, so that thousands are drawn in seconds."""
 
-import functools
 import math
 from collections.abc import Mapping
 from dataclasses import dataclass
@@ -104,9 +103,3 @@ def drawn(settings: SceneSettings, count: int, seed: int = 0, shape: Ball = BALL
 
 MANY = 2000
 """Scenes for the statistics of one setting."""
-
-
-@functools.lru_cache(maxsize=4)
-def drawn_once(settings: SceneSettings, count: int) -> list[Drawn]:
-    """Draw layouts as `drawn` does, and keep them for other tests."""
-    return drawn(settings, count)

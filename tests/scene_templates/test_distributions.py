@@ -17,7 +17,6 @@ from scipy import stats
 
 from pipeline.presets.registry import preset_settings
 from scene_templates.layout import Emitter, SurfaceLook
-from scene_templates.settings import SceneSettings
 from tests.scene_templates.balls import MANY, Drawn, drawn
 from tests.scene_templates.published import DEFAULT, STAGE_1, STAGE_2, Row
 from tests.scene_templates.statistics import (
@@ -91,11 +90,7 @@ def rotation_table(rotations: Iterable[NDArray[np.float64]], *, euler: bool) -> 
 
 
 def surface_table(
-    surfaces: Sequence[SurfaceLook],
-    *,
-    kind: str,
-    smooth_share: float,
-    triangle_colours_share: float,
+    surfaces: Sequence[SurfaceLook], *, smooth_share: float, by_triangle: float
 ) -> Table:
     """Everything that a material is drawn from."""
     sums = np.array([one.diffuse_scale + one.specular_rgb[0] for one in surfaces])
@@ -119,7 +114,6 @@ def surface_table(
     for channel, name in enumerate(("red", "green", "blue")):
         table[name] = uniform(diffuse[:, channel] / scale, 0, 1)
     many = [one.colours == "triangles" for one in smooth if one.colours != "one"]
-    by_triangle = 1.0 if kind == "shell" else triangle_colours_share
     table["by triangle"] = share(many, by_triangle)
     return table
 
@@ -178,10 +172,6 @@ STATED = {
 }
 
 
-def _settings(build: str) -> SceneSettings:
-    return preset_settings(build).scenes
-
-
 def _table(scenes: list[Drawn], stated: Stated) -> Table:
     poses = [placement.pose for one in scenes for placement in one.layout.objects]
     table = {
@@ -219,12 +209,8 @@ def _surface_tables(scenes: list[Drawn], stated: Stated) -> Table:
                 for layout in chosen
                 for part in (layout.shell if kind == "shell" else layout.objects)
             ]
-            rows = surface_table(
-                surfaces,
-                kind=kind,
-                smooth_share=smooth_share,
-                triangle_colours_share=0.0 if stated.published else 0.5,
-            )
+            share_ = 1.0 if kind == "shell" else 0.5 * (not stated.published)
+            rows = surface_table(surfaces, smooth_share=smooth_share, by_triangle=share_)
             special = " special" if smooth_share == 0.25 else ""
             table |= {f"{kind} {name}{special}": p for name, p in rows.items()}
     return table
@@ -239,12 +225,12 @@ def _surface_tables(scenes: list[Drawn], stated: Stated) -> Table:
     ],
 )
 def test_everything_is_distributed_as_stated(build: str) -> None:
-    require_plausible(_table(drawn(_settings(build), MANY), STATED[build]))
+    require_plausible(_table(drawn(preset_settings(build).scenes, MANY), STATED[build]))
 
 
 def test_the_second_training_stage_draws_the_same() -> None:
     """Its budget, and how finely it is spent, are all that differs: one table stands for both."""
-    pretrain, finetune = _settings("pretrain-256"), _settings("finetune-512")
+    pretrain, finetune = (preset_settings(name).scenes for name in ("pretrain-256", "finetune-512"))
     same = dataclasses.replace(
         finetune, max_triangles=pretrain.max_triangles, enough_error=pretrain.enough_error
     )

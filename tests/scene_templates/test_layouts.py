@@ -4,6 +4,7 @@ Shells are flat, closed at their seams, and in the published families as publish
 """
 
 import dataclasses
+import functools
 import itertools
 import math
 
@@ -35,7 +36,6 @@ from tests.scene_templates.balls import (
     Ball,
     Drawn,
     drawn,
-    drawn_once,
     one_drawn,
     template_settings,
 )
@@ -54,8 +54,9 @@ def _gaps(one: Drawn) -> list[float]:
     ]
 
 
+@functools.cache
 def _sixty(name: str) -> list[Drawn]:
-    return drawn_once(template_settings(name), 60)
+    return drawn(template_settings(name), 60)
 
 
 @for_each("name", ROOMS)
@@ -119,9 +120,8 @@ def test_objects_that_cannot_fit_are_rejected_with_a_reason() -> None:
     changes = {"families.object_scale": [2.0, 2.0], "families.num_objects": [3, 3]}
     settings = template_settings("open_box", {**changes, "placement.overlap_share": 0.0})
     plan = scene_plan(settings, seed=0, scene_index=0)
-    with pytest.raises(Rejected) as caught:
+    with pytest.raises(Rejected, match="^no_room: "):
         sample_layout(rng_for(0, "scene", 0, 0), settings, plan, [BALL] * 3)
-    assert caught.value.reason == "no_room"
     overlapping = template_settings("open_box", {**changes, "placement.overlap_share": 1.0})
     assert len(one_drawn(overlapping, 0).layout.objects) == 3
 
@@ -288,10 +288,7 @@ def _meets(
     return inside.all(axis=1) & (solved[:, 2] > 0)
 
 
-POLICIES: tuple[Policy, ...] = ("original", "de-biased")
-
-
-@pytest.mark.parametrize("policy", POLICIES)
+@pytest.mark.parametrize("policy", ["original", "de-biased"])
 def test_boxes_turn_one_wall_away_as_published_and_patches_are_exact(policy: Policy) -> None:
     """The normal of each face, against the direction to the middle of the nominal room."""
     seen = set()

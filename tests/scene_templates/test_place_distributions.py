@@ -17,8 +17,7 @@ from scene_templates.sample_camera import CameraSettings, Sector, sample_camera
 from scene_templates.sample_lights import LightSettings, sample_lights
 from scene_templates.templates import TEMPLATES
 from tests.for_each import for_each
-from tests.scene_templates.balls import Drawn, drawn, template_settings
-from tests.scene_templates.published import side_row
+from tests.scene_templates.balls import drawn, template_settings
 from tests.scene_templates.statistics import (
     Table,
     alike,
@@ -90,12 +89,13 @@ def _sides_table(stage: int, policy: Policy) -> Table:
             for part, at in zip(parts, patches, strict=True):
                 assert at.reach == 1
                 axis = SIDES[part].axis
-                spin, tilt, scale, *moves = side_row(family.name, part, policy, stage)
-                rows = [("spin", at.rotation_deg[axis], (-spin, spin))]
+                side = getattr(family.shell, part)
+                tilt, moves = side.tilt_deg, (side.shift_x, side.shift_y, side.shift_z)
+                rows = [("spin", at.rotation_deg[axis], (-side.spin_deg, side.spin_deg))]
                 others = sorted({0, 1, 2} - {axis})
                 rows += [(f"tilt {k}", at.rotation_deg[k], (-tilt, tilt)) for k in others]
                 for k in range(3):
-                    rows.append((f"scale {k}", at.scale[k], scale))
+                    rows.append((f"scale {k}", at.scale[k], side.scale))
                     rows.append((f"move {k}", at.translation[k], moves[k]))
                 for quantity, value, bounds in rows:
                     key = (family.template, part, quantity, str(bounds))
@@ -119,23 +119,20 @@ ROOM = {
 """One object over a floor of side 0.6 about the origin, which is at z = -0.6."""
 
 
-def _rests(one: Drawn, row: int) -> bool:
-    """Whether an object touches the floor; a floating one comes so near once in 1e8 times."""
-    height = plane_of(one.layout.shell[0].positions).height(one.points(row))
-    return bool(height.min() < 1e-9)
-
-
-def _place_table(scenes: list[Drawn]) -> Table:
+def test_a_single_object_is_placed_evenly_and_rests_half_the_time() -> None:
     """Within what an object's own points leave it, its place is even: nothing else decides."""
+    scenes = drawn(template_settings("plane", ROOM), COUNT)
     radius = np.array([one.layout.objects[0].pose.radius for one in scenes])
     centre = np.stack([one.layout.objects[0].pose.centre for one in scenes])
     lowest = np.array([one.points(0)[:, 2].min() for one in scenes])
-    rests = np.array([_rests(one, 0) for one in scenes])
+    floors = [plane_of(one.layout.shell[0].positions) for one in scenes]
+    above = [floor.height(one.points(0)).min() for floor, one in zip(floors, scenes, strict=True)]
+    rests = np.array(above) < 1e-9  # a floating one comes so near once in 1e8 times
     reach = 0.5 - radius / 2  # beside the open sides by half its radius at most
     least = -0.6 + (centre[:, 2] - lowest)
     height = ((centre[:, 2] - least) / (reach - least))[~rests]
     scale = template_settings("plane").families[0].object_scale
-    return {
+    table = {
         "rests": share(rests, 0.5),
         "x": uniform(centre[:, 0] / reach, -1, 1),
         "y": uniform(centre[:, 1] / reach, -1, 1),
@@ -143,10 +140,7 @@ def _place_table(scenes: list[Drawn]) -> Table:
         "size": uniform(4 * radius, *scale),
         "size of resting": uniform(4 * radius[rests], *scale),
     }
-
-
-def test_a_single_object_is_placed_evenly_and_rests_half_the_time() -> None:
-    require_plausible(_place_table(drawn(template_settings("plane", ROOM), COUNT)))
+    require_plausible(table)
 
 
 def _off_deg(directions: NDArray[np.float64], sector: Sector) -> NDArray[np.float64]:

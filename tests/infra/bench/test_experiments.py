@@ -6,6 +6,7 @@ import subprocess
 import sys
 import time
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any, cast
 
 import numpy as np
@@ -176,9 +177,7 @@ def test_memory_is_that_of_a_session() -> None:
 
 
 @pytest.mark.slow("benchmarks")
-def test_every_kind_of_work_is_done_at_its_smallest_size(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_every_kind_of_work_is_done_at_its_smallest_size(tmp_path: Path) -> None:
     sample = tmp_path / "sample"
     sample.mkdir()
     for name, data in encode_sample(toy_sample(0, resolution=32), "compact").items():
@@ -249,7 +248,7 @@ def test_methods_come_nearer_with_samples_and_with_what_is_traced(
 RATE = {"learning_rate": 1e-3}
 
 
-def test_the_sides_differ_in_what_is_asked_for_alone() -> None:
+def test_sides_differ_in_what_is_asked_for_alone_and_a_scene_is_one_cluster_of_seeds() -> None:
     options = BenchOptions(changes={"scenes_per_step": 2}, set_b=RATE)
     a, b = (settings_of(side, 3, TINY, options) for side in (SIDE_A, SIDE_B))
     assert a != b and dataclasses.replace(a, learning_rate=1e-3) == b
@@ -258,9 +257,6 @@ def test_the_sides_differ_in_what_is_asked_for_alone() -> None:
     assert settings_of(SIDE_A, 0, TINY, longer).num_steps == 7
     with pytest.raises(TrilightError, match="--run names 2 presets; expected one"):
         settings_of(SIDE_A, 0, TINY, BenchOptions(run=("smoke", "pretrain")))
-
-
-def test_a_scene_is_one_cluster_with_all_seeds() -> None:
     assert scene_of("seed 0, scene 4") == scene_of("seed 1, scene 4") != scene_of("seed 1, scene 5")
 
 
@@ -316,25 +312,19 @@ def test_a_python_that_is_missing_and_a_failing_step_are_named(
         environment._run("load it", ["sh", "-c", "echo first; echo no such wheel >&2; exit 3"])
 
 
-class Counting:
-    """A child that makes up its answers."""
-
-    def __init__(self) -> None:
-        self.calls = 0
-
-    def call(self, *_: Any) -> RawReference:
-        self.calls += 1
-        rng = np.random.default_rng(self.calls)
-        return RawReference(a_rgb=rng.random((8, 8, 3)), b_rgb=rng.random((8, 8, 3)))
-
-
 def test_a_view_is_rendered_once(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv("TRILIGHT_CACHE", str(tmp_path))
-    counting = Counting()
-    child, scene = cast(IsolatedChild, counting), toy_scene(0)
+    calls: list[Any] = []
+
+    def make_up(*asked: Any) -> RawReference:
+        calls.append(asked)
+        a, b = np.random.default_rng(len(calls)).random((2, 8, 8, 3))
+        return RawReference(a_rgb=a, b_rgb=b)
+
+    child, scene = cast(IsolatedChild, SimpleNamespace(call=make_up)), toy_scene(0)
     first = load_or_render_reference(child, scene, first_camera(scene, 8), 128)
     again = load_or_render_reference(child, scene, first_camera(scene, 8), 128)
-    assert counting.calls == 1
+    assert len(calls) == 1
     np.testing.assert_array_equal(first.a_rgb, again.a_rgb)
     np.testing.assert_array_equal(first.b_rgb, again.b_rgb)
     assert first.a_rgb.dtype == np.float64 and not np.array_equal(first.a_rgb, first.b_rgb)
@@ -344,4 +334,4 @@ def test_a_view_is_rendered_once(tmp_path: Path, monkeypatch: pytest.MonkeyPatch
         (toy_scene(1), first_camera(scene, 8), 128),
     ):
         load_or_render_reference(child, *other)
-    assert counting.calls == 4, "other samples, width or scene is another reference"
+    assert len(calls) == 4, "other samples, width or scene is another reference"

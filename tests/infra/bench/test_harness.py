@@ -456,7 +456,7 @@ def _written(path: Path, looks: list[Look], versions: dict[str, str]) -> None:
             store.add(run, trial, point, look.figures if look else {})
 
 
-def test_rows_come_to_a_file_that_pictures_are_stated_by(
+def test_rows_come_to_a_file_that_pictures_are_stated_by_but_those_of_other_versions_do_not(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     rows, file = tmp_path / "rows.jsonl", tmp_path / "stated_errors.json"
@@ -468,10 +468,7 @@ def test_rows_come_to_a_file_that_pictures_are_stated_by(
     statement = load_statement(file)
     assert statement is not None and statement.spp == (32, 288) and statement.widths == (64, 256)
     assert capsys.readouterr().out.count("| log | ") == 3, "one a width"
-
-
-def test_rows_of_other_versions_do_not_count(tmp_path: Path) -> None:
-    rows = tmp_path / "rows.jsonl"
+    rows = tmp_path / "others.jsonl"
     _written(rows, made_up_looks(20), {**versions_of_pictures(), "denoiser": "0"})
     with pytest.raises(TrilightError, match="it has 0 layouts .* expected 8"):
         read_looks(rows)

@@ -233,7 +233,7 @@ def asked(monkeypatch: pytest.MonkeyPatch) -> list[Any]:
     return found
 
 
-def test_a_run_is_watched_to_its_end(
+def test_a_run_is_watched_to_its_end_and_one_that_crashed_is_a_mistake_with_its_reason(
     asked: list[Any], monkeypatch: pytest.MonkeyPatch, tmp_path: Path
 ) -> None:
     looks = [seen("Pending"), seen("Running"), seen("Running")]
@@ -247,14 +247,9 @@ def test_a_run_is_watched_to_its_end(
         assert told.count(line) == 1, told
     assert f"Next: trilight verify {tmp_path}" in told
     assert json.loads(trilight([*words, "--json"]).stdout)["summary"] == {"scenes": "2"}
-
-
-def test_a_run_that_crashed_is_a_mistake_with_its_reason(
-    asked: list[Any], monkeypatch: pytest.MonkeyPatch
-) -> None:
     ended = seen("Crashed", message="it was killed.")
     monkeypatch.setattr(submission, "poll_run", lambda client, run: iter([ended]))
-    failed = trilight(["submit", "generate-scenes", "smoke"])
+    failed = trilight(words)
     assert "ended as Crashed: it was killed. Its log is at http://page" in failed.stderr
 
 

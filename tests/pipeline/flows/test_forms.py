@@ -10,6 +10,7 @@ import signal
 import sys
 import threading
 from collections.abc import Iterator
+from concurrent.futures import Future
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any, cast
@@ -173,45 +174,30 @@ def test_a_place_that_cannot_be_written_is_refused_by_name() -> None:
             options_of_form(_parameters(out=out), GenerateOptions)
 
 
-def test_only_what_can_pass_is_tried_again() -> None:
-    class Failed:
-        def __init__(self, error: Exception) -> None:
-            self._error = error
-
-        def result(self) -> None:
-            raise self._error
-
-    outcomes = {
-        error: is_retryable(None, None, Failed(error))  # type: ignore[arg-type]
-        for error in (
-            EnvironmentFailure("disk"),
-            OSError("gone"),
-            TrilightError("wrong"),
-            KeyError(),
-        )
-    }
-    assert list(outcomes.values()) == [True, True, False, False]
+def test_only_what_can_pass_is_tried_again_documents_too() -> None:
+    errors = (EnvironmentFailure("disk"), OSError("gone"), TrilightError("wrong"), KeyError())
+    for error, again in zip(errors, (True, True, False, False), strict=True):
+        ended: Any = Future()
+        ended.set_exception(error)
+        assert is_retryable(cast(Any, None), cast(Any, None), ended) == again
+    task = cast(Any, prefect_runner.write_documents_task)
+    assert task.retries == cast(Any, prefect_runner.make_scenes).retries > 0
+    assert task.retry_condition_fn is prefect_runner.is_retryable
 
 
-@pytest.fixture
-def made(monkeypatch: pytest.MonkeyPatch) -> list[str | None]:
-    """Which ranges are made, those of other runs first; nothing is."""
-    ranges: list[str | None] = []
+def test_so_many_flow_runs_are_so_many_in_all(monkeypatch: pytest.MonkeyPatch) -> None:
+    made: list[str | None] = []
 
     def started(deployment: str, *, parameters: dict[str, Any], **options: Any) -> None:
-        ranges.append(f"{deployment} {parameters['shards']}")
+        made.append(f"{deployment} {parameters['shards']}")
 
     status = SimpleNamespace(shards_planned=10)
     monkeypatch.setattr(prefect_flows, "prepare_assets", lambda **given: None)
     monkeypatch.setattr(prefect_flows, "read_status", lambda out: status)
     monkeypatch.setattr(prefect_flows, "run_deployment", started)
     monkeypatch.setattr(
-        prefect_flows, "generate_scenes", lambda **given: ranges.append(given["shards"])
+        prefect_flows, "generate_scenes", lambda **given: made.append(given["shards"])
     )
-    return ranges
-
-
-def test_so_many_flow_runs_are_so_many_in_all(made: list[str | None]) -> None:
     flow: Any = prefect_flows.build_dataset
     flow.fn(**_parameters(DatasetInRuns, flow_runs=3, deployment="d/x"))
     assert made == ["d/x 3:6", "d/x 6:10", "0:3", None]
@@ -254,12 +240,6 @@ def test_rendering_on_a_gpu_takes_its_limit(
     job, pieces = SimpleNamespace(device=device), (SimpleNamespace(shard_index=0, first=0),)
     submit = cast(Any, prefect_runner.PrefectRunner().submit)
     assert submit(pieces, job) == (job, pieces, held)
-
-
-def test_documents_are_tried_again_where_that_can_help() -> None:
-    task = cast(Any, prefect_runner.write_documents_task)
-    assert task.retries == cast(Any, prefect_runner.make_scenes).retries > 0
-    assert task.retry_condition_fn is prefect_runner.is_retryable
 
 
 def test_a_dask_worker_that_sees_another_folder_is_named_before_any_work(tmp_path: Path) -> None:
@@ -317,25 +297,19 @@ def test_what_is_cancelled_saves_and_status_and_lines_are_passed_on(tmp_path: Pa
     assert ended == (-signal.SIGKILL, "")
 
 
-@for_each(
-    ("base", "url"),
-    [
-        ("", None),  # a link that leads nowhere is none
-        ("https://data.example/sets/", "https://data.example/sets/mine/report.html"),
-    ],
-)
-def test_the_link_to_the_report(
-    monkeypatch: pytest.MonkeyPatch, base: str, url: str | None
-) -> None:
-    monkeypatch.setenv("TRILIGHT_PUBLIC_URL", base)
-    assert report_url("data/mine") == url
+def test_the_link_to_the_report(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("TRILIGHT_PUBLIC_URL", "")
+    assert report_url("data/mine") is None  # a link that leads nowhere is none
+    monkeypatch.setenv("TRILIGHT_PUBLIC_URL", "https://data.example/sets/")
+    assert report_url("data/mine") == "https://data.example/sets/mine/report.html"
 
 
 Shown = list[tuple[str, dict[str, str]]]
 
 
-def _shown(monkeypatch: pytest.MonkeyPatch) -> Shown:
-    """Key and rows of each table that is shown; there is no server."""
+@pytest.fixture
+def tables(monkeypatch: pytest.MonkeyPatch) -> Shown:
+    """Key and rows of each table; there is no server, and a dataset is looked at all the time."""
     shown: Shown = []
 
     def table(rows: list[dict[str, str]], key: str, description: str) -> None:
@@ -346,39 +320,10 @@ def _shown(monkeypatch: pytest.MonkeyPatch) -> Shown:
     monkeypatch.setattr(module, "create_progress_artifact", lambda *args, **named: "id")
     monkeypatch.setattr(module, "update_progress_artifact", lambda *args: None)
     monkeypatch.setattr(module, "create_image_artifact", lambda *args, **named: None)
+    monkeypatch.setattr(prefect_flows, "LOOK_S", 0.01)
     for each in (module, prefect_flows):
         monkeypatch.setattr(each, "get_run_logger", lambda: logging.getLogger("trilight.test"))
     return shown
-
-
-def _cannot_show(monkeypatch: pytest.MonkeyPatch) -> None:
-    def gone(*args: object, **named: object) -> None:
-        raise ConnectionError("gone")
-
-    monkeypatch.setattr(prefect_runner, "create_progress_artifact", gone)
-    monkeypatch.setattr(prefect_runner, "create_table_artifact", gone)
-
-
-@pytest.fixture
-def tables(monkeypatch: pytest.MonkeyPatch) -> Shown:
-    return _shown(monkeypatch)
-
-
-@pytest.fixture
-def shown(monkeypatch: pytest.MonkeyPatch) -> Shown:
-    """The dataset is looked at all the time."""
-    monkeypatch.setattr(prefect_flows, "LOOK_S", 0.01)
-    return _shown(monkeypatch)
-
-
-def test_a_page_that_cannot_be_shown_does_not_end_the_run(
-    tables: Any, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
-) -> None:
-    _cannot_show(monkeypatch)
-    page = RunPage(str(tmp_path))
-    page.record_task(cast(Any, None), TaskResult(shards=(), scenes=1, seconds=1.0, core_s=1.0))
-    page.show_failure(ValueError("x"))
-    assert [record.levelname for record in caplog.records] == ["WARNING"]
 
 
 def test_a_page_shows_the_progress_the_scenes_and_where_their_report_is(
@@ -485,18 +430,15 @@ def run(**given: Any) -> None:
     flow.fn(**flow.validate_parameters(_parameters(DatasetByArray, **tiny, **given)))
 
 
-_OWN = set(DatasetByArray.__dataclass_fields__) - set(GenerateOptions.__dataclass_fields__)
-
-
 def test_what_is_missing_is_asked_for_and_shown_to_the_end(
-    shown: Shown, cluster: list[list[int]], tmp_path: Path
+    tables: Shown, cluster: list[list[int]], tmp_path: Path
 ) -> None:
     out = str(tmp_path / "set")
     run(out=out, scenes=20, shards_per_task=2)
     assert cluster == [[0, 1, 2]]
-    key, summary = shown[-1]
+    key, summary = tables[-1]
     assert key == "summary" and summary["shards"] == "5 of 5" and len(summary["dataset digest"]) > 8
-    assert all(key == "progress" for key, _ in shown[:-1])
+    assert all(key == "progress" for key, _ in tables[:-1])
     run(out=out, scenes=20, shards_per_task=2)
     assert len(cluster) == 1, "nothing is missing"
     (tmp_path / "set" / "train-000003.tar").unlink()
@@ -506,28 +448,38 @@ def test_what_is_missing_is_asked_for_and_shown_to_the_end(
 
 
 def test_who_watches_alone_asks_for_nothing_and_waits_so_long(
-    shown: Shown, cluster: list[list[int]], tmp_path: Path
+    tables: Shown, cluster: list[list[int]], tmp_path: Path
 ) -> None:
     with pytest.raises(TrilightError, match=r"no new scene for 0\.0001 hours \(none made\)"):
         run(out=str(tmp_path / "set"), scheduler="none", quiet_hours=0.0001)
-    assert cluster == [] and shown == []
+    assert cluster == [] and tables == []
 
 
-def test_a_page_that_cannot_be_shown_does_not_end_an_array(
-    shown: Shown,
+def test_a_page_that_cannot_be_shown_ends_neither_a_run_nor_an_array(
+    tables: Shown,
     cluster: list[list[int]],
     tmp_path: Path,
     monkeypatch: pytest.MonkeyPatch,
     caplog: pytest.LogCaptureFixture,
 ) -> None:
-    _cannot_show(monkeypatch)
+    def gone(*args: object, **named: object) -> None:
+        raise ConnectionError("gone")
+
+    monkeypatch.setattr(prefect_runner, "create_progress_artifact", gone)
+    monkeypatch.setattr(prefect_runner, "create_table_artifact", gone)
+    page = RunPage(str(tmp_path))
+    page.record_task(cast(Any, None), TaskResult(shards=(), scenes=1, seconds=1.0, core_s=1.0))
+    page.show_failure(ValueError("x"))
+    assert [record.levelname for record in caplog.records] == ["WARNING"]
+    caplog.clear()
     run(out=str(tmp_path / "set"), scenes=4)
     assert [record.levelname for record in caplog.records].count("WARNING") == 1
 
 
 def test_machines_are_those_of_the_worker(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """Who may start a run chooses neither an image nor an account."""
-    assert not _OWN & set(KubernetesOptions.__dataclass_fields__)
+    own = set(DatasetByArray.__dataclass_fields__) - set(GenerateOptions.__dataclass_fields__)
+    assert not own & set(KubernetesOptions.__dataclass_fields__)
     assert options_from_environment() == KubernetesOptions()
     stated = tmp_path / "machines.json"
     monkeypatch.setenv("TRILIGHT_MACHINES", str(stated))

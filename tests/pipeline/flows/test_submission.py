@@ -212,8 +212,9 @@ def test_own_names_and_addresses_are_answered(host: str) -> None:
      "me@evil.example", "127.0.0.1@evil.example", "2130706433", "0x7f.1", "server.", "", "[",
      "a b"],
 )  # fmt: skip
-def test_other_names_are_refused(host: str) -> None:
+def test_other_names_and_none_are_refused(host: str) -> None:
     """A page may let its own name point to 127.0.0.1: its origin is then this very host."""
+    assert _answer()[0]["status"] == 403
     for origin in ({}, {"origin": f"http://{host}"}):
         start, body = _answer(host=host, **origin)
         assert start["status"] == 403 and b"no name of this server" in body["body"]
@@ -232,10 +233,6 @@ def test_pages_of_other_origins_are_refused(origin: str) -> None:
     assert start["status"] == 403 and b"other origins" in body["body"]
     (closed,) = _answer("websocket", host=f"127.0.0.1:{PORT}", origin=origin)
     assert closed["type"] == "websocket.close"
-
-
-def test_a_request_without_a_host_is_refused() -> None:
-    assert _answer()[0]["status"] == 403
 
 
 def test_half_requests_are_closed_and_slow_answers_are_not(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -18,7 +18,6 @@ from pipeline.generation.freeze_objects import ObjectLock
 from pipeline.generation.prepare_isolated import asset_store
 from pipeline.generation.scene_origins import AcceptedObjects
 from pipeline.presets.registry import preset_settings
-from pipeline.presets.settings import DatasetSettings
 from storage.dataset.layout import DatasetFolder
 from storage.digests import sha256_hex
 from storage.records.asset import encode_asset
@@ -28,11 +27,7 @@ from tests.pipeline.scenes.small_pool import small_pool
 
 LICENCES = ("CC0-1.0", "CC-BY-SA-4.0", "CC-BY-4.0", "CC-BY-SA-3.0")
 SOURCE = "objects-by-hand"
-
-
-def build() -> DatasetSettings:
-    """Return a small preset."""
-    return preset_settings("smoke", resolution=16)
+BUILD = preset_settings("smoke", resolution=16)
 
 
 _pool = functools.cache(small_pool)
@@ -64,12 +59,12 @@ def prepared(number: int) -> PreparedObject:
 
 def begun(root: Path) -> DatasetWriter:
     """Begin a dataset of four scenes."""
-    return begin_or_resume_dataset(DatasetFolder(root), build(), ENVIRONMENT, 4)
+    return begin_or_resume_dataset(DatasetFolder(root), BUILD, ENVIRONMENT, 4)
 
 
 def asked(writer: DatasetWriter, source: str = SOURCE, licence: str | None = None) -> ObjectLock:
     """Return what is asked for of objects."""
-    return ObjectLock(source=source, licence=licence, settings=build(), writer=writer, workers=1)
+    return ObjectLock(source=source, licence=licence, settings=BUILD, writer=writer, workers=1)
 
 
 def frozen(writer: DatasetWriter, objects: Sequence[PreparedObject]) -> AcceptedObjects:

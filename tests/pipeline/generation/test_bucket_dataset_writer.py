@@ -29,9 +29,9 @@ from storage.records.objects import Failure, decode_failures
 from tests.pipeline.generation.bucket_kit import OUT, Killed, Machines, other_shard
 from tests.pipeline.generation.frozen_kit import asked, frozen, object_records, prepared, use_mesher
 from tests.pipeline.generation.test_dataset_writer import (
+    LOCKED,
     _build,
     _dataset,
-    _locked,
     _sample,
     make_tiny_shard,
 )
@@ -45,7 +45,7 @@ FIRST, SECOND = "train-000000.tar", "train-000001.tar"
 def make(writer: DatasetWriter, *shards: int) -> None:
     """Freeze the objects where nobody has, make shards that are missing, and list all, if so."""
     if not writer.manifest.objects_lock_sha256:
-        writer.lock_objects([_locked()])
+        writer.lock_objects([LOCKED])
     for index in set(shards) & set(writer.unfinished_shards()):
         make_tiny_shard(writer, index)
     writer.finish()
@@ -88,7 +88,7 @@ def test_an_old_list_that_arrives_late_is_mended(
         assert open_dataset(OUT).manifest.num_scenes == 4
 
     with machines.maker("a", 4) as first:
-        first.lock_objects([_locked()])
+        first.lock_objects([LOCKED])
         make_tiny_shard(first, 0)
         monkeypatch.setattr(DatasetWriter, "publish_manifest", late)
         listed = first.finish()
@@ -100,11 +100,11 @@ def test_an_old_list_that_arrives_late_is_mended(
 def test_other_objects_and_other_settings_are_refused(bucket: Any, machines: Machines) -> None:
     with machines.maker("a") as first, machines.maker("b") as second:
         machines.use("a")
-        first.lock_objects([_locked()])
+        first.lock_objects([LOCKED])
         machines.use("b")
         with pytest.raises(TrilightError, match=rf"{OUT}: another worker has frozen other objects"):
-            second.lock_objects([dataclasses.replace(_locked(), uid="b")])
-        second.lock_objects([_locked()])
+            second.lock_objects([dataclasses.replace(LOCKED, uid="b")])
+        second.lock_objects([LOCKED])
     changed = {"renders.resolution": 32}
     with (
         pytest.raises(TrilightError, match=rf"{OUT}: this dataset was begun with another setting"),
@@ -224,13 +224,13 @@ def _failures(bucket: Any, name: str) -> list[Failure]:
 def test_who_freezes_late_takes_nothing_back(bucket: Any, machines: Machines) -> None:
     with machines.maker("b") as late, machines.maker("a") as first:
         first.add_failures([Failure(stage="assets", item="c", reason="no_faces", message="x")])
-        first.lock_objects([_locked()])
+        first.lock_objects([LOCKED])
         make_tiny_shard(first, 0)
         rejected = open_dataset(OUT).failures()
         assert len(rejected) == 5
         machines.use("b")
         late.add_failures([Failure(stage="assets", item="b", reason="no_faces", message="x")])
-        late.lock_objects([_locked()])
+        late.lock_objects([LOCKED])
         assert [entry.name for entry in open_dataset(OUT).manifest.shards] == [FIRST]
         assert set(rejected) < set(open_dataset(OUT).failures())
 
@@ -241,9 +241,9 @@ def test_the_first_writer_of_a_shard_wins_with_its_rejections(
     """Also where the second has made other bytes, as another processor may."""
     with machines.maker("a") as first, machines.maker("b") as second:
         machines.use("a")
-        first.lock_objects([_locked()])
+        first.lock_objects([LOCKED])
         machines.use("b")
-        second.lock_objects([_locked()])
+        second.lock_objects([LOCKED])
         other = other_shard(second)
         machines.use("a")
         make_tiny_shard(first, 0)
@@ -263,7 +263,7 @@ def test_a_shard_whose_maker_died_at_once_gets_the_rejections_of_the_next(
     bucket: Any, machines: Machines
 ) -> None:
     with machines.maker("a") as writer:
-        writer.lock_objects([_locked()])
+        writer.lock_objects([LOCKED])
         other = other_shard(writer)
         bucket.pipe_file(f"shards/set/{FIRST}", writer.folder.shard(FIRST).read_bytes())
         writer.add_shard(other)
@@ -277,7 +277,7 @@ def test_a_worker_with_another_cache_is_named(
     monkeypatch.setattr(dataset_writer.time, "sleep", lambda seconds: None)
     elsewhere = _dataset(tmp_path / "elsewhere").manifest.shards[1]
     with machines.maker("a") as writer:
-        writer.lock_objects([_locked()])
+        writer.lock_objects([LOCKED])
         with pytest.raises(TrilightError, match="folder is not this one.*TRILIGHT_CACHE"):
             writer.add_shard(elsewhere)
         assert open_dataset(OUT).manifest.shards == ()
@@ -285,7 +285,7 @@ def test_a_worker_with_another_cache_is_named(
 
 def test_a_shard_that_another_machine_has_sent_is_listed(bucket: Any, machines: Machines) -> None:
     with machines.maker("a") as writer:
-        writer.lock_objects([_locked()])
+        writer.lock_objects([LOCKED])
         with machines.maker("b") as worker:
             make_tiny_shard(worker, 0)
             (entry,) = open_dataset(OUT).manifest.shards
@@ -298,14 +298,17 @@ def test_a_shard_that_another_machine_has_sent_is_listed(bucket: Any, machines: 
 
 
 @contextlib.contextmanager
-def _ending_together(machines: Machines) -> Iterator[tuple[DatasetWriter, DatasetWriter]]:
+def _ending_together(
+    machines: Machines, monkeypatch: pytest.MonkeyPatch
+) -> Iterator[tuple[DatasetWriter, DatasetWriter]]:
     """Two makers that find all shards there: the first says that it lists; the second is in use."""
     with machines.maker("a") as first, machines.maker("b") as second:
         machines.use("a")
-        first.lock_objects([_locked()])
+        first.lock_objects([LOCKED])
         make_tiny_shard(first, 0)
         make_tiny_shard(first, 1)
         assert first.store.create_if_absent(".staging/listing/000000000008", b"\n")
+        monkeypatch.setattr(first, "_wait_for_lister", lambda: None)
         machines.use("b")
         second.fetch_lock()
         yield first, second
@@ -317,11 +320,14 @@ def test_of_those_who_end_together_one_reads_the_notes(
     """The others wait for its list; one that died over its list is waited for in vain."""
     read: list[str] = []
     fetched = pack.fetch_notes
-    monkeypatch.setattr(
-        pack, "fetch_notes", lambda how, names, at: fetched(how, _told(names, read), at)
-    )
+
+    def told(how: Any, names: Any, at: Any) -> Any:
+        read.extend(found := list(names))
+        return fetched(how, found, at)
+
+    monkeypatch.setattr(pack, "fetch_notes", told)
     monkeypatch.setattr(dataset_writer, "_PATIENCE_S", 10.0)
-    with _ending_together(machines) as (first, second):
+    with _ending_together(machines, monkeypatch) as (first, second):
         waits: list[float] = []
         monkeypatch.setattr(dataset_writer.time, "sleep", waits.append)
 
@@ -329,9 +335,7 @@ def test_of_those_who_end_together_one_reads_the_notes(
             waits.append(pause_s)
             if len(waits) == 3:
                 machines.use("a")
-                with monkeypatch.context() as patch:
-                    patch.setattr(first, "_wait_for_lister", lambda: None)
-                    first.finish()
+                first.finish()
                 machines.use("b")
                 read.clear()
 
@@ -359,13 +363,11 @@ def test_who_waited_and_then_lists_more_writes_the_documents(
 ) -> None:
     """While it waited for the list of 8 scenes, somebody planned 16 and made them."""
     monkeypatch.setattr(dataset_writer, "_PATIENCE_S", 10.0)
-    with _ending_together(machines) as (first, second):
+    with _ending_together(machines, monkeypatch) as (first, second):
 
         def meanwhile(pause_s: float) -> None:
             machines.use("a")
-            with monkeypatch.context() as patch:
-                patch.setattr(first, "_wait_for_lister", lambda: None)
-                first.finish()
+            first.finish()
             with machines.maker("c", 16) as third:
                 make_tiny_shard(third, 2)
                 make_tiny_shard(third, 3)
@@ -377,11 +379,6 @@ def test_who_waited_and_then_lists_more_writes_the_documents(
         assert not second.left_to_others
     assert len(open_dataset(OUT).manifest.shards) == 4
     assert verify_dataset(OUT).problems == []
-
-
-def _told(names: Any, read: list[str]) -> list[str]:
-    read += (found := list(names))
-    return found
 
 
 def test_what_a_killed_machine_has_prepared_is_not_prepared_again(

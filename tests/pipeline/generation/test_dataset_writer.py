@@ -26,13 +26,14 @@ from storage.dataset.splits import scenes_of_shard, shard_name
 from storage.dataset.staging import is_staged, stage_scene
 from storage.dataset.verify import verify_dataset
 from storage.errors import TrilightError
-from storage.records.objects import Failure, LockedObject
+from storage.records.objects import Failure
 from storage.records.sample import Sample, sample_key
 from tests.for_each import for_each
 from tests.pipeline.documents.dataset_by_hand import locked
 from tests.scenes_by_hand import tiny_sample, tiny_scene
 
 ENVIRONMENT = {"mitsuba_variant": "llvm_ad_rgb", "libraries": {"mitsuba": "3.9.1"}}
+LOCKED = locked("a")
 
 
 def _build() -> DatasetSettings:
@@ -40,16 +41,13 @@ def _build() -> DatasetSettings:
     return dataclasses.replace(build, scenes=dataclasses.replace(build.scenes, num_views=2))
 
 
-def _begin(
-    root: Path, build: DatasetSettings, scenes: int = 4, **environment: str
+def begin_tiny(
+    root: Path, scenes: int = 4, accept_environment: bool = False, **environment: str
 ) -> DatasetWriter:
-    return begin_or_resume_dataset(
-        DatasetFolder(root), build, {**ENVIRONMENT, **environment}, scenes
-    )
-
-
-def _locked() -> LockedObject:
-    return locked("a")
+    """Begin a dataset of tiny scenes, four to a shard, two views each."""
+    folder, made_in = DatasetFolder(root), {**ENVIRONMENT, **environment}
+    accepted = accept_environment
+    return begin_or_resume_dataset(folder, _build(), made_in, scenes, accept_environment=accepted)
 
 
 def _sample(index: int) -> Sample:
@@ -67,15 +65,9 @@ def make_tiny_shard(writer: DatasetWriter, index: int) -> None:
     writer.add_shard(pack_shard(folder, name, scenes_of_shard(index, build.splits)))
 
 
-def begin_tiny(root: Path, scenes: int) -> DatasetWriter:
-    """Begin a dataset of tiny scenes, four to a shard, two views each."""
-    return _begin(root, _build(), scenes)
-
-
 def _dataset(root: Path, scenes: int = 8) -> DatasetWriter:
-    build = _build()
-    writer = _begin(root, build, scenes)
-    writer.lock_objects([_locked()])
+    writer = begin_tiny(root, scenes)
+    writer.lock_objects([LOCKED])
     for index in writer.unfinished_shards():
         make_tiny_shard(writer, index)
     writer.finish()
@@ -84,9 +76,8 @@ def _dataset(root: Path, scenes: int = 8) -> DatasetWriter:
 
 def test_the_digest_knows_nothing_of_place_or_order(tmp_path: Path) -> None:
     forwards = _dataset(tmp_path / "a").manifest
-    build = _build()
-    backwards = _begin(tmp_path / "b", build, 8)
-    backwards.lock_objects([_locked()])
+    backwards = begin_tiny(tmp_path / "b", 8)
+    backwards.lock_objects([LOCKED])
     for index in (1, 0):
         make_tiny_shard(backwards, index)
     assert backwards.finish() == backwards.manifest
@@ -95,7 +86,7 @@ def test_the_digest_knows_nothing_of_place_or_order(tmp_path: Path) -> None:
 
 
 def test_as_many_scenes_are_planned_as_are_asked_for(tmp_path: Path) -> None:
-    writer = _begin(tmp_path, _build(), 5)
+    writer = begin_tiny(tmp_path, 5)
     assert writer.manifest.num_scenes == 5
     assert writer.unfinished_shards() == [0, 1]
     make_tiny_shard(writer, 0)
@@ -107,13 +98,10 @@ def test_other_settings_and_another_environment_are_refused_by_name(tmp_path: Pa
     other = preset_settings("smoke", resolution=32, seed=3)
     other = dataclasses.replace(other, scenes=_build().scenes)
     with pytest.raises(TrilightError, match=r"renders.resolution was 16, now 32 \(and 1 more\)"):
-        _begin(tmp_path, other)
+        begin_or_resume_dataset(DatasetFolder(tmp_path), other, ENVIRONMENT, 4)
     with pytest.raises(TrilightError, match="mitsuba_variant was 'llvm_ad_rgb', now 'scalar_rgb'"):
-        _begin(tmp_path, _build(), mitsuba_variant="scalar_rgb")
-    elsewhere = {**ENVIRONMENT, "mitsuba_variant": "scalar_rgb"}
-    begin_or_resume_dataset(
-        DatasetFolder(tmp_path), _build(), elsewhere, 4, accept_environment=True
-    )
+        begin_tiny(tmp_path, mitsuba_variant="scalar_rgb")
+    begin_tiny(tmp_path, accept_environment=True, mitsuba_variant="scalar_rgb")
 
 
 @for_each(
@@ -143,7 +131,7 @@ def test_a_dataset_stays_on_the_device_that_it_began_on(
     """This machine has a GPU that renders well, and smoke and frozen presets have digests."""
     folder = DatasetFolder(tmp_path)
     if begun:
-        _begin(tmp_path, _build(), mitsuba_variant=begun)
+        begin_tiny(tmp_path, mitsuba_variant=begun)
     monkeypatch.setenv("TRILIGHT_VARIANT", named)
     monkeypatch.setenv("TRILIGHT_CACHE", str(tmp_path / "cache"))
     monkeypatch.setenv("CUDA_VISIBLE_DEVICES", "0")
@@ -159,27 +147,24 @@ def test_a_dataset_stays_on_the_device_that_it_began_on(
 def test_a_dataset_goes_on_with_another_device_only_where_that_is_accepted(
     before: str, now: str, tmp_path: Path
 ) -> None:
-    _begin(tmp_path, _build(), mitsuba_variant=before)
+    begin_tiny(tmp_path, mitsuba_variant=before)
     first, second = ("cpu", "gpu") if before == "llvm_ad_rgb" else ("gpu", "cpu")
     said = f"begun on a {first.upper()} and would go on with a {second.upper()}; choose --device"
     with pytest.raises(TrilightError, match=f"{said} {first} or another --out, or .*--accept-env"):
-        _begin(tmp_path, _build(), mitsuba_variant=now)
-    elsewhere = {**ENVIRONMENT, "mitsuba_variant": now}
-    begin_or_resume_dataset(
-        DatasetFolder(tmp_path), _build(), elsewhere, 4, accept_environment=True
-    )
+        begin_tiny(tmp_path, mitsuba_variant=now)
+    begin_tiny(tmp_path, accept_environment=True, mitsuba_variant=now)
 
 
 def test_a_shard_that_missed_the_manifest_is_found(tmp_path: Path) -> None:
     """A kill between the shard's rename and its note's, or the manifest's, leaves it so."""
     whole = _dataset(tmp_path / "a").manifest
-    writer = _begin(tmp_path / "b", _build(), 8)
-    writer.lock_objects([_locked()])
+    writer = begin_tiny(tmp_path / "b", 8)
+    writer.lock_objects([LOCKED])
     for index in range(2):
         make_tiny_shard(writer, index)
     note_of(writer.folder, whole.shards[0].name).unlink()
     assert open_dataset(str(tmp_path / "b")).manifest.shards == whole.shards[1:]
-    later = _begin(tmp_path / "b", _build(), 8)
+    later = begin_tiny(tmp_path / "b", 8)
     assert later.unfinished_shards() == []
     assert later.finish() == whole == open_dataset(str(tmp_path / "b")).manifest
 
@@ -214,7 +199,7 @@ def _make_again(writer: DatasetWriter, samples: list[Sample]) -> None:
 def test_an_object_of_another_split_is_named(tmp_path: Path) -> None:
     writer = _dataset(tmp_path, 4)
     writer.folder.objects_lock.unlink()  # objects are frozen once
-    writer.lock_objects([dataclasses.replace(_locked(), split="test")])
+    writer.lock_objects([dataclasses.replace(LOCKED, split="test")])
     assert verify_dataset(tmp_path).problems == []  # the tiny scenes use no object
     scene = tiny_scene()
     used = dataclasses.replace(scene.objects[0], kind="object", uid="a")
@@ -227,17 +212,17 @@ def test_an_object_of_another_split_is_named(tmp_path: Path) -> None:
 def test_documents_of_others_are_not_replaced(tmp_path: Path, name: str) -> None:
     (tmp_path / name).write_text("theirs")
     with pytest.raises(TrilightError, match=rf"{name} is there.*another --out"):
-        _begin(tmp_path, _build())
+        begin_tiny(tmp_path)
     assert not (tmp_path / "manifest.json").exists()
     (tmp_path / "train-000000.tar").write_bytes(b"")
     with pytest.raises(TrilightError, match=r"shards but no manifest\.json"):
-        _begin(tmp_path, _build())
+        begin_tiny(tmp_path)
 
 
 def test_two_share_alike_licences_in_one_scene_are_named(tmp_path: Path) -> None:
     writer = _dataset(tmp_path, 4)
     licences = ("CC-BY-SA-4.0", "CC-BY-SA-3.0", "CC-BY-SA-3.0")
-    rows = [dataclasses.replace(_locked(), uid=uid) for uid in "abc"]
+    rows = [dataclasses.replace(LOCKED, uid=uid) for uid in "abc"]
     writer.folder.objects_lock.unlink()  # objects are frozen once
     writer.lock_objects(rows)
     scene = tiny_scene()
@@ -264,7 +249,7 @@ def test_a_shard_in_the_folder_of_a_worker_alone_is_no_shard(
     """Such a run would go on for ever: what is packed would be missing again and again."""
     pauses: list[float] = []
     elsewhere = _dataset(tmp_path / "worker", 4).manifest.shards[0]
-    writer = _begin(tmp_path / "here", _build(), 4)
+    writer = begin_tiny(tmp_path / "here", 4)
     monkeypatch.setattr(dataset_writer.time, "sleep", pauses.append)
     with pytest.raises(TrilightError, match="a worker has packed .* folder is not this one"):
         writer.add_shard(elsewhere)

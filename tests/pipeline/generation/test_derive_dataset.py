@@ -57,7 +57,7 @@ from tests.textured_by_hand import (
     textured_scene,
 )
 
-SETTINGS = {
+SETTINGS: dict[str, Any] = {
     "build": "smoke",
     "renders": {"noise_floor_db": 40.0, "max_spp": 256, "resolution": 16},
     "scenes": {"max_triangles": 9},
@@ -120,6 +120,14 @@ def finished(
 MERGE = DeriveOptions(operation="merge")
 
 
+def select(**chosen: Any) -> DeriveOptions:
+    return DeriveOptions(operation="select", selection=Selection(**chosen))
+
+
+def reshard(scenes_per_shard: int) -> DeriveOptions:
+    return DeriveOptions(operation="reshard", scenes_per_shard=scenes_per_shard)
+
+
 def made(out: Path, derive: DeriveOptions, *places: Path) -> Dataset:
     """Make a whole dataset, documents and all."""
     derive_dataset([str(place) for place in places], derive, out)
@@ -159,9 +167,11 @@ def given(shards: dict[str, list[Sample]], offset: int = 0) -> dict[str, tuple[s
     }
 
 
-def test_a_merge_holds_every_scene_under_its_raised_key(tmp_path: Path) -> None:
+def test_a_merge_holds_every_scene_under_its_raised_key_and_says_where_it_is_from(
+    tmp_path: Path,
+) -> None:
     a, b = finished(tmp_path / "a", scenes(0)), finished(tmp_path / "b", scenes(1), seed=1)
-    merged = shards_made(tmp_path / "c", MERGE, a, b)
+    merged = made(tmp_path / "c", MERGE, a, b)
     assert samples_of(merged) == given(scenes(0)) | given(scenes(1), 6)
     assert [shard.name for shard in merged.manifest.shards] == [
         "train-000000.tar", "train-000001.tar", "test-000002.tar",
@@ -169,11 +179,7 @@ def test_a_merge_holds_every_scene_under_its_raised_key(tmp_path: Path) -> None:
     ]  # fmt: skip
     for shard in open_dataset(str(a)).manifest.shards:  # the first source's shards stay as they are
         assert merged.folder.shard(shard.name).read_bytes() == (a / shard.name).read_bytes()
-
-
-def test_the_manifest_says_where_scenes_are_from(tmp_path: Path) -> None:
-    a, b = finished(tmp_path / "a", scenes(0)), finished(tmp_path / "b", scenes(1), seed=1)
-    manifest = made(tmp_path / "c", MERGE, a, b).manifest
+    manifest = merged.manifest
     derivation = derivation_of(manifest.settings)
     assert derivation is not None and derivation.operation == "merge"
     for source, root, offset in zip(derivation.sources, (a, b), (0, 6), strict=True):
@@ -206,9 +212,7 @@ def test_equal_inputs_give_equal_bytes_wherever_they_lie(tmp_path: Path) -> None
         a = finished(tmp_path / place / "a", scenes(0))
         b = finished(tmp_path / place / "b", scenes(1), seed=1)
         made(tmp_path / place / "merge", MERGE, a, b)
-        select = DeriveOptions(operation="select", selection=Selection(split="train"))
-        reshard = DeriveOptions(operation="reshard", scenes_per_shard=3)
-        for derive in (select, reshard):
+        for derive in (select(split="train"), reshard(3)):
             shards_made(tmp_path / place / derive.operation, derive, a)
         results.append(bytes_of(tmp_path / place))
         assert not [path.name for path in (tmp_path / place).iterdir() if path.name[0] == "."]
@@ -218,20 +222,19 @@ def test_equal_inputs_give_equal_bytes_wherever_they_lie(tmp_path: Path) -> None
 
 
 @for_each(
-    ("selection", "keys"),
+    ("derive", "keys"),
     [
-        (Selection(split="train"), [0, 1, 2, 3]),
-        (Selection(split="test"), [4, 5]),
-        (Selection(template="wall"), [1, 2, 4]),
-        (Selection(min_noise_floor_db=39.0), [3, 4, 5]),
-        (Selection(split="train", template="plane", min_noise_floor_db=37.0), [3]),
+        (select(split="train"), [0, 1, 2, 3]),
+        (select(split="test"), [4, 5]),
+        (select(template="wall"), [1, 2, 4]),
+        (select(min_noise_floor_db=39.0), [3, 4, 5]),
+        (select(split="train", template="plane", min_noise_floor_db=37.0), [3]),
     ],
 )
 def test_a_selection_keeps_keys_and_bytes(
-    tmp_path: Path, selection: Selection, keys: list[int]
+    tmp_path: Path, derive: DeriveOptions, keys: list[int]
 ) -> None:
-    a = finished(tmp_path / "a", scenes(0))
-    chosen = shards_made(tmp_path / "c", DeriveOptions(operation="select", selection=selection), a)
+    chosen = shards_made(tmp_path / "c", derive, finished(tmp_path / "a", scenes(0)))
     whole = given(scenes(0))
     assert samples_of(chosen) == {sample_key(key): whole[sample_key(key)] for key in keys}
 
@@ -239,8 +242,7 @@ def test_a_selection_keeps_keys_and_bytes(
 def test_a_merge_after_a_selection_gives_no_key_twice(tmp_path: Path) -> None:
     """A selection keeps its keys, which then go beyond its number of scenes."""
     a, b = finished(tmp_path / "a", scenes(0)), finished(tmp_path / "b", scenes(1), seed=1)
-    derive = DeriveOptions(operation="select", selection=Selection(split="test"))
-    chosen = shards_made(tmp_path / "c", derive, a)
+    chosen = shards_made(tmp_path / "c", select(split="test"), a)
     merged = shards_made(tmp_path / "d", MERGE, chosen.folder.root, b)
     test_part = {"test-000002.tar": scenes(0)["test-000002.tar"]}
     assert samples_of(merged) == given(test_part) | given(scenes(1), 6)
@@ -248,8 +250,7 @@ def test_a_merge_after_a_selection_gives_no_key_twice(tmp_path: Path) -> None:
 
 def test_a_selection_keeps_only_the_rights_of_what_it_holds(tmp_path: Path) -> None:
     a = finished(tmp_path / "a", scenes(0))
-    derive = DeriveOptions(operation="select", selection=Selection(split="train"))
-    chosen = made(tmp_path / "c", derive, a)
+    chosen = made(tmp_path / "c", select(split="train"), a)
     assert [entry.uid for entry in read_objects_lock(chosen.folder.objects_lock)] == ["a"]
     assert 'license: "cc0-1.0"' in chosen.folder.card.read_text()
     assert "CC-BY-4.0" not in chosen.folder.attribution.read_text()
@@ -257,17 +258,13 @@ def test_a_selection_keeps_only_the_rights_of_what_it_holds(tmp_path: Path) -> N
 
 def test_resharding_divides_each_split_evenly(tmp_path: Path) -> None:
     a = finished(tmp_path / "a", scenes(0))
-    resharded = shards_made(
-        tmp_path / "c", DeriveOptions(operation="reshard", scenes_per_shard=3), a
-    )
+    resharded = shards_made(tmp_path / "c", reshard(3), a)
     assert [(s.name, s.num_samples) for s in resharded.manifest.shards] == [
         ("train-000000.tar", 3), ("train-000001.tar", 1), ("test-000002.tar", 2),
     ]  # fmt: skip
     assert samples_of(resharded) == given(scenes(0))
     assert resharded.manifest.settings["splits"]["scenes_per_shard"] == 3
-    back = shards_made(
-        tmp_path / "d", DeriveOptions(operation="reshard", scenes_per_shard=2), tmp_path / "c"
-    )
+    back = shards_made(tmp_path / "d", reshard(2), tmp_path / "c")
     assert [shard.sha256 for shard in back.manifest.shards] == [
         shard.sha256 for shard in open_dataset(str(a)).manifest.shards
     ]
@@ -278,9 +275,7 @@ def test_many_shards_stand_in_parts(tmp_path: Path, monkeypatch: pytest.MonkeyPa
     monkeypatch.setattr(layout, "FILES_PER_FOLDER", 2)
     of_training = {name: of for name, of in scenes(0).items() if "train" in name}
     a = finished(tmp_path / "a", of_training)
-    resharded = shards_made(
-        tmp_path / "c", DeriveOptions(operation="reshard", scenes_per_shard=1), a
-    )
+    resharded = shards_made(tmp_path / "c", reshard(1), a)
     assert [shard.name for shard in resharded.manifest.shards[1:4]] == [
         "train-000001.tar", "part-0001/train-000002.tar", "part-0001/train-000003.tar",
     ]  # fmt: skip
@@ -299,8 +294,7 @@ def test_rejections_follow_their_scenes(tmp_path: Path) -> None:
     items = [row.item for row in read_failures(merged.folder.failures)]
     assert items == ["e", "000000005.1", "000000001", "000000007"]  # 5 was given up in a
     assert "000000006" in samples_of(merged)
-    derive = DeriveOptions(operation="select", selection=Selection(template="wall"))
-    chosen = shards_made(tmp_path / "d", derive, a)
+    chosen = shards_made(tmp_path / "d", select(template="wall"), a)
     assert [row.item for row in read_failures(chosen.folder.failures)] == ["e", "000000001"]
 
 
@@ -347,28 +341,22 @@ def maps_in(dataset: Dataset) -> list[list[str]]:
 
 def test_a_selection_takes_the_maps_that_it_needs_and_no_other(tmp_path: Path) -> None:
     a = finished(tmp_path / "a", textured_scenes())
-    chosen = DeriveOptions(
-        operation="select", selection=Selection(where=f'key == "{sample_key(3)}"')
-    )
-    made = shards_made(tmp_path / "b", chosen, a)
+    made = shards_made(tmp_path / "b", select(where=f'key == "{sample_key(3)}"'), a)
     held = [colour_texture(1).sha256, number_texture().sha256, sky().sha256]
     assert sorted(maps_in(made)[0]) == sorted(f"__map-{sha256}__" for sha256 in held)
-    plain = DeriveOptions(operation="select", selection=Selection(where='template == "plane"'))
-    left = shards_made(tmp_path / "c", plain, a)
+    left = shards_made(tmp_path / "c", select(where='template == "plane"'), a)
     assert left.manifest.num_samples == 1 and maps_in(left) == [[]]
 
 
 def test_resharding_stores_each_map_once_in_each_new_shard(tmp_path: Path) -> None:
     a = finished(tmp_path / "a", textured_scenes())
-    whole = shards_made(tmp_path / "b", DeriveOptions(operation="reshard", scenes_per_shard=4), a)
+    whole = shards_made(tmp_path / "b", reshard(4), a)
     (shard,) = whole.manifest.shards
     assert [len(names) for names in maps_in(whole)] == [4]
-    apart = shards_made(tmp_path / "c", DeriveOptions(operation="reshard", scenes_per_shard=1), a)
+    apart = shards_made(tmp_path / "c", reshard(1), a)
     assert [len(names) for names in maps_in(apart)] == [0, 3, 3, 3]
     assert samples_of(apart) == samples_of(whole) == given(textured_scenes())
-    again = shards_made(
-        tmp_path / "d", DeriveOptions(operation="reshard", scenes_per_shard=4), tmp_path / "c"
-    )
+    again = shards_made(tmp_path / "d", reshard(4), tmp_path / "c")
     assert [each.sha256 for each in again.manifest.shards] == [shard.sha256]
 
 
@@ -396,13 +384,6 @@ def refused(out: Path, derive: DeriveOptions, *places: Path | str) -> str:
     return message
 
 
-def changed_settings(root: Path, group: str, **values: Any) -> Path:
-    manifest = open_dataset(str(root)).manifest
-    settings = {**manifest.settings, group: {**manifest.settings.get(group, {}), **values}}
-    write_manifest(root / "manifest.json", dataclasses.replace(manifest, settings=settings))
-    return root
-
-
 @for_each("uid, sha256", [("c", "1" * 64), ("x", TEST_OBJECT.asset_sha256)])
 def test_a_leak_between_splits_is_named(tmp_path: Path, uid: str, sha256: str) -> None:
     """Of the same name with another budget; of the same file, which catalogues call otherwise."""
@@ -417,8 +398,7 @@ def test_a_leak_between_splits_is_named(tmp_path: Path, uid: str, sha256: str) -
     assert f"object '{uid}' is in test of" in message and "and in train of" in message
     assert "trilight shards select" in message
     train_only = tmp_path / "train"
-    derive = DeriveOptions(operation="select", selection=Selection(split="train"))
-    shards_made(train_only, derive, a)
+    shards_made(train_only, select(split="train"), a)
     shards_made(tmp_path / "c", MERGE, train_only, b)  # as the message advises
 
 
@@ -440,41 +420,39 @@ def test_the_same_scene_twice_is_refused(tmp_path: Path) -> None:
 def test_what_does_not_fit_together_is_named(
     tmp_path: Path, group: str, values: dict[str, Any], name: str
 ) -> None:
-    a, b = finished(tmp_path / "a", scenes(0)), finished(tmp_path / "b", scenes(1))
-    assert name in refused(tmp_path / "c", MERGE, a, changed_settings(b, group, **values))
+    settings = {**SETTINGS, group: {**SETTINGS.get(group, {}), **values}}
+    a = finished(tmp_path / "a", scenes(0))
+    b = finished(tmp_path / "b", scenes(1), settings=settings)
+    assert name in refused(tmp_path / "c", MERGE, a, b)
     other = finished(tmp_path / "other", scenes(1), num_views=3)
     assert "number of views is 3; expected 2" in refused(tmp_path / "c", MERGE, a, other)
 
 
 def test_damage_and_what_is_not_finished_are_refused(tmp_path: Path) -> None:
-    a, out = finished(tmp_path / "a", scenes(0)), tmp_path / "c"
-    reshard = DeriveOptions(operation="reshard", scenes_per_shard=3)
+    a, out, derive = finished(tmp_path / "a", scenes(0)), tmp_path / "c", reshard(3)
     manifest = open_dataset(str(a)).manifest
     write_manifest(a / "manifest.json", dataclasses.replace(manifest, num_scenes=7))
-    assert "3 of 4 shards" in refused(out, reshard, a)
+    assert "3 of 4 shards" in refused(out, derive, a)
     write_manifest(a / "manifest.json", manifest)
     shard = a / "train-000001.tar"
     data = bytearray(shard.read_bytes())
     data[len(data) // 2] ^= 1
     shard.write_bytes(data)
-    assert "sha256 differs" in refused(out, reshard, a)
+    assert "sha256 differs" in refused(out, derive, a)
     shard.unlink()
-    assert "missing" in refused(out, reshard, a)
+    assert "missing" in refused(out, derive, a)
     (a / "objects.lock.jsonl").write_bytes(b"")
-    assert "objects.lock.jsonl" in refused(out, reshard, a)
-    assert "no such folder" in refused(out, reshard, tmp_path / "nowhere")
-    assert "on this machine" in refused(out, reshard, "https://u:secret@example.org/a?token=x")
-    assert "secret" not in refused(out, reshard, "https://u:secret@example.org/a?token=x")
+    assert "objects.lock.jsonl" in refused(out, derive, a)
+    assert "no such folder" in refused(out, derive, tmp_path / "nowhere")
+    assert "on this machine" in refused(out, derive, "https://u:secret@example.org/a?token=x")
+    assert "secret" not in refused(out, derive, "https://u:secret@example.org/a?token=x")
 
 
 @for_each(
     ("derive", "expected"),
     [
-        (
-            DeriveOptions(operation="select", selection=Selection(template="no")),
-            "none of the 6 scenes",
-        ),
-        (DeriveOptions(operation="reshard", scenes_per_shard=0), "--scenes-per-shard is 0"),
+        (select(template="no"), "none of the 6 scenes"),
+        (reshard(0), "--scenes-per-shard is 0"),
     ],
 )
 def test_arguments_that_make_nothing_are_refused(
@@ -486,12 +464,11 @@ def test_arguments_that_make_nothing_are_refused(
 
 
 def test_nothing_is_overwritten_and_nothing_grows(tmp_path: Path) -> None:
-    a, out = finished(tmp_path / "a", scenes(0)), tmp_path / "c"
-    reshard = DeriveOptions(operation="reshard", scenes_per_shard=3)
+    a, out, derive = finished(tmp_path / "a", scenes(0)), tmp_path / "c", reshard(3)
     out.mkdir()
-    derive_dataset([str(a)], reshard, out)  # an empty folder is no reason to refuse
+    derive_dataset([str(a)], derive, out)  # an empty folder is no reason to refuse
     with pytest.raises(TrilightError, match="is there already"):
-        derive_dataset([str(a)], reshard, out)
+        derive_dataset([str(a)], derive, out)
     with pytest.raises(TrilightError, match=r"made by `trilight shards reshard`.*cannot grow"):
         begin_or_resume_dataset(DatasetFolder(out), _build(), ENVIRONMENT, 4)
 
@@ -514,19 +491,18 @@ flow.derive_dataset([sys.argv[1]], derive, Path(sys.argv[2]), progress=stop)
 
 
 def test_a_kill_leaves_no_dataset_and_the_next_run_makes_it(tmp_path: Path) -> None:
-    a, out = finished(tmp_path / "a", scenes(0)), tmp_path / "c"
+    a, out, derive = finished(tmp_path / "a", scenes(0)), tmp_path / "c", reshard(3)
     run = subprocess.Popen(
         [sys.executable, "-c", KILLED, str(a), str(out)], stdout=subprocess.PIPE, text=True
     )
     assert run.stdout is not None and run.stdout.readline() == "here\n"
-    reshard = DeriveOptions(operation="reshard", scenes_per_shard=3)
     with pytest.raises(TrilightError, match="another process"):
-        derive_dataset([str(a)], reshard, out)
+        derive_dataset([str(a)], derive, out)
     os.kill(run.pid, signal.SIGKILL)
     run.wait()
     assert not out.exists()
     assert list(tmp_path.glob(".c.part/*.tar"))
     (tmp_path / ".c.part" / "train-000009.tar").write_bytes(b"of a larger one")
-    derive_dataset([str(a)], reshard, out)
+    derive_dataset([str(a)], derive, out)
     assert verify_dataset(out).problems == []
     assert sorted(path.name for path in tmp_path.iterdir()) == ["a", "c"]

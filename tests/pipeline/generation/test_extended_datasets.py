@@ -297,15 +297,24 @@ def test_a_mistyped_source_leaves_nothing_behind(
     assert [path.name for path in tmp_path.iterdir()] == ["empty"]
 
 
-def test_what_was_only_begun_is_begun_anew(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_what_was_only_begun_is_begun_anew_and_what_has_objects_or_scenes_is_not(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     """As a run leaves it that ended over its objects: other settings and fewer scenes are free."""
     without_rendering(monkeypatch)
     folder = DatasetFolder(tmp_path / "set")
     with folder.hold_shared_lock():
         begin_or_resume_dataset(folder, preset_settings("smoke", seed=5), {}, 24)
-    run = prepare_dataset(tiny_order(out=str(folder.root), scenes=4, seed=7))
+    order = tiny_order(out=str(folder.root), scenes=4, seed=7)
+    run = prepare_dataset(order)  # its objects are frozen, no more
     assert run.publication.manifest.settings["seed"] == 7
     assert run.publication.manifest.num_scenes == 4
+    other = dataclasses.replace(order, seed=5)
+    with pytest.raises(TrilightError, match="begun with another setting: seed was 7, now 5"):
+        prepare_dataset(other)
+    make_dataset(order, Undocumented())
+    with pytest.raises(TrilightError, match="seed was 7, now 5"):
+        prepare_dataset(other)
 
 
 def test_the_command_is_there_while_objects_are_prepared(
@@ -324,18 +333,6 @@ def test_the_command_is_there_while_objects_are_prepared(
         prepare_dataset(tiny_order(build="tiny", out=place, scenes=4, objects=objects))
     assert asked[0] is not None and asked[0][:4] == ["generate", "tiny", "--objects", "builtin:9"]
     assert asked[1] == asked[0]
-
-
-def test_what_has_objects_or_scenes_is_not(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    without_rendering(monkeypatch)
-    order = tiny_order(out=str(tmp_path / "set"), scenes=4, seed=5)
-    prepare_dataset(order)  # its objects are frozen, no more
-    other = dataclasses.replace(order, seed=7)
-    with pytest.raises(TrilightError, match="begun with another setting: seed was 5, now 7"):
-        prepare_dataset(other)
-    make_dataset(order, Undocumented())
-    with pytest.raises(TrilightError, match="seed was 5, now 7"):
-        prepare_dataset(other)
 
 
 def test_nobody_forgets_while_another_is_at_work(tmp_path: Path) -> None:

@@ -34,7 +34,6 @@ from pipeline.scenes.compose import compose_scene
 from pipeline.scenes.triangle_budget import PooledAsset, draw_rows, fits_of
 from scene_templates.user_maps import UserMap, draw_user_map
 from storage.conventions import SPLITS
-from storage.dataset.manifest import Manifest
 from storage.dataset.verify import check_sample
 from storage.errors import Rejected, TrilightError
 from storage.records.asset import Asset, decode_asset
@@ -42,6 +41,7 @@ from storage.records.object_index import ObjectIndex
 from storage.records.objects import (
     SKY,
     TEXTURE,
+    LockedObject,
     decode_objects_lock,
     encode_objects_lock,
     read_objects_lock,
@@ -49,8 +49,8 @@ from storage.records.objects import (
 from storage.records.texture import MapSource
 from storage.seeds import SceneKey, rng_for
 from tests.infra.child_here import ChildHere
-from tests.pipeline.documents.dataset_by_hand import locked
-from tests.pipeline.generation.frozen_kit import SOURCE, asked, begun, build, frozen, prepared
+from tests.pipeline.documents.dataset_by_hand import locked, write_dataset
+from tests.pipeline.generation.frozen_kit import BUILD, SOURCE, asked, begun, frozen, prepared
 from tests.pipeline.objects.maps.test_maps import exr, noise, png, sun_map
 from tests.pipeline.scenes.small_pool import first_scene, small_pool
 from tests.scenes_by_hand import tiny_sample
@@ -74,17 +74,19 @@ def _opened(accepted: AcceptedObjects, split: str = "train") -> SplitPool:
     return SplitPool(accepted.origin, split, asset_store())
 
 
-def _stored(name: str) -> Asset:
-    return decode_asset(asset_store().asset_path(name).read_bytes())
+def _rows(writer: DatasetWriter) -> list[LockedObject]:
+    return [row for row in read_objects_lock(writer.folder.objects_lock) if row.split == "train"]
 
 
 def _whole(writer: DatasetWriter, accepted: AcceptedObjects) -> list[PooledAsset]:
     """The pool as it would be with every object of the split in memory."""
-    names = {each.asset_sha256: each.asset_name for each in map(prepared, range(NUM_OBJECTS))}
+    stored = {
+        each.asset_sha256: asset_store().asset_path(each.asset_name)
+        for each in map(prepared, range(NUM_OBJECTS))
+    }
     return [
-        PooledAsset(locked=row, asset=_stored(names[row.asset_sha256]))
-        for row in read_objects_lock(writer.folder.objects_lock)
-        if row.split == "train"
+        PooledAsset(locked=row, asset=decode_asset(stored[row.asset_sha256].read_bytes()))
+        for row in _rows(writer)
     ]
 
 
@@ -101,7 +103,7 @@ def test_scenes_of_opened_objects_are_those_of_objects_in_memory(
         assert draws[0] == draws[1]
     for index in range(2):
         one, other = (
-            first_scene(build().scenes, pool, seed=1, scene_index=index) for pool in (opened, whole)
+            first_scene(BUILD.scenes, pool, seed=1, scene_index=index) for pool in (opened, whole)
         )
         assert one.objects == other.objects
         assert np.array_equal(one.vertex_positions, other.vertex_positions)
@@ -121,17 +123,12 @@ def test_only_a_few_objects_are_open(
     pool = _opened(made[1])
     assert not read
     for row in (0, 1, 2, 0, 3, 0, 1):
-        assert pool[row].locked.uid == read_objects_lock_uids(made[0])[row]
+        assert pool[row].locked.uid == _rows(made[0])[row].uid
     assert len(read) == 5  # 0, 1, 2, 3, and 1 again
     assert pool._open.cache_info().currsize == 3
     for row in (-1, len(pool)):
         with pytest.raises(IndexError):
             pool[row]
-
-
-def read_objects_lock_uids(writer: DatasetWriter) -> list[str]:
-    rows = read_objects_lock(writer.folder.objects_lock)
-    return [row.uid for row in rows if row.split == "train"]
 
 
 def test_a_second_start_looks_at_no_object(
@@ -166,24 +163,19 @@ def test_a_file_that_is_not_the_locked_one_is_away(
     name = pool._index.asset_name(pool._first)
     path = asset_store().asset_path(name)
     was = path.read_bytes()
+    other = asset_store().asset_path(pool._index.asset_name(pool._first + 1)).read_bytes()
     try:
-        for damage in (path.unlink, lambda: path.write_bytes(was[:-1]), lambda: _swap(path, pool)):
-            damage()
+        for damage in (None, was[:-1], other):
+            path.unlink(missing_ok=True)
+            if damage is not None:
+                path.write_bytes(damage)
             with pytest.raises(AssetMissing) as caught:
                 pool[0]
-            assert (caught.value.uid, caught.value.asset_name) == (
-                read_objects_lock_uids(made[0])[0],
-                name,
-            )
+            uid = _rows(made[0])[0].uid
+            assert (caught.value.uid, caught.value.asset_name) == (uid, name)
     finally:
         path.write_bytes(was)
-    assert pool[0].locked.uid == read_objects_lock_uids(made[0])[0]
-
-
-def _swap(path: Path, pool: SplitPool) -> None:
-    """Put another object of the same store in the place of one."""
-    other = asset_store().asset_path(pool._index.asset_name(pool._first + 1))
-    path.write_bytes(other.read_bytes())
+    assert pool[0].locked.uid == uid
 
 
 def test_an_index_that_contradicts_the_objects_is_refused(
@@ -337,21 +329,15 @@ def test_without_own_ones_a_scene_is_what_it_was(
     assert "maps" not in second.provenance
 
 
-def test_documents_name_them_and_a_stranger_in_a_scene_is_a_fault(accepted: AcceptedMaps) -> None:
+def test_documents_name_them_and_a_stranger_in_a_scene_is_a_fault(
+    accepted: AcceptedMaps, tmp_path: Path
+) -> None:
     rows = [locked for locked, _ in accepted.rows]
     table = list(csv.DictReader(io.StringIO(encode_attribution(rows).decode())))
     done = {row["uid"]: row["changes"] for row in table}
     assert "laid on other surfaces" in done["texture:copy"] and "turned" in done["sky:copy"]
     sample, locked = tiny_sample(), {row.uid: row for row in rows}
-    manifest = Manifest(
-        build="smoke",
-        settings={},
-        environment={},
-        num_scenes=1,
-        num_views=sample.scene.num_views,
-        objects_lock_sha256="",
-        shards=(),
-    )
+    manifest = write_dataset(tmp_path, {}).manifest
     trains = next(row.uid for row in rows if row.split == "train")
     held = next(row.uid for row in rows if row.split == "test")
     named = {**sample.scene.provenance, "maps": [trains, held, "sky:unknown"]}

@@ -323,21 +323,19 @@ def test_every_scene_is_in_one_task(
             assert scenes.start <= piece.first < piece.last <= scenes.stop
 
 
-def test_a_task_takes_the_time_that_it_should() -> None:
+def test_a_task_takes_the_time_that_it_should_by_what_is_measured() -> None:
     """At 10 s a scene 24 of them: half a shard of 48, or six of 4."""
     cutter = _cutter(3, 30.0)
     for per_shard, pieces in ((48, 1), (4, 6)):
         tasks = list(cutter.cut_round(range(24), SplitSettings(scenes_per_shard=per_shard)))
         assert len(_scenes(tasks[:1])) == TASK_S / 10
         assert len(tasks[0]) == pieces
-
-
-def test_sizes_follow_what_is_measured_on_the_way() -> None:
+    # Sizes follow what is measured on the way.
     cutter = TaskCutter()
-    tasks = cutter.cut_round(range(100), SplitSettings(scenes_per_shard=4))
-    assert len(_scenes([next(tasks)])) == 4
+    cut = cutter.cut_round(range(100), SplitSettings(scenes_per_shard=4))
+    assert len(_scenes([next(cut)])) == 4
     cutter.record(TaskResult(shards=(), scenes=4, seconds=4.0, core_s=4.0))
-    assert len(_scenes([next(tasks)])) == TASK_S
+    assert len(_scenes([next(cut)])) == TASK_S
 
 
 @for_each("at_once", [2, 8])

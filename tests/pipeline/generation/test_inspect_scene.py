@@ -19,7 +19,6 @@ from pipeline.exchange.open_scene import SceneSource
 from pipeline.exchange.reader import SceneReader
 from pipeline.exchange.usd.write_usd import write_usd
 from pipeline.generation import inspect_scene as inspecting
-from pipeline.generation import render_sample as module
 from pipeline.generation import render_sample as rendering
 from pipeline.generation.inspect_scene import ROWS, VIEWS, inspect_scene, seen_into, turntable_poses
 from pipeline.generation.render_sample import RenderInput, ViewProgress, render_sample
@@ -28,7 +27,6 @@ from pipeline.presets.settings import DatasetSettings
 from pipeline.renders.mitsuba_variant import Device, Variant, activate, choose_variant
 from pipeline.renders.results import RenderedView
 from pipeline.renders.settings import NoiseTargets
-from pipeline.scenes.compose import compose_scene
 from storage.conventions import look_at_c2w
 from storage.dataset.layout import DatasetFolder
 from storage.dataset.shard import write_shard
@@ -37,21 +35,15 @@ from storage.records.objects import Failure
 from storage.records.passes.pictures import passes_exr
 from storage.records.profiles import PROFILES
 from storage.records.sample import decode_sample, encode_sample, sample_key
-from storage.records.scene import ObjectKind, Scene, SceneObject
+from storage.records.scene import Scene, SceneObject
 from storage.records.scene_file import encode_scene
 from storage.renderer import Camera, Sampling
-from storage.seeds import SceneKey, seed_for
+from storage.seeds import seed_for
 from storage.settings.overrides import json_or_word
 from tests.command_line import trilight
 from tests.infra.child_here import use_children_here
-from tests.pipeline.scenes.small_pool import small_pool
+from tests.pipeline.scenes.small_pool import first_scene, small_pool
 from tests.scenes_by_hand import tiny_sample, tiny_scene
-
-KINDS: tuple[tuple[str, ObjectKind], ...] = (
-    ("floor", "shell"),
-    ("walls", "shell"),
-    ("thing", "object"),
-)
 
 
 def test_a_summary_and_a_sheet(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -96,7 +88,8 @@ def test_mistakes(tmp_path: Path) -> None:
 
 
 def test_walls_before_the_objects_are_left_out() -> None:
-    floor, wall, thing = (SceneObject(name=name, kind=kind) for name, kind in KINDS)
+    floor, wall = (SceneObject(name=name, kind="shell") for name in ("floor", "walls"))
+    thing = SceneObject(name="thing", kind="object")
     walls = [[[x, -1, 0], [x, 1, 0], [x, 0, 1]] for x in (1, -1)]
     corners = [*walls, [[0, 0, 0.1], [0.1, 0, 0.1], [0, 0.1, 0.3]], [[1, 0, 0], [0, 1, 0], [0] * 3]]
     room = tiny_scene(
@@ -217,12 +210,7 @@ KEY = "000000000"
 
 @pytest.fixture(scope="module")
 def scene() -> Scene:
-    for attempt in range(16):
-        try:
-            return compose_scene(BUILD.scenes, small_pool(), SceneKey(BUILD.seed, 0, attempt))
-        except Rejected:
-            continue
-    raise AssertionError("no scene in sixteen attempts")
+    return first_scene(BUILD.scenes, small_pool(), seed=BUILD.seed, scene_index=0)
 
 
 class _Renderer:
@@ -270,7 +258,8 @@ def test_a_record_says_all_three_floors_and_the_target_that_was_missed(scene: Sc
 def test_a_refused_camera_is_replaced_and_told(
     scene: Scene, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(module, "SceneRenderer", _Renderer)
+    """One of a file is not: it ends the scene."""
+    monkeypatch.setattr(rendering, "SceneRenderer", _Renderer)
     failures: list[Failure] = []
     sample = render_sample(KEY, RenderInput(scene=scene), BUILD, failures, ViewProgress(None, 0))
     before = scene.provenance["camera_attempts"]
@@ -286,17 +275,10 @@ def test_a_refused_camera_is_replaced_and_told(
     assert [view.seed for view in sample.views] == [
         seed_for(BUILD.seed, "samples", 0, view, attempt) for view, attempt in enumerate(after)
     ]
-
-
-def test_a_refused_camera_of_a_file_ends_the_scene(
-    scene: Scene, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.setattr(module, "SceneRenderer", _Renderer)
-    failures: list[Failure] = []
+    of_file = RenderInput(scene=scene, kept_cameras=2)
+    failures.clear()
     with pytest.raises(Rejected, match="black_view: view 1: seed "):
-        render_sample(
-            KEY, RenderInput(scene=scene, kept_cameras=2), BUILD, failures, ViewProgress(None, 0)
-        )
+        render_sample(KEY, of_file, BUILD, failures, ViewProgress(None, 0))
     assert failures == []
 
 
@@ -346,17 +328,16 @@ def _told(folder: DatasetFolder) -> list[str]:
     return [path.read_text() for path in at_work.iterdir()] if at_work.is_dir() else []
 
 
-def test_a_view_counts_in_part(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_view_counts_in_part_and_quick_passes_are_told_once_and_to_nobody(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     """Of 128 samples that are expected, and no more than the whole where there are more."""
     folder, told = DatasetFolder(tmp_path), list[float]()
-    monkeypatch.setattr(rendering, "_EVERY_S", 0.0)
-    monkeypatch.setattr(rendering, "tell_views", lambda *words: told.append(words[2]))
-    assert ViewProgress(folder, 5).render_view(2, _steps()) is DONE
+    with monkeypatch.context() as patch:
+        patch.setattr(rendering, "_EVERY_S", 0.0)
+        patch.setattr(rendering, "tell_views", lambda *words: told.append(words[2]))
+        assert ViewProgress(folder, 5).render_view(2, _steps()) is DONE
     assert told == [2.25, 2.5, 2.75, 3.0]
-
-
-def test_quick_passes_are_told_once_and_to_nobody(tmp_path: Path) -> None:
-    folder = DatasetFolder(tmp_path)
     progress = ViewProgress(folder, 5)
     assert progress.render_view(0, _steps()) is DONE
     assert progress.render_view(1, _steps()) is DONE

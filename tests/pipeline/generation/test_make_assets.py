@@ -60,10 +60,6 @@ def source(shared: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
     return folder
 
 
-def _nothing_to_fetch(done: int, total: int) -> None:
-    raise AssertionError("these sources lie on this machine")
-
-
 def run(
     source: Path | str, out: Path, settings: AssetSettings | None = None, workers: int = 1
 ) -> AssetReport:
@@ -75,7 +71,7 @@ def run(
         allowed_licences=DEFAULT_ALLOWED,
         licence=None,
         workers=workers,
-        on_download=_nothing_to_fetch,
+        on_download=lambda done, total: pytest.fail("these sources lie on this machine"),
         on_plan=counts.append,
         on_object=lambda: counts.append(-1),
     )
@@ -182,13 +178,6 @@ def test_a_folder_of_somebody_else_is_left_alone(source: Path, tmp_path: Path) -
         run(source, tmp_path / "thesis.tex")
 
 
-def test_only_bad_objects_make_a_folder_too(source: Path, tmp_path: Path) -> None:
-    report = run(source / "bad", tmp_path / "out")
-    assert not report.rows
-    assert len(report.failures) == len(BAD)
-    assert (tmp_path / "out" / "quality.html").read_text().count("<img") == 0
-
-
 @pytest.fixture(scope="module")
 def few(source: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
     """One good object and the bad ones."""
@@ -211,11 +200,17 @@ def test_the_command_prints_json_and_nothing_else(few: Path, tmp_path: Path) -> 
     assert (out / "quality.html").exists()
 
 
-def test_where_nothing_can_be_used_the_command_says_so(few: Path, tmp_path: Path) -> None:
-    result = trilight(["assets", str(few / "bad"), "--out", str(tmp_path / "out")])
+def test_where_nothing_can_be_used_the_command_says_so_and_makes_a_folder_too(
+    few: Path, tmp_path: Path
+) -> None:
+    out = tmp_path / "out"
+    result = trilight(["assets", str(few / "bad"), "--out", str(out)])
     assert result.exit_code == 1 and "No object can be used" in result.stdout
     assert "object outcome triangles p99 method or reason" in " ".join(result.stdout.split())
     assert "Next:" not in result.stdout
+    assert (out / "objects.jsonl").read_bytes() == b""
+    assert len(read_failures(out / "failures.jsonl")) == len(BAD)
+    assert (out / "quality.html").read_text().count("<img") == 0
 
 
 @pytest.mark.slow("kills")

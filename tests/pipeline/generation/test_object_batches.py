@@ -145,7 +145,10 @@ def test_a_file_that_has_changed_is_looked_at(mesher: Mesher, tmp_path: Path) ->
         assert (max(mesher.made.values()) == 2) == is_made_again, (suffix, changed)
 
 
-def test_a_damaged_result_is_made_again(mesher: Mesher, tmp_path: Path) -> None:
+def test_a_damaged_result_or_one_of_another_user_is_made_again(
+    mesher: Mesher, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """In a cache it counts as missing; beside the dataset the error names the next step."""
     records = object_records(tmp_path / "objects", 3)
     expected = _prepare(records, tmp_path / "one")
     for number, damage in enumerate((b"", b"{}\n", b'{"uid": "x"}\n', b"\xff", b'"uid"\n')):
@@ -153,14 +156,6 @@ def test_a_damaged_result_is_made_again(mesher: Mesher, tmp_path: Path) -> None:
             path.write_bytes(damage)
         assert _prepare(records, tmp_path / f"again{number}") == expected
         assert max(mesher.made.values()) == 2 + number
-
-
-def test_a_file_of_another_user(
-    mesher: Mesher, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    """In a cache it counts as missing; beside the dataset the error names the next step."""
-    records = object_records(tmp_path / "objects", 3)
-    expected = _prepare(records, tmp_path / "one")
     read = Path.read_bytes
     unreadable = tmp_path / "cache"
 
@@ -170,15 +165,15 @@ def test_a_file_of_another_user(
         return read(path)
 
     monkeypatch.setattr(Path, "read_bytes", refused)
+    made = max(mesher.made.values())
     assert _prepare(records, tmp_path / "two") == expected
+    assert max(mesher.made.values()) == made + 1
     unreadable = tmp_path / "two"
     with pytest.raises(TrilightError, match="Permission denied; expected a file that every worker"):
         _prepare(records, tmp_path / "two")
 
 
 NUM_OBJECTS = 120
-WORKERS = 3
-KILL_AFTER = BATCH // 2
 
 
 @pytest.fixture
@@ -195,12 +190,10 @@ def lock_of_one(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> bytes:
 
 
 def test_rejected_objects_are_not_tried_again_from_another_folder(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    mesher: Mesher, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """What is frozen is found in the batches of all objects, also without the index of the lock."""
     without_probe(monkeypatch)
-    monkeypatch.setenv("TRILIGHT_CACHE", str(tmp_path / "cache"))
-    mesher = use_mesher(monkeypatch, batch=BATCH)
     rejected = {"object 00003", "object 00017"}
     mesher.reasons = dict.fromkeys(rejected, "no_faces")
     object_records(tmp_path / "objects")
@@ -231,8 +224,8 @@ def test_workers_share_the_objects(
         request.getfixturevalue("bucket")
     out, notes = OUT if is_bucket else str(tmp_path / "set"), tmp_path / "notes"
     notes.mkdir()
-    words = [out, str(tmp_path / "objects"), str(notes), str(WORKERS)]
-    killed = _start([*words, str(KILL_AFTER)], TRILIGHT_CACHE=str(tmp_path / "killed"))
+    words = [out, str(tmp_path / "objects"), str(notes), "3"]
+    killed = _start([*words, str(BATCH // 2)], TRILIGHT_CACHE=str(tmp_path / "killed"))
     others = [_start(words, TRILIGHT_CACHE=str(tmp_path / name)) for name in "12"]
     for process in (killed, *others):
         said, _ = process.communicate(timeout=300)
@@ -298,15 +291,13 @@ def test_a_claim_keeps_other_machines_off_until_it_ends(
         assert theirs
 
 
-OPTIONS = KubernetesOptions(image="not pulled", cores=2)
-
-
 @pytest.mark.slow("kills")
 def test_arrays_that_are_killed_end_in_the_digest_of_one_that_was_not(
     bucket: Any, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """Each array goes on where the one before was killed: four of Kubernetes, then one of Slurm."""
     order, rng, killed = tiny_order(out=OUT, scenes=12), np.random.default_rng(0), 0
+    options = KubernetesOptions(image="not pulled", cores=2)
     without_rendering(monkeypatch)
     monkeypatch.setattr("pipeline.executors.threads.ThreadRunner", Undocumented)
     alone = dataclasses.replace(order, out=str(tmp_path / "whole"))
@@ -317,7 +308,7 @@ def test_arrays_that_are_killed_end_in_the_digest_of_one_that_was_not(
         assert set(job.tasks) <= set(missing)  # only what is missing
         missing = list(job.tasks)
         for place, task in enumerate(job.tasks):
-            pod = job_manifest(job, OPTIONS)["spec"]["template"]["spec"]["containers"][0]
+            pod = job_manifest(job, options)["spec"]["template"]["spec"]["containers"][0]
             variables = {row["name"]: row["value"] for row in pod["env"]}
             if on == "slurm":
                 variables["SLURM_ARRAY_TASK_ID"] = str(task)

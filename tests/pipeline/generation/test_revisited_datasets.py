@@ -26,7 +26,6 @@ from storage.dataset.dataset import Dataset, open_dataset
 from storage.dataset.shard import open_shard
 from storage.dataset.verify import verify_dataset
 from storage.errors import TrilightError
-from storage.records.sample import Sample
 from storage.records.scene_facts import lights
 from tests.for_each import for_each
 from tests.infra.child_here import ChildHere
@@ -73,10 +72,6 @@ def members(dataset: Dataset) -> dict[str, bytes]:
         for key, of_key in open_shard(dataset.folder.shard(shard.name))
         for suffix, data in of_key.items()
     }
-
-
-def samples(dataset: Dataset) -> list[Sample]:
-    return [each for shard in dataset.manifest.shards for each in dataset.read_shard(shard)]
 
 
 @pytest.fixture(scope="module")
@@ -150,7 +145,7 @@ def test_lights_materials_and_resolution_change_on_request(source: Dataset, tmp_
         seed=5,
     )
     assert new.manifest.num_views == 2
-    for then, now in zip(samples(source), samples(new), strict=True):
+    for then, now in zip(source.samples(), new.samples(), strict=True):
         assert now.radiance_rgb.shape == (2, 24, 24, 3)
         assert len(lights(now.scene)) == 2
         assert not np.array_equal(now.scene.materials[:1], then.scene.materials[:1])
@@ -165,7 +160,7 @@ def test_a_kept_camera_is_rendered_again_where_it_would_see_something_else(
     source: Dataset, tmp_path: Path, asked: dict[str, Any]
 ) -> None:
     new = revisited(source.folder.root, tmp_path / "new", shards="0:1", **asked)
-    for then, now in zip(samples(source), samples(new), strict=False):
+    for then, now in zip(source.samples(), new.samples(), strict=False):
         assert np.array_equal(now.scene.c2w, then.scene.c2w)
         assert not np.array_equal(now.radiance_rgb, then.radiance_rgb)
         changed = not np.array_equal(now.scene.materials, then.scene.materials)
@@ -177,7 +172,7 @@ def test_given_cameras_are_those_of_every_scene(source: Dataset, tmp_path: Path)
     path = tmp_path / "cameras.json"
     path.write_text(json.dumps({"cameras": [look]}))
     given = revisited(source.folder.root, tmp_path / "given", cameras=str(path), shards="0:1")
-    for sample in samples(given):
+    for sample in given.samples():
         assert np.allclose(sample.scene.c2w[0, :3, 3], [0, -2, 1], atol=1e-6)  # float32
         assert sample.scene.fov_deg.tolist() == [40]
 

@@ -3,10 +3,9 @@
 import contextlib
 import dataclasses
 import os
-import threading
 from collections import Counter
 from collections.abc import Callable, Iterable, Iterator
-from concurrent.futures import Future
+from concurrent.futures import Future, ThreadPoolExecutor
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any, cast
@@ -74,15 +73,8 @@ def _make(root: Path, first: int, last: int, made: "Counter[int]", broken: int =
 
 def test_many_makers_of_one_shard_make_every_scene_once(tmp_path: Path) -> None:
     made: Counter[int] = Counter()
-    packed: list[ShardEntry | None] = []
-    threads = [
-        threading.Thread(target=lambda: packed.append(_make(tmp_path, 0, 4, made)))
-        for _ in range(6)
-    ]
-    for thread in threads:
-        thread.start()
-    for thread in threads:
-        thread.join()
+    with ThreadPoolExecutor(6) as makers:
+        packed = list(makers.map(lambda _: _make(tmp_path, 0, 4, made), range(6)))
     assert made == {0: 1, 1: 1, 2: 1, 3: 1}
     (shard,) = [entry for entry in packed if entry]
     assert shard == index_shard(tmp_path / NAME)
@@ -110,8 +102,7 @@ def test_the_first_scene_can_be_looked_at_at_once(tmp_path: Path) -> None:
 
 def test_what_somebody_else_is_making_is_left_to_them(tmp_path: Path) -> None:
     made: Counter[int] = Counter()
-    claim = DatasetFolder(tmp_path).staged_shard(NAME) / f"{sample_key(1)}.claim"
-    with hold_lock(claim):
+    with _claim(DatasetFolder(tmp_path), 1):
         assert _make(tmp_path, 0, 4, made) is None
     assert made == {0: 1, 2: 1, 3: 1}
     assert _make(tmp_path, 0, 4, made) is not None  # they died; now it is free
@@ -127,7 +118,7 @@ def test_who_waits_for_others_says_for_whom(
         publication=writer, job=shard_job(tmp_path), unfinished_shards=lambda: missing.pop(0)
     )
     _make(tmp_path, 1, 4, Counter())
-    with hold_lock(folder.staged_shard(NAME) / f"{sample_key(0)}.claim"):
+    with _claim(folder, 0):
         generation_run.wait_for_others(run, 0.0)
     assert f"{sample_key(0)}.claim: waiting for 0 s for process {os.getpid()} of" in caplog.text
 
@@ -168,17 +159,12 @@ def _somebody_quicker(
 def test_a_scene_that_somebody_made_before_the_claim_is_not_made_again(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
+    """And a shard that somebody packed before the claim has one packer."""
     made: Counter[int] = Counter()
+    packed: list[ShardEntry | None] = []
     _somebody_quicker(monkeypatch, f"{sample_key(0)}.claim", lambda: _make(tmp_path, 0, 1, made))
     _make(tmp_path, 0, 1, made)
     assert made == {0: 1}
-
-
-def test_a_shard_that_somebody_packed_before_the_claim_has_one_packer(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    made: Counter[int] = Counter()
-    packed: list[ShardEntry | None] = []
     _somebody_quicker(monkeypatch, "pack.claim", lambda: packed.append(_make(tmp_path, 0, 4, made)))
     packed.append(_make(tmp_path, 0, 4, made))
     assert [entry is not None for entry in packed] == [True, False]
@@ -266,10 +252,7 @@ def test_waiting_for_others_takes_few_looks_and_no_tasks(
 def test_a_range_leaves_to_others_what_they_are_at(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    def sleep(seconds: float) -> None:
-        raise AssertionError("nobody waits")
-
-    monkeypatch.setattr(generation_run.time, "sleep", sleep)
+    monkeypatch.setattr(generation_run.time, "sleep", None)  # nobody waits
     run, runner = _run(tmp_path, 8), Idle()
     ranged = dataclasses.replace(run, options=dataclasses.replace(run.options, shards="0:1"))
     pipeline.make_shards(ranged, runner, lambda run, outcome: None)

@@ -18,7 +18,7 @@ from storage.dataset.layout import DatasetFolder
 from storage.dataset.statistics import Statistics
 from storage.records.objects import Failure
 from storage.records.sample import Sample, sample_key
-from tests.pipeline.generation.test_dataset_writer import _build, _locked
+from tests.pipeline.generation.test_dataset_writer import LOCKED, _build
 from tests.scenes_by_hand import tiny_sample
 
 NO_OBJECTS = AcceptedObjects(
@@ -60,7 +60,7 @@ def without_rendering(
 
     def freeze(lock: ObjectLock, *more: Any) -> AcceptedObjects:
         if not lock.writer.manifest.objects_lock_sha256:
-            lock.writer.lock_objects([_locked()])
+            lock.writer.lock_objects([LOCKED])
         return dataclasses.replace(NO_OBJECTS, num_found=1)
 
     def make(split: str, scene: int, *more: Any) -> tuple[Sample, list[Failure]]:

@@ -56,6 +56,9 @@ BLIND = {
 }  # fmt: skip
 """Every view is good enough."""
 
+TOUCH = 1e-6
+"""Coordinates below 2 in float32: 1.2e-7 of rounding each, three to a height."""
+
 LOOK = SurfaceLook(
     diffuse_scale=1.0,
     diffuse_rgb=(0.1, 0.2, 0.3),

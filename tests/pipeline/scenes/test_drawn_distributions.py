@@ -152,12 +152,12 @@ CHOSEN = [index for index in range(74) if index == 0 or index % 37 > 3] + [38]
 """Half a turn: 37 values in two layouts each; of the slow subdivisions the two with the fewest."""
 
 
-LEFT_OUT = sorted(set(range(74)) - set(CHOSEN))
-
-
 @pytest.fixture(
     scope="module",
-    params=[CHOSEN, pytest.param(LEFT_OUT, marks=pytest.mark.slow("every"))],
+    params=[
+        CHOSEN,
+        pytest.param(sorted(set(range(74)) - set(CHOSEN)), marks=pytest.mark.slow("every")),
+    ],
     ids=["chosen", "left out"],
 )
 def indices(request: pytest.FixtureRequest) -> list[int]:

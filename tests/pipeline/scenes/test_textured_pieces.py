@@ -27,7 +27,6 @@ from pipeline.scenes.redrawn import with_new_lights
 from pipeline.scenes.shading_normals import flat_shaded
 from pipeline.scenes.source_materials import source_skins, with_source_emission
 from pipeline.scenes.triangle_budget import PooledAsset
-from scene_templates.families import DEFAULT_FAMILIES
 from scene_templates.layout import Emitter, Layout, ObjectPlacement, Pose, ShellPart
 from scene_templates.rooms import PATCH_FACES, SIDES, patch
 from scene_templates.rotations import rotate_points
@@ -59,12 +58,12 @@ from tests.pipeline.assets.source_materials.textured_kit import (
     textured_glb,
 )
 from tests.pipeline.scenes.small_pool import LOOK, first_scene, pooled, small_pool
-from tests.scene_templates.balls import STILL
+from tests.scene_templates.balls import DEFAULTS, STILL
 from tests.scene_templates.statistics import require_plausible, share
 from tests.textured_by_hand import bumps
 
 SMALL = SurfaceMapSettings(size=8)
-PLAIN = SceneSettings(families=DEFAULT_FAMILIES, num_views=1)
+PLAIN = dataclasses.replace(DEFAULTS, num_views=1)
 TEXTURED = dataclasses.replace(PLAIN, textures=TextureSettings(share=0.5, surfaces=SMALL))
 OWN = apply_overrides(PLAIN, {"materials.source": "object"})
 GLOWS = apply_overrides(OWN, {"materials.own_emission": 0.5})

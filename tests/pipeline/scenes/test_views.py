@@ -31,11 +31,10 @@ from pipeline.scenes.views import (
     visibility_problem,
     with_cameras,
 )
-from scene_templates.families import DEFAULT_FAMILIES
 from scene_templates.layout import Pose
 from scene_templates.rotations import rotation_xyz, uniform_rotation
 from scene_templates.sample_layout import scene_plan
-from scene_templates.settings import SceneSettings, ViewLaws
+from scene_templates.settings import ViewLaws
 from storage.conventions import camera_rays, look_at_c2w
 from storage.errors import Rejected
 from storage.records.material import DIFFUSE, EMISSION, SPECULAR
@@ -44,6 +43,7 @@ from storage.records.scene_facts import lights, surfaces
 from storage.seeds import SceneKey
 from storage.settings.overrides import apply_overrides
 from tests.pipeline.scenes.small_pool import (
+    TOUCH,
     first_scene,
     level,
     points_of,
@@ -52,12 +52,11 @@ from tests.pipeline.scenes.small_pool import (
     small_pool,
     triangles_of,
 )
+from tests.scene_templates.balls import DEFAULTS as SETTINGS
 from tests.scene_templates.balls import ROOMS
 from tests.scenes_by_hand import tiny_scene
 from tests.sky_maps import constant, one_sun
 from tests.textured_by_hand import sky, textured_scene
-
-SETTINGS = SceneSettings(families=DEFAULT_FAMILIES)
 
 
 def _slow_view(scene: Scene, view: int, grid: int) -> tuple[float, float, float]:
@@ -358,7 +357,7 @@ def test_a_cube_keeps_its_edges_and_a_sphere_becomes_round() -> None:
     assert np.sum(ball.normals * ball.positions, axis=1).min() > np.cos(np.radians(1))
 
 
-def test_groups_agree_with_those_of_trimesh() -> None:
+def test_groups_agree_with_those_of_trimesh_and_an_edge_of_three_faces_is_sharp() -> None:
     for positions, faces in _shapes():
         normals = face_normals(positions, faces)
         beside = trimesh.graph.face_adjacency(faces)
@@ -369,9 +368,7 @@ def test_groups_agree_with_those_of_trimesh() -> None:
             twin = trimesh.graph.connected_component_labels(joined, len(faces)).tolist()
             pairs = set(zip(groups, twin, strict=True))
             assert len(pairs) == len(set(twin)) == len(set(groups))
-
-
-def test_an_edge_of_three_faces_is_sharp() -> None:
+    # An edge of three faces is sharp.
     faces = np.array([[0, 1, 2], [1, 0, 3], [0, 1, 4]], np.uint32)
     normals = np.tile([0.0, 0.0, 1.0], (3, 1))
     assert len(set(shading_groups(faces, normals, 30.0).tolist())) == 3
@@ -504,10 +501,6 @@ def test_meshes_inside_and_beside_each_other_and_of_any_size() -> None:
         assert ball.overlaps(_at(0, radius=radius), ball, _at(radius + 0.17, radius=0.2))
 
 
-TOUCH = 1e-6
-"""Coordinates below 2 in float32: 1.2e-7 of rounding each, three to a height."""
-
-
 def _off_centre() -> NDArray[np.float32]:
     """A level that is not in the middle of its source: half of a ball is gone."""
     ball = trimesh.creation.icosphere(2)
@@ -551,9 +544,7 @@ def test_posing_is_a_similarity_that_fills_its_sphere() -> None:
 
 
 def test_slivers_go_and_all_else_stays() -> None:
-    mesh = trimesh.creation.icosphere(1)
-    positions = mesh.vertices.astype(np.float32)
-    faces = mesh.faces.astype(np.uint32)
+    positions, faces = _arrays(trimesh.creation.icosphere(1))
     middle = (positions[0] + positions[1]) / 2
     padded = np.concatenate([positions, [middle.astype(np.float32)]])
     sliver = np.array([[0, 1, 1], [0, 0, 0]], np.uint32)
