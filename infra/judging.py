@@ -32,7 +32,7 @@ from infra.render.quality import FixedSamples
 from model.inference import NeuralRenderer
 from model.open import find_network
 from model.weights import network_digest
-from pipeline.exchange.exports.scenes import picture_name
+from pipeline.exchange.exports.export import picture_name
 from pipeline.exchange.pictures import MAX_BYTES, decode_pixels
 from pipeline.renders.mitsuba_variant import choose_variant
 from pipeline.renders.preview import MOST_SPP

@@ -113,13 +113,6 @@ def _list_usd_pictures(target: Path) -> Sequence[Path]:
     return [target.parent / Path(name).name for name in sorted(names)]
 
 
-def _write_many_usd(target: Path, scenes: Iterable[tuple[str, Scene]]) -> None:
-    # names of USD variants must not contain the point or the minus of a time code
-    write_usd_shard(
-        target, ((key.replace(".", "_").replace("-", "m"), scene) for key, scene in scenes)
-    )
-
-
 def _read_json(source: SceneSource, pictures: bool) -> LoadedScene:
     root = source.path.parent.resolve()
     name = source.path.name
@@ -179,7 +172,7 @@ _READ_USD = SceneFormat(
 _USD = dataclasses.replace(
     _READ_USD,
     write=lambda target, scene, _: write_usd(target, scene),
-    write_many=_write_many_usd,
+    write_many=write_usd_shard,
     named_files=_list_usd_pictures,
     carried=scene_file.CARRIED,
 )

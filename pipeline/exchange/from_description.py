@@ -23,11 +23,12 @@ from typing import Annotated, Any, Literal
 import numpy as np
 from numpy.typing import NDArray
 
+from pipeline.exchange.textured_triangles import MAX_ROWS
 from pipeline.scenes.pieces import ScenePiece, concatenate_pieces
 from pipeline.scenes.shading_normals import ShadedMesh, flat_shaded, smooth_shaded, without_slivers
 from scene_templates.rotations import rotate_points, rotation_xyz
 from storage.conventions import look_at_c2w
-from storage.errors import TrilightError
+from storage.errors import TrilightError, prefix_errors
 from storage.records.material import DIFFUSE, EMISSION, ROUGHNESS, SPECULAR, default_rows
 from storage.records.scene import ALBEDO_SUM_TOLERANCE, ObjectKind, Scene, SceneObject
 from storage.settings.ranges import Within
@@ -127,12 +128,11 @@ SHELL_FOLDER = "templates/backgrounds/"
 """Folder of floors and walls in the published scene files."""
 
 SMOOTH_ANGLE_DEG = 30.0
-"""Smoothing angle of the published converter."""
+"""Smoothing angle of the published converter, and where a surface states no normals."""
 
 MAX_TRIANGLES = 1_000_000
 MAX_EMITTERS = 4096
-MAX_MATERIALS = 1 << 16
-"""Maximum numbers of triangles, emitting triangles and material rows in a scene."""
+"""Maximum numbers of triangles and emitting triangles in a scene."""
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -168,21 +168,19 @@ def scene_from_description(
     pieces: list[ScenePiece] = []
     scales: dict[str, float] = {}
     for described, mesh in zip(description.objects, meshes, strict=True):
-        try:
+        with prefix_errors(f"{description.file}: objects.{described.name}"):
             object_pieces, scale = _pieces(described, mesh, albedo_over_one)
-            pieces += object_pieces
-            if scale < 1:
-                scales[described.name] = round(scale, 6)
-        except TrilightError as error:
-            raise TrilightError(f"{description.file}: objects.{described.name}: {error}") from error
+        pieces += object_pieces
+        if scale < 1:
+            scales[described.name] = round(scale, 6)
     c2w, fov_deg = build_cameras(description.cameras[:num_views], description.file)
-    try:
+    with prefix_errors(description.file):
         emitters = sum(piece.entry.kind == "emitter" for piece in pieces)
         require_at_most(
             {
                 "triangles": (sum(len(piece.mesh.faces) for piece in pieces), MAX_TRIANGLES),
                 "emitting triangles": (emitters, MAX_EMITTERS),
-                "materials": (sum(len(piece.materials) for piece in pieces), MAX_MATERIALS),
+                "materials": (sum(len(piece.materials) for piece in pieces), MAX_ROWS),
             }
         )
         scene = Scene(
@@ -193,8 +191,6 @@ def scene_from_description(
             provenance={**provenance, "albedo_scale": scales} if scales else provenance,
         )
         scene.check()
-    except TrilightError as error:
-        raise TrilightError(f"{description.file}: {error}") from error
     return scene
 
 

@@ -16,14 +16,16 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from pipeline.exchange.linear_maps import (
+from pipeline.exchange.textured_triangles import (
+    NO_TEXTURES,
     Map,
+    TexturedTriangles,
+    TextureSet,
     color_textures,
     constant_map,
     number_texture,
     resample_to_largest,
 )
-from pipeline.exchange.textured_triangles import NO_TEXTURES, TexturedTriangles, TextureSet
 from pipeline.foreign.material import Slot, SourceMaterial, source_columns
 from pipeline.foreign.picture import Picture, Wrap, spread_points
 from storage.conventions import srgb8
@@ -187,8 +189,7 @@ def _columns(
     material: SourceMaterial, maps: Mapping[str, Map], tint: NDArray[np.float64]
 ) -> NDArray[np.float32]:
     """Return the columns [H, W, 7] of a material whose base is multiplied by a tint [., ., 3]."""
-    names = list(maps)
-    resampled = dict(zip(names, resample_to_largest(*maps.values()), strict=True)) if names else {}
+    resampled = dict(zip(maps, resample_to_largest(*maps.values()), strict=True))
     height, width = np.broadcast_shapes(
         tint.shape[:2], *(map_.shape[:2] for map_ in resampled.values())
     )

@@ -43,16 +43,24 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from pipeline.exchange.linear_maps import color_textures, number_texture
 from pipeline.exchange.safe_h5 import (
     iterate_blocks,
-    list_names,
     open_h5,
     plain_array,
     read_whole,
     require_finite,
 )
-from pipeline.exchange.textured_triangles import LoadedScene, index_corners
+from pipeline.exchange.textured_triangles import (
+    MAX_ROWS,
+    NO_TEXTURES,
+    LoadedScene,
+    add_textures,
+    color_textures,
+    index_corners,
+    number_texture,
+    used_textures,
+)
+from pipeline.objects.licences import UNKNOWN
 from storage.atomic import write_atomically
 from storage.errors import TrilightError
 from storage.records.environment import Environment
@@ -68,7 +76,6 @@ from storage.records.material import (
     default_rows,
     distinct_rows,
 )
-from storage.records.retextured import with_textures, without_constant_textures
 from storage.records.scene import (
     ALBEDO_SUM_TOLERANCE,
     UNIT_NORMAL_TOLERANCE,
@@ -76,10 +83,13 @@ from storage.records.scene import (
     Scene,
     SceneObject,
 )
-from storage.records.texture import CONSTANT, TEXTURED, MapSource, Texture
+from storage.records.texture import CONSTANT, MapSource, Texture
 
 CHANNELS = 13
+CELLS = 32
 """A texture has CHANNELS channels of CELLS x CELLS cells."""
+FILLED_CELLS = np.add.outer(np.arange(CELLS), np.arange(CELLS)) <= CELLS
+"""Mask [32, 32] of the cells that hold a texture: those with x + y <= 32."""
 _NORMAL = slice(7, 10)
 _EMISSION = slice(10, 13)
 """Channels of a texture row; those before them are REFLECTING (storage.records.material)."""
@@ -155,11 +165,10 @@ def _write_texture(file: Any, rows: NDArray[np.float32], scene: Scene) -> None:
     texture = file.create_dataset(
         "texture", shape, rows.dtype, compression="gzip", compression_opts=GZIP_LEVEL
     )
-    filled = filled_cell_mask()
     step = texture.chunks[0]
     for start in range(0, len(rows), step):
         block = rows[start : start + step, :, None, None]
-        cells = np.where(filled, block, rows.dtype.type(0))
+        cells = np.where(FILLED_CELLS, block, rows.dtype.type(0))
         for triangle in start + np.flatnonzero(textured[start : start + step]):
             for part, values in compute_cells(scene, int(triangle)):
                 cells[triangle - start, part] = values
@@ -181,12 +190,6 @@ MAX_TRIANGLES = 1_000_000
 MAX_VIEWS = 1000
 MAX_PICTURE_BYTES = 1 << 30
 """Maximum bytes of all pictures of a file as float32."""
-MAX_PALETTE = 1 << 16
-"""Maximum number of material rows and of objects: `Scene` counts them in 16 bits."""
-
-UNKNOWN_LICENCE = "LicenseRef-unknown"
-"""Licence of everything that is read, since the file states no rights."""
-
 _GREY = (0.5, 0.5, 0.5, 0, 0, 0, 1)
 """What the reflecting channels of a surface of the successor become."""
 _SECOND_VERSION = ("env_map", "env_map_rotation", "env_map_strength", "light_strength")
@@ -208,7 +211,7 @@ def read_renderformer_h5(path: Path, *, pictures: bool = True) -> LoadedScene:
     """
     lost: list[str] = []
     with open_h5(path) as file:
-        second = "light_strength" in list_names(file)
+        second = "light_strength" in sorted(file)
         lost += _list_unknown(file, (*_KNOWN, *(_SECOND_VERSION if second else ())))
         triangles = read_whole(file, "triangles", (None, 3, 3), MAX_TRIANGLES)
         count = len(triangles)
@@ -217,7 +220,7 @@ def read_renderformer_h5(path: Path, *, pictures: bool = True) -> LoadedScene:
         sky = _read_sky(file, lost) if second else None
         c2w = read_whole(file, "c2w", (None, 4, 4), MAX_VIEWS)
         fov_deg = read_whole(file, "fov", (len(c2w),), MAX_VIEWS)
-        radiance_rgb = _pictures(file, len(c2w), lost) if "img" in list_names(file) else None
+        radiance_rgb = _pictures(file, len(c2w), lost) if "img" in sorted(file) else None
         positions, normals, faces = index_corners(triangles, _normalize(triangles, normals, lost))
         scene = Scene(
             vertex_positions=positions,
@@ -238,7 +241,7 @@ def read_renderformer_h5(path: Path, *, pictures: bool = True) -> LoadedScene:
 
 
 def _list_unknown(file: Any, known: Sequence[str]) -> list[str]:
-    names = [f"array or group {name!r:.60}" for name in list_names(file) if name not in known]
+    names = [f"array or group {name!r:.60}" for name in sorted(file) if name not in known]
     names += [f"attribute {name!r:.60}" for name in sorted(file.attrs)]
     return names if len(names) <= 10 else [*names[:10], f"and {len(names) - 10} more"]
 
@@ -284,10 +287,10 @@ def _palette(
     _limit_rounded_albedos(materials, lost)
     order = np.where(emits, np.cumsum(emits), -1.0 * varies)  # equal emitters keep separate rows
     first, index = distinct_rows(np.column_stack([materials, order.astype(np.float32)]))
-    if len(first) > MAX_PALETTE or emits.sum() >= MAX_PALETTE:
+    if len(first) > MAX_ROWS or emits.sum() >= MAX_ROWS:
         raise TrilightError(
             f"texture: {len(first)} materials and {emits.sum()} emitters; expected at most "
-            f"{MAX_PALETTE} of each."
+            f"{MAX_ROWS} of each."
         )
     kinds: dict[str, ObjectKind] = {} if emits.all() else {"surfaces": "object"}
     first_emitter = len(kinds)
@@ -297,8 +300,7 @@ def _palette(
         "material_index": index.astype(np.uint16),
         "object_index": (np.where(emits, order - 1 + first_emitter, 0)).astype(np.uint16),
         "objects": tuple(
-            SceneObject(name=name, kind=kind, licence=UNKNOWN_LICENCE)
-            for name, kind in kinds.items()
+            SceneObject(name=name, kind=kind, licence=UNKNOWN) for name, kind in kinds.items()
         ),
     }
 
@@ -322,13 +324,12 @@ def _read_rows(
     One block of cells is in memory at a time.
     """
     texture = plain_array(file, "texture", (count, CHANNELS, CELLS, CELLS), MAX_TRIANGLES)
-    filled = filled_cell_mask()
     low = np.full((count, CHANNELS), np.inf, np.float32)
     high = -low
     total = np.zeros((count, CHANNELS))
     for where, block in iterate_blocks(texture):
         rows = where[:2]
-        cells = filled[where[2:]]
+        cells = FILLED_CELLS[where[2:]]
         if cells.any():
             require_finite(texture, block[:, :, cells])
             values = block[:, :, cells].astype(np.float32)
@@ -347,7 +348,7 @@ def _read_rows(
     bumpy = (low[:, _NORMAL] != np.array(_FLAT_NORMAL, np.float32)).any(axis=1)
     if bumpy.any():
         lost.append(f"normal textures of {bumpy.sum()} triangles")
-    mean = (total / filled.sum()).astype(np.float32)
+    mean = (total / FILLED_CELLS.sum()).astype(np.float32)
     return np.where(differs, mean, low), varies
 
 
@@ -364,16 +365,12 @@ def _read_cells(file: Any, varies: NDArray[np.bool_]) -> NDArray[np.float32]:
 
 def _with_cells(scene: Scene, cells: NDArray[np.float32], varies: NDArray[np.bool_]) -> Scene:
     """Return a scene with the textures of its cells; varying triangles share a material."""
-    source = MapSource(name="cells of triangles", licence=UNKNOWN_LICENCE)
+    source = MapSource(name="cells of triangles", licence=UNKNOWN)
     maps, corner_uv = build_atlas(cells, source)
     uv = np.zeros((scene.num_triangles, 3, 2), np.float32)
     uv[varies] = corner_uv
-    index = np.full((len(scene.materials), len(TEXTURED)), CONSTANT, np.int32)
-    textures = {texture.sha256: texture for texture in maps}
-    used = np.unique(scene.material_index[varies])
-    index[used] = [list(textures).index(texture.sha256) for texture in maps]
-    scene = with_textures(scene, uv.reshape(-1, 2), tuple(textures.values()), index)
-    return without_constant_textures(scene)
+    used = np.isin(np.arange(len(scene.materials)), scene.material_index[varies])
+    return add_textures(scene, uv, [maps if is_used else NO_TEXTURES for is_used in used])
 
 
 def _read_grey_rows(
@@ -396,7 +393,7 @@ def _read_sky(file: Any, lost: list[str]) -> Environment | None:
     Raises:
         TrilightError: the map is unusable (`plain_array`) or of another shape.
     """
-    if "env_map" not in list_names(file):
+    if "env_map" not in sorted(file):
         return None
     values = read_whole(file, "env_map", (None, None, None), MAX_RESOLUTION)
     if values.shape[0] == 3:  # a processed map, which is already rotated and scaled
@@ -414,13 +411,13 @@ def _read_sky(file: Any, lost: list[str]) -> Environment | None:
         return None  # a black map stands for no environment
     return Environment(
         radiance_rgb=np.ascontiguousarray(radiance, np.float32),
-        source=MapSource(name="env_map", licence=UNKNOWN_LICENCE),
+        source=MapSource(name="env_map", licence=UNKNOWN),
     )
 
 
 def _read_small(file: Any, name: str) -> NDArray[np.float32]:
     """Read a small array of a file; empty where the file lacks it."""
-    if name not in list_names(file):
+    if name not in sorted(file):
         return np.zeros(0, np.float32)
     try:
         return read_whole(file, name, (), 1)
@@ -428,22 +425,12 @@ def _read_small(file: Any, name: str) -> NDArray[np.float32]:
         return read_whole(file, name, (None,), 16)
 
 
-CELLS = 32
-REFLECTED = 7
-"""Number of channels that a material may have textured: two colors and a roughness."""
-
 MAX_VARYING = 8192
 """Maximum number of triangles whose cells become an atlas; each takes 28 kB meanwhile."""
 
 _BORDER = 1
 _TILE = CELLS + 2 * _BORDER
 _MOST_STEPS = 16  # maximum number of samples along the side of a cell
-
-
-def filled_cell_mask() -> NDArray[np.bool_]:
-    """Return a mask [32, 32] of the cells that hold a texture: those with x + y <= 32."""
-    x, y = np.meshgrid(np.arange(CELLS), np.arange(CELLS))
-    return x + y <= CELLS
 
 
 def textured_triangles(scene: Scene) -> NDArray[np.bool_]:
@@ -456,14 +443,13 @@ def textured_triangles(scene: Scene) -> NDArray[np.bool_]:
 
 def compute_cells(scene: Scene, triangle: int) -> list[tuple[slice, NDArray[np.float32]]]:
     """Return the channels and cells [C, 32, 32] of each textured column of a triangle."""
-    assert scene.material_textures is not None and scene.uv is not None
-    index = scene.material_textures[scene.material_index[triangle]]
+    assert scene.uv is not None
     uv = scene.uv.reshape(-1, 3, 2)[triangle].astype(np.float64)
-    places = column_places()
+    used = used_textures(scene, scene.material_index[triangle])
     return [
-        (places[name], _compute_means(scene.textures[row], uv))
-        for name, row in zip(TEXTURED, index, strict=True)
-        if row != CONSTANT
+        (part, _compute_means(used[name][1], uv))
+        for name, part in column_places().items()
+        if name in used
     ]
 
 
@@ -476,18 +462,16 @@ def _compute_means(texture: Texture, uv: NDArray[np.float64]) -> NDArray[np.floa
     edges = (uv[:2] - uv[2]) * [width, height] / CELLS  # in texels, along a cell
     steps = int(np.clip(np.ceil(np.abs(edges).max()), 2, _MOST_STEPS))
     offsets = (np.arange(steps) + 0.5) / steps
+    y, x = np.nonzero(FILLED_CELLS)
+    one = (x[:, None, None] + offsets) / CELLS
+    two = (y[:, None, None] + offsets[:, None]) / CELLS
+    weights = np.stack(np.broadcast_arrays(one, two, 1 - one - two), axis=-1)
+    values = texture_values(texture, np.einsum("csuk,kd->csud", weights, uv))
+    inside = weights[..., 2] >= -1e-9
+    inside |= ~inside.any((1, 2), keepdims=True)
+    total = np.einsum("csu,csuk->ck", inside.astype(np.float64), values)
     means = np.zeros((texture.channels, CELLS, CELLS), np.float32)
-    x, y = np.meshgrid(np.arange(CELLS), np.arange(CELLS))
-    for row in range(CELLS):  # one row of cells at a time: 131 k samples at most
-        columns = x[row][filled_cell_mask()[row]]
-        one = (columns[:, None, None] + offsets[None, None, :]) / CELLS
-        two = (y[row][: len(columns), None, None] + offsets[None, :, None]) / CELLS
-        one, two = np.broadcast_arrays(one, two)
-        weights = np.stack([one, two, 1 - one - two], axis=-1)
-        values = texture_values(texture, np.einsum("csuk,kd->csud", weights, uv))
-        inside = (weights[..., 2] >= -1e-9) | ~(weights[..., 2] >= -1e-9).any((1, 2), keepdims=True)
-        total = np.einsum("csu,csuk->ck", inside.astype(np.float64), values)
-        means[:, row, : len(columns)] = (total / inside.sum(axis=(1, 2))[:, None]).T
+    means[:, y, x] = (total / inside.sum(axis=(1, 2))[:, None]).T
     return means
 
 
@@ -501,16 +485,16 @@ def build_atlas(
     The diffuse albedo is lowered where both add up to more than 1. Cells that no look-up reaches
     get the mean of the others, so that a texture's mean is that of its triangles.
     """
-    count = len(cells)
+    count, channels = cells.shape[:2]
     across = int(np.ceil(np.sqrt(count)))
     up = -(-count // across)
     inner = np.moveaxis(np.clip(cells, 0, 1), 1, -1)
-    means = inner[:, filled_cell_mask()].mean(axis=1)
-    inner = np.where(filled_cell_mask()[..., None], inner, means[:, None, None])
-    tiles = np.zeros((across * up, _TILE, _TILE, REFLECTED), np.float32) + means.mean(axis=0)
+    means = inner[:, FILLED_CELLS].mean(axis=1)
+    inner = np.where(FILLED_CELLS[..., None], inner, means[:, None, None])
+    tiles = np.zeros((across * up, _TILE, _TILE, channels), np.float32) + means.mean(axis=0)
     tiles[:count] = np.pad(inner, ((0, 0), (_BORDER, _BORDER), (_BORDER, _BORDER), (0, 0)), "edge")
-    sheet = tiles.reshape(up, across, _TILE, _TILE, REFLECTED).swapaxes(1, 2)
-    sheet = sheet.reshape(up * _TILE, across * _TILE, REFLECTED)
+    sheet = tiles.reshape(up, across, _TILE, _TILE, channels).swapaxes(1, 2)
+    sheet = sheet.reshape(up * _TILE, across * _TILE, channels)
     colors = color_textures(sheet[..., DIFFUSE], sheet[..., SPECULAR], source)
     roughness = number_texture(sheet[..., ROUGHNESS : ROUGHNESS + 1], source)
     row, column = np.divmod(np.arange(count), across)

@@ -53,11 +53,6 @@ def open_h5(path: Path) -> Iterator[Any]:
         raise TrilightError(f"{path.name}: not a readable HDF5 file.") from error
 
 
-def list_names(group: Any) -> list[str]:
-    """Return the sorted names of a group; no link is followed."""
-    return sorted(group)
-
-
 def plain_array(group: Any, name: str, shape: Sequence[int | None], longest: int) -> Any:
     """Return an h5py dataset, unread: little-endian floats that the file itself holds.
 
@@ -69,7 +64,7 @@ def plain_array(group: Any, name: str, shape: Sequence[int | None], longest: int
     import h5py
     from h5py import h5t
 
-    if name not in list_names(group):
+    if name not in sorted(group):  # follows no link
         raise TrilightError(f"{name}: missing; expected an array {_format_shape(shape)}.")
     if not isinstance(group.get(name, getlink=True), h5py.HardLink):
         raise TrilightError(f"{name}: is a link; expected an array in the file itself.")

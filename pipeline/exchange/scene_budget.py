@@ -9,6 +9,7 @@ import dataclasses
 import numpy as np
 from numpy.typing import NDArray
 
+from pipeline.exchange.from_description import SMOOTH_ANGLE_DEG
 from pipeline.foreign.mesh import TriangleMesh
 from pipeline.scenes.pieces import ScenePiece, concatenate_pieces
 from pipeline.scenes.shading_normals import (
@@ -26,7 +27,6 @@ LEAST = 4
 """Minimum number of triangles of a reduced object."""
 
 _LOST = "textures became their means: reduced triangles have no texture coordinates"
-_SMOOTH_ANGLE_DEG = 30.0
 _FLAT = 1e-3
 
 
@@ -95,7 +95,7 @@ def _reduce_piece(piece: ScenePiece, count: int) -> ScenePiece:
     flat = face_normals(old.positions, old.faces)[:, None]
     smooth = bool((np.abs(old.normals[old.faces] - flat) > _FLAT).any())
     mesh = (
-        smooth_shaded(positions, faces, _SMOOTH_ANGLE_DEG)
+        smooth_shaded(positions, faces, SMOOTH_ANGLE_DEG)
         if smooth
         else flat_shaded(positions, faces)
     )

@@ -7,7 +7,7 @@ number: that scene is rejected, and a row of failures.jsonl states the reason.
 """
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 
 import numpy as np
@@ -34,16 +34,45 @@ TEMPLATE = "renderformer-json"
 
 @dataclass(frozen=True, kw_only=True)
 class SceneFiles:
-    """Files and options from which a render child builds any scene of the folder."""
+    """Scene files of one folder, from which a render child builds any scene."""
 
-    root: Path  # the folder, with links resolved
-    names: tuple[str, ...]  # scene files; the position is the scene index
-    sha256: Mapping[str, str]  # digest of every locked file by its path below `root`
+    root: Path  # the folder, with links resolved; nothing outside it is read
+    names: tuple[str, ...]
+    """Names of all scene files, sorted; the position is the scene index, usable or not."""
     unusable: Mapping[str, str]
     """Reason why no scene can be made of a file, by the name of each such file."""
-    licence: str  # licence of every object
+    num_cameras: Mapping[str, int] = field(default_factory=dict)  # by the name of each usable file
     albedo_over_one: AlbedoOverOne = "scale"  # treatment of albedos over 1
-    notes: tuple[str, ...] = ()  # sentences about the built scenes
+    notes: tuple[str, ...] = ()  # sentences about unknown fields, and about the built scenes
+    sha256: Mapping[str, str] = field(default_factory=dict)
+    """Digest of every locked file by its path below `root`; empty before they are locked."""
+    licence: str = ""  # licence of every object
+
+    def views(self, num_views: int | None) -> int:
+        """Return the number of views of each scene: `num_views`, or the fewest cameras of a file.
+
+        Cameras come from the files alone; none is added.
+
+        Raises:
+            TrilightError: a file has fewer cameras than `num_views`.
+        """
+        file, fewest = min(self.num_cameras.items(), key=lambda item: item[1])
+        if num_views is None:
+            return fewest
+        if not 1 <= num_views <= fewest:
+            raise TrilightError(
+                f"--views is {num_views}; expected 1 to {fewest}, the number of cameras in {file}: "
+                "choose fewer views, or add cameras to the file."
+            )
+        return num_views
+
+    def unused_camera_notes(self, num_views: int) -> tuple[str, ...]:
+        """Return a sentence for each file with more cameras than are used."""
+        return tuple(
+            f"{name}: {count - num_views} of {count} cameras not used, from cameras[{num_views}] on"
+            for name, count in self.num_cameras.items()
+            if count > num_views
+        )
 
     def scene(self, scene_index: int, assets: AssetSettings, num_views: int, seed: int) -> Scene:
         """Build the scene of the file `names[scene_index]`; only child processes call this.
@@ -231,51 +260,7 @@ MAX_SCENES = 100_000
 """Maximum number of scene files in a folder."""
 
 
-@dataclass(frozen=True, kw_only=True)
-class SceneFolder:
-    """The scene files of one folder."""
-
-    root: Path  # the folder, with links resolved; nothing outside it is read
-    names: tuple[str, ...]
-    """Names of all scene files, sorted; the position is the scene index, usable or not."""
-    descriptions: tuple[SceneDescription, ...]  # of the usable files, in the same order
-    unusable: Mapping[str, str]  # reason for each other file, by its name
-    albedo_over_one: AlbedoOverOne  # treatment of albedos over 1
-
-    def views(self, num_views: int | None) -> int:
-        """Return the number of views of each scene: `num_views`, or the fewest cameras of a file.
-
-        Cameras come from the files alone; none is added.
-
-        Raises:
-            TrilightError: a file has fewer cameras than `num_views`.
-        """
-        fewest = min(self.descriptions, key=lambda description: len(description.cameras))
-        if num_views is None:
-            return len(fewest.cameras)
-        if not 1 <= num_views <= len(fewest.cameras):
-            raise TrilightError(
-                f"--views is {num_views}; expected 1 to {len(fewest.cameras)}, the number of "
-                f"cameras in {fewest.file}: choose fewer views, or add cameras to the file."
-            )
-        return num_views
-
-    def notes(self, num_views: int) -> tuple[str, ...]:
-        """Return a sentence for each unknown field and each file with unused cameras."""
-        notes = []
-        for description in self.descriptions:
-            notes += [
-                f"{description.file}: unknown field {name}" for name in description.unknown_fields
-            ]
-            if (unused := len(description.cameras) - num_views) > 0:
-                notes.append(
-                    f"{description.file}: {unused} of {len(description.cameras)} cameras not used, "
-                    f"from cameras[{num_views}] on"
-                )
-        return tuple(notes)
-
-
-def find_scene_files(folder: str, albedo_over_one: AlbedoOverOne = "scale") -> SceneFolder:
+def find_scene_files(folder: str, albedo_over_one: AlbedoOverOne = "scale") -> SceneFiles:
     """Read every `*.json` of a local folder, without its subfolders.
 
     Raises:
@@ -295,22 +280,27 @@ def find_scene_files(folder: str, albedo_over_one: AlbedoOverOne = "scale") -> S
             raise TrilightError(
                 f"--scenes-from {folder}: rename {name!r}; expected printable text."
             )
-    descriptions = []
+    num_cameras = {}
     unusable = {}
+    notes = list[str]()
     for name in names:
         try:
-            descriptions.append(read_scene_description(root, name))
+            description = read_scene_description(root, name)
         except EnvironmentFailure:
             raise
         except TrilightError as mistake:
             unusable[name] = str(mistake)
+            continue
+        num_cameras[name] = len(description.cameras)
+        notes += (f"{name}: unknown field {each}" for each in description.unknown_fields)
     require_usable(names, unusable)
-    return SceneFolder(
+    return SceneFiles(
         root=root,
         names=tuple(names),
-        descriptions=tuple(descriptions),
         unusable=unusable,
+        num_cameras=num_cameras,
         albedo_over_one=albedo_over_one,
+        notes=tuple(notes),
     )
 
 

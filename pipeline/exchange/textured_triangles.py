@@ -1,7 +1,8 @@
 """Joins triangles with materials and textures, and cameras, of other programs to a Scene.
 
 Each triangle has three separate corners. Corners of equal position and normal become one vertex,
-and equal materials one row. Textures of one color become constants. `LoadedScene` is what every
+and equal materials one row. Textures are computed per texel, as maps of linear values; those of one
+color become constants. `LoadedScene` is what every
 reader of a scene format returns.
 """
 
@@ -12,22 +13,32 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 
 from pipeline.scenes.pieces import ScenePiece, concatenate_pieces
 from pipeline.scenes.shading_normals import ShadedMesh, flat_shaded
-from storage.conventions import look_at_c2w
+from storage.conventions import linear_from_srgb8, look_at_c2w, srgb8
 from storage.errors import TrilightError
 from storage.records.environment import Environment
-from storage.records.material import (
-    EMISSION,
-    ROUGHNESS,
-    default_rows,
-    distinct_rows,
-)
+from storage.records.lookup import texture_values
+from storage.records.material import EMISSION, ROUGHNESS, default_rows, distinct_rows
 from storage.records.retextured import with_textures, without_constant_textures
 from storage.records.scene import ObjectKind, Scene, SceneObject
-from storage.records.texture import CONSTANT, TEXTURED, Texture
+from storage.records.texture import CONSTANT, NORMAL, TEXTURED, MapSource, Texture
+
+Map = NDArray[np.float32]
+"""Linear values [H, W, C] of a texture, the bottom row first; a constant is one texel.
+
+numpy broadcasts constants. Where two maps are combined, the smaller one is interpolated at the
+texels of the larger one. The resulting textures have 8 bits, as their sources have: float32 would
+take four times the memory for digits that no source states.
+"""
+
+_MAP_ROWS = 256
+"""Number of rows of a map that are interpolated at a time."""
+
+EXCESS = 1e-6
+"""Tolerance for the rounding of two float32 albedos that add up to 1."""
 
 Pictures = NDArray[np.float32] | None
 """[V, R, R, 3] linear radiance of all views, or None."""
@@ -260,22 +271,25 @@ class SceneParts:
             provenance=provenance,
             environment=sky,
         )
-        scene = self._with_textures(scene)
+        scene = add_textures(scene, np.concatenate(self._uv), self._texture_sets)
         scene.check()
         return scene
 
-    def _with_textures(self, scene: Scene) -> Scene:
-        sets = self._texture_sets
-        textures: dict[str, Texture] = {}
-        for texture in (texture for texture_set in sets for texture in texture_set if texture):
-            textures.setdefault(texture.sha256, texture)
-        if not textures:
-            return scene
-        order = {sha256: row for row, sha256 in enumerate(textures)}
-        index = [[order[each.sha256] if each else CONSTANT for each in row] for row in sets]
-        uv = np.concatenate(self._uv).reshape(-1, 2).astype(np.float32)
-        rows = np.array(index, np.int32).reshape(-1, len(TEXTURED))
-        return without_constant_textures(with_textures(scene, uv, tuple(textures.values()), rows))
+
+def add_textures(
+    scene: Scene, uv: NDArray[np.floating], texture_sets: Sequence[TextureSet]
+) -> Scene:
+    """Return a scene with textures for each material, and coordinates [T, 3, 2] of the corners."""
+    textures: dict[str, Texture] = {}
+    for texture in (each for texture_set in texture_sets for each in texture_set if each):
+        textures.setdefault(texture.sha256, texture)
+    if not textures:
+        return scene
+    order = {sha256: row for row, sha256 in enumerate(textures)}
+    index = [[order[each.sha256] if each else CONSTANT for each in row] for row in texture_sets]
+    corners = uv.reshape(-1, 2).astype(np.float32)
+    rows = np.array(index, np.int32)
+    return without_constant_textures(with_textures(scene, corners, tuple(textures.values()), rows))
 
 
 def unique_name(base: str, counts: dict[str, int], key: Callable[[str], str] = str) -> str:
@@ -288,3 +302,82 @@ def unique_name(base: str, counts: dict[str, int], key: Callable[[str], str] = s
     counts[key(base)] = count
     counts.setdefault(key(name), 1)
     return name
+
+
+def constant_map(value: ArrayLike) -> Map:
+    """Return a number or a color as a map of one texel."""
+    return np.atleast_1d(np.asarray(value, np.float32)).reshape(1, 1, -1)
+
+
+def linear_map(texture: Texture) -> Map:
+    """Return the linear values of a texture."""
+    return texture.linear(texture.texels)
+
+
+def used_textures(scene: Scene, material: int) -> dict[str, tuple[int, Texture]]:
+    """Return row and texture of each textured column of a material, and of its normal map."""
+    if scene.material_textures is None:
+        return {}
+    normal = CONSTANT if scene.normal_textures is None else int(scene.normal_textures[material])
+    index = [*scene.material_textures[material].tolist(), normal]
+    return {
+        name: (row, scene.textures[row])
+        for name, row in zip((*TEXTURED, NORMAL), index, strict=True)
+        if row != CONSTANT
+    }
+
+
+def is_constant(values: Map) -> bool:
+    """Return whether a map has one texel."""
+    return values.shape[:2] == (1, 1)
+
+
+def resample_to_largest(*maps: Map) -> tuple[Map, ...]:
+    """Resample all maps but constants to the size of the largest in each direction."""
+    sizes = [values.shape[:2] for values in maps if not is_constant(values)]
+    if len(set(sizes)) < 2:
+        return maps
+    height, width = (max(size[axis] for size in sizes) for axis in range(2))
+    return tuple(
+        values if is_constant(values) else resample_map(values, height, width) for values in maps
+    )
+
+
+def resample_map(values: Map, height: int, width: int) -> Map:
+    """Interpolate a map at the texel centers of another size, as texture look-ups do."""
+    if values.shape[:2] == (height, width):
+        return values
+    texture = Texture(texels=values)
+    u, v = ((np.arange(count) + 0.5) / count for count in (width, height))
+    resampled = np.zeros((height, width, values.shape[2]), np.float32)
+    for first in range(0, height, _MAP_ROWS):
+        uv = np.stack(np.meshgrid(u, v[first : first + _MAP_ROWS]), axis=-1)
+        resampled[first : first + _MAP_ROWS] = texture_values(texture, uv)
+    return resampled
+
+
+def number_texture(values: Map, source: MapSource) -> Texture:
+    """Return a linear texture of numbers in [0, 1], in 8 bits unless it is a constant."""
+    if is_constant(values):
+        return Texture(texels=values, source=source)
+    return Texture(texels=np.round(values * 255).astype(np.uint8), source=source)
+
+
+def color_textures(diffuse: Map, specular: Map, source: MapSource) -> tuple[Texture, Texture]:
+    """Return textures of two albedos whose sum is at most 1 at every look-up.
+
+    The diffuse one is lowered where they would add up to more.
+    """
+    diffuse, specular = resample_to_largest(diffuse, specular)
+    glossy = Texture(texels=specular, source=source)
+    if not is_constant(specular):
+        glossy = Texture(texels=srgb8(specular), is_srgb=True, source=source)
+    room = 1 - linear_map(glossy)
+    if is_constant(diffuse) and (diffuse <= room.min(axis=(0, 1)) + EXCESS).all():
+        return Texture(texels=diffuse, source=source), glossy
+    if is_constant(room) and is_constant(diffuse):
+        return Texture(texels=np.minimum(diffuse, room), source=source), glossy
+    limited = np.minimum(diffuse, room)
+    codes = srgb8(limited)
+    over = linear_from_srgb8()[codes] > room  # by rounding
+    return Texture(texels=codes - over.astype(np.uint8), is_srgb=True, source=source), glossy

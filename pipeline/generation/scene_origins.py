@@ -16,7 +16,7 @@ import numpy as np
 
 from pipeline.assets.settings import AssetSettings
 from pipeline.exchange.from_description import AlbedoOverOne, scaled_albedo_notes
-from pipeline.exchange.scene_files import SceneFiles, SceneFolder, build_scene, require_usable
+from pipeline.exchange.scene_files import SceneFiles, build_scene, require_usable
 from pipeline.generation.dataset_writer import DatasetWriter
 from pipeline.generation.frozen_pool import ComposedScenes, require_same
 from pipeline.generation.prepare_isolated import asset_child
@@ -226,7 +226,7 @@ def _accept_objects(source: FinishedDataset, writer: DatasetWriter) -> AcceptedO
 
 
 def settings_for_files(
-    settings: DatasetSettings, folder: SceneFolder, views: int | None
+    settings: DatasetSettings, folder: SceneFiles, views: int | None
 ) -> DatasetSettings:
     """Return the preset's settings with the number of scenes and views of a folder.
 
@@ -243,7 +243,7 @@ def settings_for_files(
 
 
 def accept_scene_files(
-    folder: SceneFolder,
+    folder: SceneFiles,
     licence: str | None,
     settings: DatasetSettings,
     writer: DatasetWriter,
@@ -286,7 +286,7 @@ def accept_scene_files(
 
 
 def _build_all(
-    folder: SceneFolder, licence: str, settings: DatasetSettings, out: DatasetFolder
+    folder: SceneFiles, licence: str, settings: DatasetSettings, out: DatasetFolder
 ) -> SceneFiles:
     """Build every scene; return digests of the usable files, and errors of the others."""
     announce_objects(out, len(folder.names))
@@ -308,14 +308,9 @@ def _build_all(
             count_object(out)
     require_usable(folder.names, unusable)
     left_out = (f"{name} is left out: {why.rstrip('.')}" for name, why in unusable.items())
-    return SceneFiles(
-        root=folder.root,
-        names=folder.names,
-        sha256=sha256,
-        unusable=unusable,
-        licence=licence,
-        albedo_over_one=folder.albedo_over_one,
-        notes=(*notes, *left_out, *folder.notes(num_views)),
+    notes += (*left_out, *folder.notes, *folder.unused_camera_notes(num_views))
+    return dataclasses.replace(
+        folder, sha256=sha256, unusable=unusable, licence=licence, notes=tuple(notes)
     )
 
 
@@ -343,7 +338,7 @@ def build_once(
 
 
 def _build_in_child(
-    child: IsolatedChild, folder: SceneFolder, name: str, settings: DatasetSettings
+    child: IsolatedChild, folder: SceneFiles, name: str, settings: DatasetSettings
 ) -> tuple[Mapping[str, str], tuple[str, ...]]:
     """Build a scene in a child; raises TrilightError, or EnvironmentFailure for the machine."""
     arguments = (settings.assets, settings.scenes.num_views, folder.albedo_over_one)

@@ -24,8 +24,7 @@ from infra.judging import (
 from infra.render.methods import DIRECT_LIGHT, TRACED_LIGHT
 from infra.render.networks import NetworkRenderer
 from model.open import save_published
-from pipeline.exchange.exports.export import export_dataset
-from pipeline.exchange.exports.scenes import picture_name
+from pipeline.exchange.exports.export import export_dataset, picture_name
 from storage.errors import TrilightError, Unrenderable
 from storage.records.exr import encode_channels
 from storage.renderer import Renderer

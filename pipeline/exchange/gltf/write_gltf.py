@@ -17,19 +17,20 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pipeline.documents.png import encode_png
-from pipeline.exchange.linear_maps import (
+from pipeline.exchange.textured_triangles import (
     Map,
     constant_map,
+    group_triangles,
     is_constant,
     linear_map,
     resample_to_largest,
+    used_textures,
 )
-from pipeline.exchange.textured_triangles import group_triangles
 from storage.atomic import write_atomically
 from storage.conventions import srgb8
 from storage.records.material import EMISSION, column_places
 from storage.records.scene import Scene
-from storage.records.texture import CONSTANT, NORMAL, TEXTURED, Texture
+from storage.records.texture import NORMAL, TEXTURED, Texture
 
 _TO_Y_UP = (-(0.5**0.5), 0.0, 0.0, 0.5**0.5)
 """Quaternion of the root node, which rotates +Z up to the +Y up of glTF."""
@@ -199,13 +200,8 @@ def _maps(scene: Scene, row: int) -> Mapping[str, Map]:
     """Return the map of each column of a material that may be textured, and its normal map."""
     places = column_places()
     maps = {name: constant_map(scene.materials[row, places[name]]) for name in TEXTURED}
-    if scene.material_textures is not None:
-        for name, texture in zip(TEXTURED, scene.material_textures[row], strict=True):
-            if texture >= 0:
-                maps[name] = linear_map(scene.textures[texture])
-    if scene.normal_textures is not None and scene.normal_textures[row] != CONSTANT:
-        maps[NORMAL] = linear_map(scene.textures[scene.normal_textures[row]])
-    return maps
+    used = used_textures(scene, row)
+    return maps | {name: linear_map(texture) for name, (_, texture) in used.items()}
 
 
 class GlbFile:

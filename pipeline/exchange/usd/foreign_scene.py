@@ -13,6 +13,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from pipeline.exchange.from_description import SMOOTH_ANGLE_DEG
 from pipeline.exchange.part_materials import Part, PartConverter, drop_empty, unit_normals
 from pipeline.exchange.pictures import decode_values
 from pipeline.exchange.textured_triangles import (
@@ -57,9 +58,6 @@ _MOST_NOTED = 2
 
 _SAME_LENS = 1e-5
 """Relative tolerance for a lens that Trilight wrote."""
-
-SMOOTH_ANGLE_DEG = 30.0
-"""Maximum angle of a smooth edge where a subdivision surface states no normals."""
 
 
 def _name_lights(notes: Sequence[str]) -> str:

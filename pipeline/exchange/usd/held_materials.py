@@ -14,14 +14,15 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from pipeline.exchange.linear_maps import (
+from pipeline.exchange.pictures import MAX_BYTES
+from pipeline.exchange.textured_triangles import (
     EXCESS,
+    NO_TEXTURES,
+    TexturedTriangles,
     color_textures,
     constant_map,
     linear_map,
 )
-from pipeline.exchange.pictures import MAX_BYTES
-from pipeline.exchange.textured_triangles import NO_TEXTURES, TexturedTriangles
 from pipeline.exchange.usd import layout
 from pipeline.exchange.usd.write_materials import (
     COAT_ROUGHNESS,
@@ -46,12 +47,7 @@ from pipeline.foreign.usd.texture_nodes import (
     is_output,
     read_texture_node,
 )
-from storage.records.material import (
-    DIFFUSE,
-    SPECULAR,
-    column_places,
-    laid_out,
-)
+from storage.records.material import DIFFUSE, SPECULAR, column_places, laid_out
 from storage.records.texture import TEXTURED, MapSource, Texture
 
 _OPENPBR = f"its shader {OPENPBR}"
@@ -125,7 +121,7 @@ class HeldMaterial:
         self._opened = opened
         self._maps: dict[str, tuple[str, MapSource]] = {}
         for name in TEXTURED:
-            text = prim.GetAttribute(layout.texture_attribute(name)).Get(time)
+            text = prim.GetAttribute(layout.TEXTURE_SOURCE + name).Get(time)
             if (held := layout.parse_map_text(text)) is not None:
                 self._maps[name] = held
         self._is_marked = bool(root) and root.HasAttribute(layout.DIGEST)

@@ -82,7 +82,7 @@ EXACT_POSITIONS = NAMESPACE + "exactPositions"
 """Attributes of a mesh: rows and positions of the vertices whose position differs from center plus
 point in float32."""
 
-_TEXTURE_SOURCE = NAMESPACE + "texture:"
+TEXTURE_SOURCE = NAMESPACE + "texture:"
 """Prefix of the attribute that names the texture of a material column (format_map)."""
 
 MATERIAL_ATTRIBUTES = {
@@ -113,11 +113,6 @@ def column_of(attribute: str) -> str | None:
     published = {name: column for column, name in MATERIAL_ATTRIBUTES.items()}
     added = attribute.removeprefix(_ADDED_COLUMN)
     return published.get(attribute, None if added == attribute else added)
-
-
-def texture_attribute(column: str) -> str:
-    """Return the attribute name for the texture of a material column."""
-    return _TEXTURE_SOURCE + column
 
 
 def format_map(sha256: str, source: MapSource) -> str:
@@ -194,7 +189,7 @@ def add_attributes(prim: Any, attributes: Attributes, material: str = "") -> Non
             name.startswith(NAMESPACE),
         )
         if value is not None:
-            attribute.default = usd_value(kind, value)
+            attribute.default = usd_converter(kind)(value)
         if sources:
             paths = [_target(f"{material}/{source}") for source in sources]
             attribute.connectionPathList.explicitItems = paths
@@ -222,14 +217,9 @@ def _value_type(kind: str) -> Any:
     return Sdf.ValueTypeNames.Find(kind.removeprefix(UNIFORM))
 
 
-def usd_value(kind: str, value: Any) -> Any:
-    """Return a value as the USD type `kind`."""
-    return _converter(kind)(value)
-
-
 @functools.cache
-def _converter(kind: str) -> Callable[[Any], Any]:
-    """Return the converter to a USD type; cached, since scenes have 10^5 values."""
+def usd_converter(kind: str) -> Callable[[Any], Any]:
+    """Return the converter of values to a USD type; cached, since scenes have 10^5 values."""
     from pxr import Sdf
 
     python_class = Sdf.AssetPath if kind == "asset" else _value_type(kind).type.pythonClass

@@ -28,6 +28,7 @@ from numpy.typing import NDArray
 
 from pipeline.documents.png import encode_png
 from pipeline.exchange.pictures import MAX_PIXELS
+from pipeline.exchange.textured_triangles import used_textures
 from pipeline.exchange.usd import layout
 from pipeline.foreign.picture import decode_image
 from pipeline.foreign.usd.shaders import (
@@ -42,13 +43,9 @@ from pipeline.foreign.usd.texture_nodes import convert_to_rec709, find_sources, 
 from storage.errors import Rejected, TrilightError
 from storage.records.environment import Environment
 from storage.records.exr import MAGIC, MAX_RESOLUTION, decode_channels, encode_channels
-from storage.records.material import (
-    column_places,
-    laid_out,
-    stored_columns,
-)
+from storage.records.material import column_places, laid_out, stored_columns
 from storage.records.scene import Scene
-from storage.records.texture import CONSTANT, NORMAL, TEXTURED, MapSource, Texture
+from storage.records.texture import NORMAL, TEXTURED, MapSource, Texture
 
 PREVIEW = "Preview"
 OPENPBR = "OpenPBR"
@@ -124,7 +121,7 @@ def add_materials(layer: Any, folder: str, scene: Scene) -> None:
     columns = stored_columns(scene.materials)
     for row, values in enumerate(scene.materials):
         path = f"{folder}/{layout.material_name(row)}"
-        used = _used_textures(scene, row)
+        used = used_textures(scene, row)
         copied = first is not None and not used
         if copied:
             Sdf.CopySpec(layer, first, layer, path)
@@ -136,21 +133,8 @@ def add_materials(layer: Any, folder: str, scene: Scene) -> None:
             prim = layer.GetPrimAtPath(path + below)
             for name, (kind, value, *_) in attributes.items():
                 if kind in ("color3f", "float", "float[]"):
-                    prim.attributes[name].default = layout.usd_value(kind, value)
+                    prim.attributes[name].default = layout.usd_converter(kind)(value)
         first = first if used else first or path
-
-
-def _used_textures(scene: Scene, row: int) -> Used:
-    """Return the textures of a material row."""
-    if scene.material_textures is None:
-        return {}
-    normal = CONSTANT if scene.normal_textures is None else int(scene.normal_textures[row])
-    index = [*scene.material_textures[row].tolist(), normal]
-    return {
-        name: (texture, scene.textures[texture])
-        for name, texture in zip((*TEXTURED, NORMAL), index, strict=True)
-        if texture != CONSTANT
-    }
 
 
 def material_tables(
@@ -164,7 +148,7 @@ def material_tables(
     material = _exact_attributes(values, columns)
     for name, (_, texture) in used.items():
         source = layout.format_map(texture.sha256, texture.source)
-        material[layout.texture_attribute(name)] = ("string", source)
+        material[layout.TEXTURE_SOURCE + name] = ("string", source)
     material["outputs:surface"] = ("token", None, f"{PREVIEW}.outputs:surface")
     preview: _Table = {
         "info:id": ("uniform token", "UsdPreviewSurface"),

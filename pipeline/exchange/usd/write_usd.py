@@ -58,6 +58,8 @@ def write_usd(path: Path, scene: Scene) -> tuple[()]:
 def write_usd_shard(path: Path, scenes: Iterable[tuple[str, Scene]]) -> None:
     """Write many scenes as variants, named by their keys; programs show one at a time.
 
+    The point and the minus of a time code, which a name must not contain, become `_` and `m`.
+
     Raises:
         TrilightError: as `write_usd`, or there is no scene.
     """
@@ -68,7 +70,8 @@ def write_usd_shard(path: Path, scenes: Iterable[tuple[str, Scene]]) -> None:
     root.variantSetNameList.Prepend(layout.VARIANT_SET)
     keys = []
     files = dict[str, bytes]()
-    for key, scene in scenes:
+    for stated_key, scene in scenes:
+        key = stated_key.replace(".", "_").replace("-", "m")
         variant = f"{layout.SHARD_ROOT}{{{layout.VARIANT_SET}={key}}}"
         Sdf.CreatePrimInLayer(layer, variant)
         files |= _add_scene(layer, variant + layout.ROOT.removeprefix("/"), scene)
@@ -189,9 +192,8 @@ def _add_objects(layer: Any, folder: str, scene: Scene, materials: str) -> None:
     layout.add_prim(layer, folder, "Scope")
     order = np.argsort(scene.object_index, kind="stable")
     counts = np.bincount(scene.object_index, minlength=len(scene.objects))
-    starts = np.concatenate([[0], np.cumsum(counts)])
-    for row, name in enumerate(prim_names(scene)):
-        faces = order[starts[row] : starts[row + 1]]
+    groups = np.split(order, np.cumsum(counts)[:-1])
+    for row, (name, faces) in enumerate(zip(prim_names(scene), groups, strict=True)):
         _add_object(layer, f"{folder}/{name}", scene, row, faces, materials)
 
 

@@ -17,9 +17,9 @@ from pipeline.exchange.convert import write_scene
 from pipeline.exchange.renderformer_h5 import (
     CELLS,
     FAR,
+    FILLED_CELLS,
     NEAR,
     compute_cells,
-    filled_cell_mask,
     read_renderformer_h5,
     write_renderformer_h5,
 )
@@ -208,11 +208,11 @@ def test_a_ramp_has_the_means_of_its_cells(tmp_path: Path) -> None:
     scene = dataclasses.replace(scene, uv=np.tile(corners, (3, 1)))
     (_, diffuse), (_, roughness) = compute_cells(scene, 0)
     x, y = np.meshgrid(np.arange(CELLS), np.arange(CELLS))
-    whole = filled_cell_mask() & (x + y < CELLS - 1)  # others lie partly beyond the triangle
+    whole = FILLED_CELLS & (x + y < CELLS - 1)  # others lie partly beyond the triangle
     for found, place in ((diffuse[0], x), (roughness[0], y)):
         middle = (0.01 + 0.97 * (place + 0.5) / CELLS) / 2
         assert found[whole] == pytest.approx(middle[whole], abs=1e-4)
-    assert (diffuse[:, ~filled_cell_mask()] == 0).all()
+    assert (diffuse[:, ~FILLED_CELLS] == 0).all()
 
 
 def test_a_fine_checker_is_grey_in_every_cell() -> None:
@@ -248,7 +248,7 @@ def test_corners_have_the_colours_of_their_cells(tmp_path: Path) -> None:
     with h5py.File(path, "r+") as file:
         texture = file["texture"]
         for triangle, level in ((0, 0.25), (1, 0.75)):
-            cells = np.where(filled_cell_mask(), np.float32(level), np.float32(0))
+            cells = np.where(FILLED_CELLS, np.float32(level), np.float32(0))
             cells[0, 0] = level - 0.125  # so that it varies
             texture[triangle, :3] = cells
             texture[triangle, 3:6] = 0

@@ -168,9 +168,9 @@ def test_remesh_keeps_the_place_and_the_number(folder: Path) -> None:
 def test_without_wish_there_are_as_many_views_as_every_file_has(folder: Path) -> None:
     assert _settings(folder).scenes.num_views == 1
     found = find_scene_files(str(folder))
-    assert found.notes(1) == ("b.json: 1 of 2 cameras not used, from cameras[1] on",)
+    assert found.unused_camera_notes(1) == ("b.json: 1 of 2 cameras not used, from cameras[1] on",)
     _change(folder, "a.json", colour="red")
-    assert find_scene_files(str(folder)).notes(1)[0] == "a.json: unknown field objects.green.colour"
+    assert find_scene_files(str(folder)).notes == ("a.json: unknown field objects.green.colour",)
     with pytest.raises(TrilightError, match="--views is 2; expected 1 to 1.*in a.json"):
         _settings(folder, views=2)
     with pytest.raises(TrilightError, match="--views is 0"):

@@ -13,9 +13,14 @@ from numpy.typing import NDArray
 from PIL import Image
 
 from model.scene_tensors import scene_tensors
-from pipeline.exchange.exports.export import FORMS
+from pipeline.exchange.exports.export import (
+    FORMS,
+    MOST_NOTES,
+    SCENE_FORMS,
+    _limit_notes,
+    picture_name,
+)
 from pipeline.exchange.exports.pictures import stands_alone
-from pipeline.exchange.exports.scenes import MOST_NOTES, SCENE_FORMS, _limit_notes, picture_name
 from pipeline.exchange.open_scene import load_source, scene_source
 from storage.conventions import in_camera, preview_srgb8, srgb8
 from storage.dataset.dataset import open_dataset
