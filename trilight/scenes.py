@@ -10,6 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from infra.render.sources import scene_sources
+from pipeline.exchange.convert import reduce_scene
 from pipeline.exchange.convert import write_scene as write_in_form
 from pipeline.exchange.open_scene import LoadedScene, scene_source
 from pipeline.exchange.reader import SceneReader
@@ -78,8 +79,7 @@ def within_budget(scene: Scene, max_triangles: int) -> Scene:
     Raises:
         TrilightError: the emitters alone exceed it, or an object cannot be reduced that far.
     """
-    with SceneReader() as reader:
-        return _warn_notes(reader.within_budget(scene, max_triangles))
+    return _warn_notes(reduce_scene(scene, max_triangles))
 
 
 def _warn_notes(loaded: LoadedScene) -> Scene:

@@ -1,8 +1,13 @@
 """Converts the scenes of a file to another format, in a child process with limits.
 
 A USD file holds many scenes. In formats that hold one, each scene becomes `NAME.KEY.SUFFIX`.
+
+A budget reduces the triangles of a scene, by the same fraction in each object. Emitters stay
+unchanged. The mesh stage's decimation reduces an object; each new triangle takes the material of
+the nearest old one, and smooth normals are computed again.
 """
 
+import dataclasses
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -20,11 +25,21 @@ from pipeline.exchange.formats import (
     list_lost_members,
     writable_suffixes,
 )
+from pipeline.exchange.from_description import SMOOTH_ANGLE_DEG
 from pipeline.exchange.open_scene import load_source
 from pipeline.exchange.reader import SceneReader
-from pipeline.exchange.scene_budget import within_budget
+from pipeline.foreign.mesh import TriangleMesh
+from pipeline.scenes.pieces import ScenePiece, concatenate_pieces
+from pipeline.scenes.shading_normals import (
+    ShadedMesh,
+    face_normals,
+    flat_shaded,
+    smooth_shaded,
+    without_slivers,
+)
 from storage.atomic import write_error
-from storage.errors import TrilightError
+from storage.errors import Rejected, TrilightError
+from storage.records.retextured import without_maps
 from storage.records.scene import Scene
 
 
@@ -113,7 +128,9 @@ def convert_sources(
     def carried_scenes() -> Iterator[tuple[str, Scene, Pictures]]:
         nonlocal triangles
         for source in sources:
-            loaded = _load_within_budget(source, budget, pictures=form.holds_pictures)
+            loaded = load_source(source, pictures=form.holds_pictures)
+            if budget is not None and loaded.scene.num_triangles > budget:
+                loaded = within_budget(loaded, budget)
             triangles += loaded.scene.num_triangles
             notes.extend(loaded.notes)
             note_losses(list_lost_members(loaded.scene, form.carried))
@@ -132,11 +149,107 @@ def convert_sources(
     return ConvertResult(files=files, triangles=triangles, notes=tuple(notes))
 
 
-def _load_within_budget(source: SceneSource, budget: int | None, *, pictures: bool) -> LoadedScene:
-    loaded = load_source(source, pictures=pictures)
-    if budget is None or loaded.scene.num_triangles <= budget:
-        return loaded
-    scene, notes = within_budget(loaded.scene, budget)
+LEAST = 4
+"""Minimum number of triangles of a reduced object."""
+
+_LOST = "textures became their means: reduced triangles have no texture coordinates"
+_FLAT = 1e-3
+
+
+def reduce_scene(scene: Scene, budget: int) -> LoadedScene:
+    """Call `within_budget` in a child process."""
+    with SceneReader() as reader:
+        loaded = LoadedScene(scene=scene, notes=())
+        return reader.call(within_budget, loaded, budget, name="scene")
+
+
+def within_budget(loaded: LoadedScene, budget: int) -> LoadedScene:
+    """Return a scene with at most `budget` triangles and no pictures, and notes on what that cost.
+
+    Raises:
+        TrilightError: emitters alone exceed the budget, or an object cannot be reduced that far.
+    """
+    lost = [_LOST] if loaded.scene.textures else []
     if loaded.radiance_rgb is not None:
-        notes = (*notes, "pictures left out: they show the scene before that")
-    return LoadedScene(scene=scene, notes=(*loaded.notes, *notes))
+        lost.append("pictures left out: they show the scene before that")
+    scene = without_maps(loaded.scene, environment=False)
+    counts = np.bincount(scene.object_index, minlength=len(scene.objects))
+    emits = np.array([entry.kind == "emitter" for entry in scene.objects])
+    room = budget - int(counts[emits].sum())
+    least = np.where(emits, 0, np.minimum(counts, LEAST))
+    more = np.where(emits, 0, counts) - least
+    fraction = max(room - int(least.sum()), 0) / max(int(more.sum()), 1)
+    pieces = []
+    for row in np.flatnonzero(counts):
+        piece = _build_piece(scene, int(row))
+        if not emits[row]:
+            piece = _reduce_piece(piece, int(least[row] + more[row] * fraction))
+        pieces.append(piece)
+    total = sum(len(piece.mesh.faces) for piece in pieces)
+    if total > budget:
+        raise TrilightError(
+            f"--budget is {budget}; expected at least {total}, the fewest triangles of this scene "
+            f"(emitters take {counts[emits].sum()} of them)."
+        )
+    reduced = dataclasses.replace(
+        scene,
+        **concatenate_pieces(pieces),
+        objects=tuple(piece.entry for piece in pieces),
+        provenance={**scene.provenance, "budget": budget},
+    )
+    reduced.check()
+    note = f"{scene.num_triangles} triangles reduced to {total}"
+    return LoadedScene(scene=reduced, notes=(*loaded.notes, note, *lost))
+
+
+def _build_piece(scene: Scene, row: int) -> ScenePiece:
+    in_object = scene.object_index == row
+    rows, corners = np.unique(scene.faces[in_object], return_inverse=True)
+    palette, index = np.unique(scene.material_index[in_object], return_inverse=True)
+    faces = corners.reshape(-1, 3).astype(np.uint32)
+    return ScenePiece(
+        entry=scene.objects[row],
+        mesh=ShadedMesh(
+            positions=scene.vertex_positions[rows],
+            normals=scene.vertex_normals[rows],
+            faces=faces,
+            groups=np.zeros(len(faces), np.int64),
+        ),
+        materials=scene.materials[palette],
+        material_index=index.astype(np.int64),
+    )
+
+
+def _reduce_piece(piece: ScenePiece, count: int) -> ScenePiece:
+    from scipy.spatial import cKDTree
+
+    old = piece.mesh
+    if len(old.faces) <= count:
+        return piece
+    positions, faces = _decimate_mesh(piece, count)
+    faces = without_slivers(positions, faces)
+    flat = face_normals(old.positions, old.faces)[:, None]
+    smooth = bool((np.abs(old.normals[old.faces] - flat) > _FLAT).any())
+    mesh = (
+        smooth_shaded(positions, faces, SMOOTH_ANGLE_DEG)
+        if smooth
+        else flat_shaded(positions, faces)
+    )
+    centers = old.positions[old.faces].mean(axis=1)
+    _, nearest = cKDTree(centers).query(mesh.positions[mesh.faces].mean(axis=1))
+    return dataclasses.replace(piece, mesh=mesh, material_index=piece.material_index[nearest])
+
+
+def _decimate_mesh(piece: ScenePiece, count: int) -> tuple[NDArray[np.float32], NDArray[np.uint32]]:
+    from pipeline.assets.scene_mesh import remesh  # loads mesh libraries
+
+    faces = piece.mesh.faces.astype(np.int64)
+    raw = TriangleMesh(positions=piece.mesh.positions.astype(np.float64), faces=faces)
+    try:
+        reduced = remesh(raw, count, "faithful")
+    except Rejected as rejection:
+        raise TrilightError(
+            f"{piece.entry.name}: no method gives at most {count} of its {len(faces)} triangles; "
+            "choose a larger --budget."
+        ) from rejection
+    return reduced.positions.astype(np.float32), reduced.faces.astype(np.uint32)

@@ -23,7 +23,7 @@ from pipeline.exchange.gltf.read_gltf import read_gltf
 from pipeline.exchange.gltf.write_gltf import write_gltf
 from pipeline.exchange.renderformer_h5 import read_renderformer_h5, write_renderformer_h5
 from pipeline.exchange.renderformer_json import describe_scene
-from pipeline.exchange.scene_files import build_scene, read_scene_cameras, read_scene_description
+from pipeline.exchange.scene_files import build_scene, read_scene_cameras
 from pipeline.exchange.textured_triangles import LoadedScene as LoadedScene
 from pipeline.exchange.textured_triangles import Pictures as Pictures
 from pipeline.exchange.usd.read_usd import read_usd, usd_keys
@@ -116,9 +116,7 @@ def _list_usd_pictures(target: Path) -> Sequence[Path]:
 def _read_json(source: SceneSource, pictures: bool) -> LoadedScene:
     root = source.path.parent.resolve()
     name = source.path.name
-    notes = [
-        f"unknown field {field}" for field in read_scene_description(root, name).unknown_fields
-    ]
+    notes = list[str]()
     scene, _ = build_scene(
         root,
         name,
@@ -254,8 +252,6 @@ def drop_uncarried_maps(scene: Scene, carried: Collection[str]) -> Scene:
     if "normal_textures" not in carried:
         scene = without_normal_maps(scene)
     loses_sky = scene.environment is not None and "environment" not in carried
-    if not loses_sky and (not scene.textures or "textures" in carried):
-        return scene
     if loses_sky and not scene.triangle_emits.any():
         raise TrilightError(
             "scene: its only light is its environment, which this form cannot hold; expected an "

@@ -23,9 +23,9 @@ from typing import Annotated, Any, Literal
 import numpy as np
 from numpy.typing import NDArray
 
-from pipeline.exchange.textured_triangles import MAX_ROWS
+from pipeline.exchange.textured_triangles import MAX_ROWS, require_at_most
 from pipeline.scenes.pieces import ScenePiece, concatenate_pieces
-from pipeline.scenes.shading_normals import ShadedMesh, flat_shaded, smooth_shaded, without_slivers
+from pipeline.scenes.shading_normals import flat_shaded, smooth_shaded, without_slivers
 from scene_templates.rotations import rotate_points, rotation_xyz
 from storage.conventions import look_at_c2w
 from storage.errors import TrilightError, prefix_errors
@@ -240,7 +240,10 @@ def _pieces(
         ]
         rows = np.zeros(len(parts[0].faces), np.int64)
         if (seed := material.rand_tri_diffuse_seed) is not None:
-            rows = color_groups(parts[0], material)
+            # in the published converter a flat mesh shares no vertices: each triangle is a group
+            has_groups = material.random_diffuse_type == "per-shading-group"
+            is_grouped = material.smooth_shading and has_groups
+            rows = parts[0].groups if is_grouped else np.arange(len(parts[0].faces))
             diffuse = random_diffuse(seed, material.random_diffuse_max, int(rows.max()) + 1)
     diffuse, specular, scale = limit_albedos(diffuse, np.array(material.specular), over_one)
     materials = default_rows(len(diffuse))
@@ -279,13 +282,6 @@ def build_cameras(
     return np.array(poses, np.float32).reshape(-1, 4, 4), angles
 
 
-def require_at_most(counts: Mapping[str, tuple[int, int]]) -> None:
-    """Raise TrilightError where a count of a scene is larger than its maximum, by what it is of."""
-    for what, (count, most) in counts.items():
-        if count > most:
-            raise TrilightError(f"{count} {what}; expected at most {most} in a scene.")
-
-
 def limit_albedos(
     diffuse: NDArray[np.float64], specular: NDArray[np.float64], over_one: AlbedoOverOne
 ) -> tuple[NDArray[np.float64], NDArray[np.float64], float]:
@@ -312,17 +308,6 @@ def limit_albedos(
         )
     factors = np.where(beyond, 1 / np.where(beyond, sums, 1), 1.0)
     return diffuse * factors[:, None], both * factors[:, None], float(factors.min())
-
-
-def color_groups(mesh: ShadedMesh, material: DescribedMaterial) -> NDArray[np.int64]:
-    """Return the random color's number of each triangle, [T].
-
-    In the published converter a flat mesh shares no vertices, so that each of its triangles is a
-    group, whatever the type says.
-    """
-    if material.smooth_shading and material.random_diffuse_type == "per-shading-group":
-        return mesh.groups
-    return np.arange(len(mesh.faces))
 
 
 def random_diffuse(seed: int, bound: float, count: int) -> NDArray[np.float64]:

@@ -11,7 +11,6 @@ from pipeline.assets.settings import AssetSettings
 from pipeline.exchange.formats import Cameras, LoadedScene, SceneSource
 from pipeline.exchange.from_description import AlbedoOverOne, LoadedMesh
 from pipeline.exchange.open_scene import load_cameras, load_source, source_keys
-from pipeline.exchange.scene_budget import within_budget
 from pipeline.exchange.scene_files import load_mesh_file
 from pipeline.isolation import (
     NO_FILES,
@@ -24,7 +23,6 @@ from pipeline.isolation import (
     reach,
 )
 from storage.errors import TrilightError
-from storage.records.scene import Scene
 
 log = logging.getLogger("trilight.exchange")
 
@@ -76,11 +74,6 @@ class SceneReader(contextlib.AbstractContextManager["SceneReader"]):
         if mesh.unread:
             log.warning("%s: not read: %s", path.name, "; ".join(mesh.unread))
         return mesh
-
-    def within_budget(self, scene: Scene, max_triangles: int) -> LoadedScene:
-        """Reduce a scene in the child; see `pipeline.exchange.scene_budget.within_budget`."""
-        reduced, notes = self.call(within_budget, scene, max_triangles, name="scene")
-        return LoadedScene(scene=reduced, notes=notes)
 
     def close(self) -> None:
         """End the child."""

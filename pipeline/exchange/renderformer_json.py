@@ -28,9 +28,12 @@ from pipeline.exchange.from_description import (
     DescribedObject,
     PrintableText,
     SceneDescription,
-    require_at_most,
 )
-from pipeline.exchange.textured_triangles import group_triangles, unique_name
+from pipeline.exchange.textured_triangles import (
+    group_triangles,
+    require_at_most,
+    unique_name,
+)
 from pipeline.foreign.numbers import Malformed
 from pipeline.scenes.shading_normals import face_normals, smooth_shaded, without_slivers
 from storage.conventions import HALF_FLOAT_MAX

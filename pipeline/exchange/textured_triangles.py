@@ -18,7 +18,7 @@ from numpy.typing import ArrayLike, NDArray
 from pipeline.scenes.pieces import ScenePiece, concatenate_pieces
 from pipeline.scenes.shading_normals import ShadedMesh, flat_shaded
 from storage.conventions import linear_from_srgb8, look_at_c2w, srgb8
-from storage.errors import TrilightError
+from storage.errors import TrilightError, prefix_errors
 from storage.records.environment import Environment
 from storage.records.lookup import texture_values
 from storage.records.material import EMISSION, ROUGHNESS, default_rows, distinct_rows
@@ -207,13 +207,14 @@ class SceneParts:
             unique = dataclasses.replace(entry, name=name, kind=kind)
             self._add_piece(unique, triangles.select(mask))
             self._surfaces += [] if is_lamp else self._pieces[-1:]
-        for what, count, most in (
-            ("triangles", self._num_triangles, MAX_TRIANGLES),
-            ("materials", len(self._texture_sets), MAX_ROWS),
-            ("objects", len(self._pieces), MAX_ROWS),
-        ):
-            if count > most:
-                raise TrilightError(f"{self._file}: more than {most} {what}.")
+        with prefix_errors(self._file):
+            require_at_most(
+                {
+                    "triangles": (self._num_triangles, MAX_TRIANGLES),
+                    "materials": (len(self._texture_sets), MAX_ROWS),
+                    "objects": (len(self._pieces), MAX_ROWS),
+                }
+            )
 
     def _add_piece(self, entry: SceneObject, triangles: TexturedTriangles) -> None:
         positions, normals, faces = index_corners(triangles.positions, triangles.normals)
@@ -290,6 +291,13 @@ def add_textures(
     corners = uv.reshape(-1, 2).astype(np.float32)
     rows = np.array(index, np.int32)
     return without_constant_textures(with_textures(scene, corners, tuple(textures.values()), rows))
+
+
+def require_at_most(counts: Mapping[str, tuple[int, int]]) -> None:
+    """Raise TrilightError where a count of a scene is larger than its maximum, by what it is of."""
+    for what, (count, most) in counts.items():
+        if count > most:
+            raise TrilightError(f"{count} {what}; expected at most {most} in a scene.")
 
 
 def unique_name(base: str, counts: dict[str, int], key: Callable[[str], str] = str) -> str:

@@ -207,9 +207,10 @@ def write_energon(
         )
     for shard in shards:
         _copy_shard(dataset, shard, out, done)
-    splits: dict[str, list[str]] = {name: [] for name in _SPLITS.values()}
-    for shard in shards:
-        splits[_SPLITS[shard.split]].append(shard.name)
+    splits = {
+        name: [shard.name for shard in shards if shard.split == ours]
+        for ours, name in _SPLITS.items()
+    }
     meta = out / ".nv-meta"
     write_json(
         meta / ".info.json", {"shard_counts": {each.name: each.num_samples for each in shards}}

@@ -99,10 +99,12 @@ class _GltfReader:
                 parts.add(self._entry(name), self._triangles(primitive))
         reach = float(np.linalg.norm(np.ptp(parts.surface_points(), axis=0)))
         suns = []
+        lights = extension(tree, "KHR_lights_punctual")
         for placed in visible:
-            light = self._light(placed)
-            if light is None:
+            reference = extension(placed.node, "KHR_lights_punctual")
+            if "light" not in reference:
                 continue
+            light = entry(lights, "lights", reference["light"])
             if light.get("type") == "directional":
                 suns.append((light, placed.to_world))
             elif (lamp := _light_triangles(light, placed, reach, self.lost)) is not None:
@@ -151,15 +153,6 @@ class _GltfReader:
         name = str(row.get("name", ""))[:200]
         source = MapSource(name=name, licence=self.licence, attribution=self._attribution)
         return self._converter.convert(part, source)
-
-    def _light(self, placed: PlacedNode) -> dict[str, Any] | None:
-        """Return the JSON of a node's light; None where it has none."""
-        reference = extension(placed.node, "KHR_lights_punctual")
-        if "light" not in reference:
-            return None
-        return entry(
-            extension(self.document.tree, "KHR_lights_punctual"), "lights", reference["light"]
-        )
 
     def _entry(self, stated: Any) -> SceneObject:
         return SceneObject(

@@ -176,10 +176,9 @@ class StageReader:
                 if lamp is not None:
                     radiance = compute_radiance(each, lamp, time, self._lost)
                     parts.add(self._entry(each.prim), build_lamp(lamp, radiance), is_lamp=True)
-        for each in self._placed:
-            if each.prim.GetTypeName() in DOMES and sky is not None:
+            elif sky is not None:
                 self._note(each.prim, "a second dome; a scene has one environment")
-            elif each.prim.GetTypeName() in DOMES:
+            else:
                 sky = read_foreign_dome(each.prim, each.to_world, time, self._opened, self._licence)
         is_lit = sky is not None and sky.radiance_rgb.any()
         if not is_lit and not parts.has_emitters:

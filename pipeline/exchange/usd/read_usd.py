@@ -200,7 +200,7 @@ def _read_exact(opened: OpenedStage, key: str | None = None) -> Scene | None:
     if scene_digest(scene) != root.attributes[layout.DIGEST].default:
         return None
     scene.check()
-    expected = new_layer(".usdc", layout.ROOT)
+    expected = new_layer(layout.ROOT)
     try:
         written = author_scene(expected, str(root.path), scene)
         return scene if _list_specs(root) == _list_specs(written) else None

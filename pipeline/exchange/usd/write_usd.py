@@ -50,7 +50,7 @@ def write_usd(path: Path, scene: Scene) -> tuple[()]:
         TrilightError: the suffix is not USD's, the scene breaks a law or holds text that USD cannot
             store, or the file cannot be written.
     """
-    layer = _new_layer(path, layout.ROOT)
+    layer = new_layer(layout.ROOT)
     _save(path, layer, _add_scene(layer, layout.ROOT, scene))
     return ()
 
@@ -65,7 +65,7 @@ def write_usd_shard(path: Path, scenes: Iterable[tuple[str, Scene]]) -> None:
     """
     from pxr import Sdf
 
-    layer = _new_layer(path, layout.SHARD_ROOT)
+    layer = new_layer(layout.SHARD_ROOT)
     root = layout.add_prim(layer, layout.SHARD_ROOT, "Xform")
     root.variantSetNameList.Prepend(layout.VARIANT_SET)
     keys = []
@@ -102,11 +102,10 @@ def _add_scene(layer: Any, path: str, scene: Scene) -> dict[str, bytes]:
     """Write a scene into a layer; return its texture and map files by name."""
     scene.check()
     scene = without_constant_textures(scene)
-    records: list[tuple[Any, dict[str, str]]] = [
-        (entry, layout.OBJECT_TEXTS) for entry in scene.objects
-    ]
-    records += [(texture.source, layout.MAP_TEXTS) for texture in scene.textures]
-    for text in (getattr(record, field) for record, fields in records for field in fields):
+    sources = [texture.source for texture in scene.textures]
+    texts = [getattr(each, field) for each in scene.objects for field in layout.OBJECT_TEXTS]
+    texts += [getattr(each, field) for each in sources for field in layout.MAP_TEXTS]
+    for text in texts:
         if "\0" in text or any("\ud800" <= letter <= "\udfff" for letter in text):
             raise TrilightError(f"names: {text!r:.80} has a character that USD cannot store.")
     author_scene(layer, path, scene)
@@ -129,17 +128,11 @@ def author_scene(layer: Any, path: str, scene: Scene) -> Any:
     return root
 
 
-def _new_layer(path: Path, root: str) -> Any:
-    if path.suffix.lower() not in SUFFIXES:
-        raise TrilightError(f"{path.name}: expected a name that ends in {', '.join(SUFFIXES)}.")
-    return new_layer(".usda" if path.suffix.lower() == ".usda" else ".usdc", root)
-
-
-def new_layer(suffix: str, root: str) -> Any:
+def new_layer(root: str) -> Any:
     """Return an empty layer in meters with +Z up, whose default prim is `root`."""
     from pxr import Sdf
 
-    layer = Sdf.Layer.CreateAnonymous(suffix)
+    layer = Sdf.Layer.CreateAnonymous(".usdc")
     layer.defaultPrim = root.removeprefix("/")
     layer.pseudoRoot.SetInfo("upAxis", "Z")
     layer.pseudoRoot.SetInfo("metersPerUnit", 1.0)
@@ -147,7 +140,10 @@ def new_layer(suffix: str, root: str) -> Any:
 
 
 def _save(path: Path, layer: Any, files: Mapping[str, bytes]) -> None:
-    if path.suffix.lower() == ".usda":  # Export would change file modes, which a child may not
+    suffix = path.suffix.lower()
+    if suffix not in SUFFIXES:
+        raise TrilightError(f"{path.name}: expected a name that ends in {', '.join(SUFFIXES)}.")
+    if suffix == ".usda":  # Export would change file modes, which a child may not
         data = layer.ExportToString().encode()
     else:
         within = path.parent if path.parent.is_dir() else None
@@ -156,7 +152,7 @@ def _save(path: Path, layer: Any, files: Mapping[str, bytes]) -> None:
             if not layer.Export(str(plain)):
                 raise TrilightError(f"{path.name}: USD could not write the scene.")
             data = plain.read_bytes()
-    if path.suffix.lower() == ".usdz":
+    if suffix == ".usdz":
         write_atomically(path, encode_usdz(data, files))
         return
     for name, content in files.items():

@@ -12,8 +12,8 @@ import trimesh
 
 from infra.bench.workloads.named_scenes import cost_scene
 from pipeline.exchange import formats
-from pipeline.exchange.convert import convert_scene, write_scene
-from pipeline.exchange.formats import list_lost_members
+from pipeline.exchange.convert import convert_scene, within_budget, write_scene
+from pipeline.exchange.formats import LoadedScene, list_lost_members
 from pipeline.exchange.open_scene import SceneSource, load_source, scene_source
 from pipeline.isolation import ChildLimits, IsolatedChild
 from pipeline.presets.registry import preset_settings
@@ -316,13 +316,12 @@ def test_a_scene_that_only_its_sky_lights_is_not_written_dark(tmp_path: Path, fo
 
 
 def test_a_smaller_budget_says_that_textures_go() -> None:
-    from pipeline.exchange.scene_budget import within_budget
-
     scene = textured_scene(environment=sky())
-    reduced, notes = within_budget(scene, 3)
-    assert not reduced.textures and reduced.environment is scene.environment
-    assert any("textures became their means" in note for note in notes)
-    assert not any("textures" in note for note in within_budget(tiny_scene(), 3)[1])
+    reduced = within_budget(LoadedScene(scene=scene, notes=()), 3)
+    assert not reduced.scene.textures and reduced.scene.environment is scene.environment
+    assert any("textures became their means" in note for note in reduced.notes)
+    plain = within_budget(LoadedScene(scene=tiny_scene(), notes=()), 3)
+    assert not any("textures" in note for note in plain.notes)
 
 
 def test_the_names_of_members_are_those_of_a_scene() -> None:

@@ -4,6 +4,7 @@ import dataclasses
 import json
 import os
 import shutil
+from collections.abc import Mapping
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any, cast
@@ -72,9 +73,8 @@ def _build(folder: Path, name: str = "a.json") -> Scene:
     return build_json(folder, name, licence="MIT", num_views=1, scene_index=3, seed=9)
 
 
-def _digests(folder: Path, name: str) -> dict[str, str]:
-    assets = preset_settings("smoke").assets
-    return dict(build_once(folder.resolve(), name, assets, 1, "scale")[0])
+def _build_once(folder: Path, name: str) -> tuple[Mapping[str, str], tuple[str, ...]]:
+    return build_once(folder.resolve(), name, preset_settings("smoke").assets, 1, "scale")
 
 
 def _settings(folder: Path, views: int | None = None) -> DatasetSettings:
@@ -82,7 +82,7 @@ def _settings(folder: Path, views: int | None = None) -> DatasetSettings:
 
 
 def _files(folder: Path, *names: str, **unusable: str) -> SceneFiles:
-    sha256 = {uid: digest for name in names for uid, digest in _digests(folder, name).items()}
+    sha256 = {uid: digest for name in names for uid, digest in _build_once(folder, name)[0].items()}
     return SceneFiles(
         root=folder.resolve(), names=names, sha256=sha256, unusable=unusable, licence="MIT"
     )
@@ -170,7 +170,7 @@ def test_without_wish_there_are_as_many_views_as_every_file_has(folder: Path) ->
     found = find_scene_files(str(folder))
     assert found.unused_camera_notes(1) == ("b.json: 1 of 2 cameras not used, from cameras[1] on",)
     _change(folder, "a.json", colour="red")
-    assert find_scene_files(str(folder)).notes == ("a.json: unknown field objects.green.colour",)
+    assert _build_once(folder, "a.json")[1] == ("a.json: unknown field objects.green.colour",)
     with pytest.raises(TrilightError, match="--views is 2; expected 1 to 1.*in a.json"):
         _settings(folder, views=2)
     with pytest.raises(TrilightError, match="--views is 0"):
