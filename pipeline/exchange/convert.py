@@ -65,7 +65,11 @@ def convert_scene(
             written.
     """
     form = _form_of(target)
-    with SceneReader(writes=[_make_folder(target)]) as reader:
+    try:
+        target.parent.mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        raise write_error(target, error) from error
+    with SceneReader(writes=[target.parent]) as reader:
         sources = reader.scenes_of(source)
         outputs = [(target, sources)]
         if len(sources) > 1 and not form.write_many:
@@ -96,15 +100,6 @@ def write_scene(
     assert form.write is not None
     carried = drop_uncarried_maps(scene, form.carried)
     return (*list_lost_members(scene, form.carried), *form.write(target, carried, radiance_rgb))
-
-
-def _make_folder(target: Path) -> Path:
-    """Make the folder of a file; the child may write there and nowhere else."""
-    try:
-        target.parent.mkdir(parents=True, exist_ok=True)
-    except OSError as error:
-        raise write_error(target, error) from error
-    return target.parent
 
 
 def _form_of(target: Path) -> SceneFormat:

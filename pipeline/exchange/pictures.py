@@ -3,10 +3,9 @@
 import contextlib
 from collections.abc import Iterator
 
-import numpy as np
 from numpy.typing import NDArray
 
-from pipeline.foreign.picture import Picture, decode_image, read_linear_picture
+from pipeline.foreign.picture import decode_image, read_linear_picture
 from storage.errors import Rejected, TrilightError
 
 MAX_BYTES = 256 << 20
@@ -45,15 +44,6 @@ def decode_pixels(data: bytes, name: str, lost: list[str] | None = None) -> NDAr
         return None
     lost += [f"{name!r:.100}: {sentence}" for sentence in picture.unread]
     return picture.values
-
-
-def linear_rgb(pixels: NDArray) -> NDArray[np.float32]:
-    """Return the linear colors [H, W, 3] of a picture without alpha; 8 bits are sRGB."""
-    if pixels.dtype != np.float32:
-        is_srgb = pixels.dtype == np.uint8
-        pixels = Picture(values=pixels, is_srgb=is_srgb).linear(pixels)
-    rgb = pixels[..., :3] if pixels.shape[2] >= 3 else np.repeat(pixels[..., :1], 3, axis=2)
-    return np.asarray(rgb, np.float32)
 
 
 @contextlib.contextmanager

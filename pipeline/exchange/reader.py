@@ -13,11 +13,9 @@ from pipeline.exchange.from_description import AlbedoOverOne, LoadedMesh
 from pipeline.exchange.open_scene import load_cameras, load_source, source_keys
 from pipeline.exchange.scene_files import load_mesh_file
 from pipeline.isolation import (
-    NO_FILES,
     ChildFailed,
     ChildLimits,
     IsolatedChild,
-    Reach,
     Result,
     call_with_retries,
     reach,
@@ -39,7 +37,7 @@ class SceneReader(contextlib.AbstractContextManager["SceneReader"]):
             albedo_over_one: treatment of albedos over 1 in RenderFormer's JSON.
             writes: folders that the child may write into.
         """
-        self._child = file_child(reach(writes=writes))
+        self._child = IsolatedChild(limits=LIMITS, confined_to=reach(writes=writes))
         self._over_one = albedo_over_one
 
     def scenes_of(self, source: SceneSource) -> list[SceneSource]:
@@ -107,15 +105,7 @@ class SceneReader(contextlib.AbstractContextManager["SceneReader"]):
             raise TrilightError(f"{name}: could not be {done} ({failure}).") from failure
 
 
-_LIMITS = ChildLimits(memory_bytes=16 << 30, wall_s=1800, calls_per_child=1000)
-
-
-def file_child(confined_to: Reach = NO_FILES) -> IsolatedChild:
-    """Return a confined child with limits; close it.
-
-    The child may use these files, and those that `allow_files` adds.
-    """
-    return IsolatedChild(limits=_LIMITS, confined_to=confined_to)
+LIMITS = ChildLimits(memory_bytes=16 << 30, wall_s=1800, calls_per_child=1000)
 
 
 def unconfined_child(address_space: Callable[[int], int]) -> IsolatedChild:
@@ -124,5 +114,5 @@ def unconfined_child(address_space: Callable[[int], int]) -> IsolatedChild:
     Args:
         address_space: returns the memory limit for what the child renders with, of the usual one.
     """
-    memory_bytes = address_space(_LIMITS.memory_bytes)
-    return IsolatedChild(limits=dataclasses.replace(_LIMITS, memory_bytes=memory_bytes))
+    memory_bytes = address_space(LIMITS.memory_bytes)
+    return IsolatedChild(limits=dataclasses.replace(LIMITS, memory_bytes=memory_bytes))

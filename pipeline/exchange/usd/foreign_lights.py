@@ -14,9 +14,10 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from pipeline.exchange.pictures import MAX_BYTES, decode_pixels, linear_rgb
+from pipeline.exchange.pictures import MAX_BYTES, decode_pixels
 from pipeline.exchange.usd import layout
 from pipeline.foreign.numbers import FINITE, read_number, read_numbers
+from pipeline.foreign.picture import Picture
 from pipeline.foreign.usd.placed import PlacedPrim
 from pipeline.foreign.usd.stage import OpenedStage
 from pipeline.foreign.usd.texture_nodes import asset_bytes, convert_to_rec709
@@ -281,4 +282,6 @@ def _read_map(prim: Any, time: Any, opened: OpenedStage) -> NDArray[np.float64] 
             f"{prim_path}: map {asset.path!r:.100} is not read; its light was left out"
         )
         return None
-    return linear_rgb(pixels).astype(np.float64)
+    linear = Picture(values=pixels, is_srgb=pixels.dtype == np.uint8).linear(pixels)
+    rgb = linear[..., :3] if linear.shape[2] >= 3 else np.repeat(linear[..., :1], 3, axis=2)
+    return rgb.astype(np.float64)

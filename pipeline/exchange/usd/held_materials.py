@@ -27,22 +27,25 @@ from pipeline.exchange.usd import layout
 from pipeline.exchange.usd.write_materials import (
     COAT_ROUGHNESS,
     OPENPBR,
+    OPENPBR_SHADER,
     PREVIEW_INPUTS,
     decode_texture,
-    read_openpbr,
-    written_columns,
+    openpbr_inputs,
 )
 from pipeline.foreign.usd.shaders import (
     DEFAULTS,
     IOR_OF_CONSTANT_ALBEDOS,
     StatedMaterial,
+    note_unsupported,
     parse_color,
+    reflect_head_on,
     surface_shader,
 )
 from pipeline.foreign.usd.stage import OpenedStage
 from pipeline.foreign.usd.texture_nodes import (
     TextureNode,
     asset_bytes,
+    convert_to_rec709,
     find_sources,
     is_output,
     read_texture_node,
@@ -55,6 +58,14 @@ _OPENPBR = f"its shader {OPENPBR}"
 
 _SAME_VALUE = 1e-5
 """Relative tolerance for a value that Trilight wrote: programs compute in float32."""
+
+_INPUTS = {
+    "diffuse": ("base_weight", "base_color"),
+    "specular": ("specular_weight", "specular_color", "specular_ior"),
+    "roughness": ("specular_roughness",),
+    "emission": ("emission_luminance", "emission_color"),
+}
+"""OpenPBR's inputs whose product is a column; an index of refraction counts as its reflectance."""
 
 
 def read_columns(prim: Any, time: Any, lost: list[str]) -> dict[str, NDArray[np.float32]]:
@@ -125,7 +136,7 @@ class HeldMaterial:
             if (held := layout.parse_map_text(text)) is not None:
                 self._maps[name] = held
         self._is_marked = bool(root) and root.HasAttribute(layout.DIGEST)
-        self._openpbr = read_openpbr(material, time, opened) if self._is_marked else {}
+        self._openpbr = _read_openpbr(material, time, opened) if self._is_marked else {}
 
     def restore(
         self, stated: StatedMaterial | None
@@ -248,7 +259,7 @@ class HeldMaterial:
         if column in self._openpbr:
             places[_OPENPBR] = self._openpbr[column]
         for written in [self._written] if self._written else [of_preview, self._columns]:
-            expected = {_OPENPBR: written_columns(written)[column]}
+            expected = {_OPENPBR: _written_columns(written)[column]}
             changed = {
                 place: value
                 for place, value in places.items()
@@ -287,6 +298,53 @@ class HeldMaterial:
 
 def _name_shader(stated: StatedMaterial) -> str:
     return f"its shader {stated.where.rpartition('/')[2]}"
+
+
+def _written_columns(columns: Mapping[str, NDArray]) -> dict[str, NDArray[np.float64]]:
+    """Return the columns [3] that the shader written for a material's columns states."""
+    table = openpbr_inputs({name: np.maximum(columns[name], 0).tolist() for name in _INPUTS})
+    return _multiply({name.removeprefix("inputs:"): each[1] for name, each in table.items()})
+
+
+def _read_openpbr(material: Any, time: Any, opened: OpenedStage) -> dict[str, NDArray[np.float64]]:
+    """Return the columns [3] that the OpenPBR shader beside a preview states; none without both.
+
+    Columns with an input that is missing, or no constant, are left out; notes name the latter.
+    """
+    shader = material.ComputeSurfaceSource("mtlx")[0]
+    preview = surface_shader(material)
+    if (
+        not shader
+        or shader.GetShaderId() != OPENPBR_SHADER
+        or shader.GetPath() == preview.GetPath()
+    ):
+        return {}
+    values = dict[str, NDArray[Any]]()
+    for name in (each for inputs in _INPUTS.values() for each in inputs):
+        sources = find_sources(shader, name)
+        if not sources:
+            continue
+        stated = None if is_output(sources[0]) else sources[0].Get(time)
+        value = parse_color(
+            None if stated is None else convert_to_rec709(sources[0], np.array(stated))
+        )
+        if value is None:
+            opened.lost.append(f"{shader.GetPath()}.{name}: no finite constant; it is not read")
+        else:
+            values[name] = value
+    note_unsupported(shader, time, opened, ("specular_weight", "specular_color"))
+    return _multiply(values)
+
+
+def _multiply(values: Mapping[str, Any]) -> dict[str, NDArray[np.float64]]:
+    columns = {}
+    for column, inputs in _INPUTS.items():
+        if all(name in values for name in inputs):
+            factors = [np.broadcast_to(values[name], 3).astype(float) for name in inputs]
+            if column == "specular":
+                factors[-1] = reflect_head_on(factors[-1])
+            columns[column] = np.prod(factors, axis=0)
+    return columns
 
 
 def keep_exact(

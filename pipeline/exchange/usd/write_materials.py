@@ -31,15 +31,7 @@ from pipeline.exchange.pictures import MAX_PIXELS
 from pipeline.exchange.textured_triangles import used_textures
 from pipeline.exchange.usd import layout
 from pipeline.foreign.picture import decode_image
-from pipeline.foreign.usd.shaders import (
-    IOR_OF_CONSTANT_ALBEDOS,
-    note_unsupported,
-    parse_color,
-    reflect_head_on,
-    surface_shader,
-)
-from pipeline.foreign.usd.stage import OpenedStage
-from pipeline.foreign.usd.texture_nodes import convert_to_rec709, find_sources, is_output
+from pipeline.foreign.usd.shaders import IOR_OF_CONSTANT_ALBEDOS
 from storage.errors import Rejected, TrilightError
 from storage.records.environment import Environment
 from storage.records.exr import MAGIC, MAX_RESOLUTION, decode_channels, encode_channels
@@ -94,18 +86,10 @@ Used = Mapping[str, tuple[int, Texture]]
 
 _Table = dict[str, tuple[str, Any] | tuple[str, Any, str]]
 
-_OPENPBR_SHADER = "ND_open_pbr_surface_surfaceshader"
+OPENPBR_SHADER = "ND_open_pbr_surface_surfaceshader"
 
 _MOST_REFLECTING = 0.98
 """Maximum head-on reflectance that sets the index of refraction: 0.98 needs 199."""
-
-_INPUTS = {
-    "diffuse": ("base_weight", "base_color"),
-    "specular": ("specular_weight", "specular_color", "specular_ior"),
-    "roughness": ("specular_roughness",),
-    "emission": ("emission_luminance", "emission_color"),
-}
-"""OpenPBR's inputs whose product is a column; an index of refraction counts as its reflectance."""
 
 
 def add_materials(layer: Any, folder: str, scene: Scene) -> None:
@@ -163,7 +147,7 @@ def material_tables(
     tables: dict[str, layout.Attributes] = {"": material, f"/{PREVIEW}": preview}
     if not used:
         material["outputs:mtlx:surface"] = ("token", None, f"{OPENPBR}.outputs:out")
-        tables[f"/{OPENPBR}"] = {**_openpbr_inputs(stated), "outputs:out": ("token", None)}
+        tables[f"/{OPENPBR}"] = {**openpbr_inputs(stated), "outputs:out": ("token", None)}
         return tables
     for name, (row, texture) in used.items():
         kind, socket, output, output_kind = _LINKS[name]
@@ -283,13 +267,13 @@ def decode_texture(
     return texture
 
 
-def _openpbr_inputs(columns: Mapping[str, Sequence[float]]) -> layout.Attributes:
+def openpbr_inputs(columns: Mapping[str, Sequence[float]]) -> layout.Attributes:
     """Return the attributes of the shader of a material's columns."""
     specular = columns["specular"]
     emission = columns["emission"]
     root = math.sqrt(min(max(specular), _MOST_REFLECTING))
     return {
-        "info:id": ("uniform token", _OPENPBR_SHADER),
+        "info:id": ("uniform token", OPENPBR_SHADER),
         "inputs:base_color": ("color3f", columns["diffuse"]),
         "inputs:base_weight": ("float", 1.0),
         "inputs:base_diffuse_roughness": ("float", 0.0),
@@ -300,53 +284,6 @@ def _openpbr_inputs(columns: Mapping[str, Sequence[float]]) -> layout.Attributes
         "inputs:emission_luminance": ("float", max(emission)),
         "inputs:emission_color": ("color3f", _divide_by_largest(emission)),
     }
-
-
-def written_columns(columns: Mapping[str, NDArray]) -> dict[str, NDArray[np.float64]]:
-    """Return the columns [3] that the shader written for a material's columns states."""
-    table = _openpbr_inputs({name: np.maximum(columns[name], 0).tolist() for name in _INPUTS})
-    return _multiply({name.removeprefix("inputs:"): each[1] for name, each in table.items()})
-
-
-def read_openpbr(material: Any, time: Any, opened: OpenedStage) -> dict[str, NDArray[np.float64]]:
-    """Return the columns [3] that the OpenPBR shader beside a preview states; none without both.
-
-    Columns with an input that is missing, or no constant, are left out; notes name the latter.
-    """
-    shader = material.ComputeSurfaceSource("mtlx")[0]
-    preview = surface_shader(material)
-    if (
-        not shader
-        or shader.GetShaderId() != _OPENPBR_SHADER
-        or shader.GetPath() == preview.GetPath()
-    ):
-        return {}
-    values = dict[str, NDArray[Any]]()
-    for name in (each for inputs in _INPUTS.values() for each in inputs):
-        sources = find_sources(shader, name)
-        if not sources:
-            continue
-        stated = None if is_output(sources[0]) else sources[0].Get(time)
-        value = parse_color(
-            None if stated is None else convert_to_rec709(sources[0], np.array(stated))
-        )
-        if value is None:
-            opened.lost.append(f"{shader.GetPath()}.{name}: no finite constant; it is not read")
-        else:
-            values[name] = value
-    note_unsupported(shader, time, opened, ("specular_weight", "specular_color"))
-    return _multiply(values)
-
-
-def _multiply(values: Mapping[str, Any]) -> dict[str, NDArray[np.float64]]:
-    columns = {}
-    for column, inputs in _INPUTS.items():
-        if all(name in values for name in inputs):
-            factors = [np.broadcast_to(values[name], 3).astype(float) for name in inputs]
-            if column == "specular":
-                factors[-1] = reflect_head_on(factors[-1])
-            columns[column] = np.prod(factors, axis=0)
-    return columns
 
 
 def _divide_by_largest(rgb: Sequence[float]) -> list[float]:

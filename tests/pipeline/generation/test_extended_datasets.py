@@ -9,14 +9,14 @@ import pytest
 from prefect.exceptions import ParameterTypeError
 
 from infra.repair import repair
-from pipeline.exchange.reader import file_child
+from pipeline.exchange.reader import LIMITS
 from pipeline.executors.threads import ThreadRunner
 from pipeline.generation.dataset_writer import begin_or_resume_dataset
 from pipeline.generation.derive_dataset import _extensions
 from pipeline.generation.freeze_objects import ObjectLock
 from pipeline.generation.generate_options import GenerateOptions
 from pipeline.generation.pipeline import make_dataset, make_task, prepare_dataset
-from pipeline.isolation import call_with_retries
+from pipeline.isolation import NO_FILES, IsolatedChild, call_with_retries
 from pipeline.presets.registry import DATASET_PRESETS, preset_settings, resolve_dataset_preset
 from pipeline.shards.pack_shards import hold_dataset_lock
 from scene_templates.families import FAMILIES
@@ -86,7 +86,7 @@ def test_a_worker_without_the_extension_is_refused(tmp_path: Path) -> None:
 
 def test_children_know_what_is_registered() -> None:
     """Also those of a fork server that was started before."""
-    child = file_child()
+    child = IsolatedChild(limits=LIMITS, confined_to=NO_FILES)
     try:
         with pytest.raises(TrilightError, match="template 'corridor' is unknown"):
             child.call(parts_of, "corridor")
@@ -112,7 +112,7 @@ def parts_of(name):
 
 def test_a_bug_in_an_extension_is_its_authors_and_stops_at_once(tmp_path: Path) -> None:
     """In a child too: it is neither tried again nor taken for a failure of the environment."""
-    child = file_child()
+    child = IsolatedChild(limits=LIMITS, confined_to=NO_FILES)
     with room_for_extensions():
         bug = load_extension(written(tmp_path, BUG)).module.parts_of
         said = r"^extension own\.py, line 8: KeyError: 'floor'\.$"
