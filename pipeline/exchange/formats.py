@@ -14,11 +14,8 @@ from collections.abc import Callable, Collection, Iterable, Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
-import numpy as np
-from numpy.typing import NDArray
-
 from pipeline.assets.settings import AssetSettings
-from pipeline.exchange.from_description import AlbedoOverOne, scaled_albedo_notes
+from pipeline.exchange.from_description import AlbedoOverOne, Cameras, scaled_albedo_notes
 from pipeline.exchange.gltf.read_gltf import read_gltf
 from pipeline.exchange.gltf.write_gltf import write_gltf
 from pipeline.exchange.renderformer_h5 import read_renderformer_h5, write_renderformer_h5
@@ -64,10 +61,6 @@ class SceneSource:
     def name(self) -> str:
         """Name for messages and notes: the file without its folders, and the key."""
         return self.path.name if self.key is None else f"{self.path.name}{SEPARATOR}{self.key}"
-
-
-Cameras = tuple[NDArray[np.float32], NDArray[np.float32]]
-"""Poses [C, 4, 4] and angles [C] in degrees."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -164,7 +157,7 @@ _GEOMETRY |= {f"materials.{name}" for name in PUBLISHED_COLUMNS}
 """Members that the formats of other programs hold: triangles, cameras and published columns."""
 
 _READ_USD = SceneFormat(
-    read=lambda source, _: read_usd(source.path, source.key, source.usd_folder, USER_PROVIDED),
+    read=lambda source, _: read_usd(source.path, source.key, source.usd_folder),
     keys=lambda source: [key or None for key in usd_keys(source.path, source.usd_folder)],
 )
 _USD = dataclasses.replace(
@@ -174,7 +167,7 @@ _USD = dataclasses.replace(
     named_files=_list_usd_pictures,
     carried=scene_file.CARRIED,
 )
-_READ_GLTF = SceneFormat(read=lambda source, _: read_gltf(source.path, USER_PROVIDED))
+_READ_GLTF = SceneFormat(read=lambda source, _: read_gltf(source.path))
 
 FORMATS: Registry[SceneFormat] = Registry(
     "scene format",

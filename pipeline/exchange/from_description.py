@@ -121,6 +121,9 @@ class SceneDescription:
     """Dotted names of unknown fields, which were left out."""
 
 
+Cameras = tuple[NDArray[np.float32], NDArray[np.float32]]
+"""Poses [C, 4, 4] and angles [C] in degrees."""
+
 AlbedoOverOne = Literal["scale", "refuse"]
 """Treatment of materials whose diffuse and specular albedos add up to more than 1."""
 
@@ -264,9 +267,7 @@ def _pieces(
     return pieces, scale
 
 
-def build_cameras(
-    cameras: Sequence[DescribedCamera], file: str
-) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
+def build_cameras(cameras: Sequence[DescribedCamera], file: str) -> Cameras:
     """Return poses [C, 4, 4] and full angles [C] in degrees; raises TrilightError about a file."""
     poses = []
     for row, camera in enumerate(cameras):

@@ -19,13 +19,12 @@ from pathlib import Path
 from pipeline.exchange.formats import (
     FORMATS,
     SEPARATOR,
-    Cameras,
     LoadedScene,
     SceneFormat,
     SceneSource,
     readable_suffixes,
 )
-from pipeline.exchange.from_description import AlbedoOverOne
+from pipeline.exchange.from_description import AlbedoOverOne, Cameras
 from storage.errors import TrilightError
 from storage.remote.safe_url import safe_url
 

@@ -17,6 +17,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pipeline.exchange.textured_triangles import (
+    MAP_ROWS,
     NO_TEXTURES,
     Map,
     TexturedTriangles,
@@ -28,14 +29,12 @@ from pipeline.exchange.textured_triangles import (
 )
 from pipeline.foreign.material import Slot, SourceMaterial, source_columns
 from pipeline.foreign.picture import Picture, Wrap, spread_points
+from pipeline.scenes.shading_normals import SMALLEST_DOUBLE_AREA
 from storage.conventions import srgb8
 from storage.records.exr import MAX_RESOLUTION
 from storage.records.material import DIFFUSE, EMISSION, ROUGHNESS, SPECULAR, default_rows
 from storage.records.scene import MAX_UV
 from storage.records.texture import MapSource
-
-_SMALLEST_DOUBLE_AREA = 1e-12
-"""Twice the area of a triangle, in square meters, below which it counts as empty."""
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -69,7 +68,7 @@ def drop_empty(
     cross = np.cross(wide[:, 1] - wide[:, 0], wide[:, 2] - wide[:, 0])
     size = min(float(np.ptp(wide.reshape(-1, 3), axis=0).max()), 1.0) if wide.size else 1.0
     length = np.linalg.norm(cross, axis=1, keepdims=True)
-    has_area: NDArray[np.bool_] = length[:, 0] > _SMALLEST_DOUBLE_AREA * size**2
+    has_area: NDArray[np.bool_] = length[:, 0] > SMALLEST_DOUBLE_AREA * size**2
     return positions[has_area], cross[has_area] / length[has_area], has_area
 
 
@@ -90,9 +89,6 @@ _MAX_TILES = 8
 
 _INSIDE = 1e-4
 """Tolerance for coordinates that leave [0, 1] by rounding."""
-
-_STRIP = 256
-"""Number of texel rows whose material columns are computed at a time."""
 
 _TRIANGLES = 4096
 """Number of triangles whose emission is sampled at a time."""
@@ -194,8 +190,8 @@ def _columns(
         tint.shape[:2], *(map_.shape[:2] for map_ in resampled.values())
     )
     values = np.zeros((height, width, 7), np.float32)
-    for first in range(0, height, _STRIP):
-        size = min(_STRIP, height - first)
+    for first in range(0, height, MAP_ROWS):
+        size = min(MAP_ROWS, height - first)
         texel_values = {
             name: _flatten_on_grid(
                 map_[first : first + size] if len(map_) > 1 else map_, size, width

@@ -8,8 +8,8 @@ from pathlib import Path
 from typing import Any
 
 from pipeline.assets.settings import AssetSettings
-from pipeline.exchange.formats import Cameras, LoadedScene, SceneSource
-from pipeline.exchange.from_description import AlbedoOverOne, LoadedMesh
+from pipeline.exchange.formats import LoadedScene, SceneSource
+from pipeline.exchange.from_description import AlbedoOverOne, Cameras, LoadedMesh
 from pipeline.exchange.open_scene import load_cameras, load_source, source_keys
 from pipeline.exchange.scene_files import load_mesh_file
 from pipeline.isolation import (

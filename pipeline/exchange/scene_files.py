@@ -11,11 +11,11 @@ from dataclasses import dataclass, field
 from pathlib import Path
 
 import numpy as np
-from numpy.typing import NDArray
 
 from pipeline.assets.settings import AssetSettings
 from pipeline.exchange.from_description import (
     AlbedoOverOne,
+    Cameras,
     LoadedMesh,
     build_cameras,
     scene_from_description,
@@ -104,7 +104,7 @@ class SceneFiles:
         return scene
 
 
-def read_scene_cameras(root: Path, name: str) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
+def read_scene_cameras(root: Path, name: str) -> Cameras:
     """Read the poses [C, 4, 4] and angles [C] in degrees of a scene file or a list of cameras.
 
     Raises:

@@ -34,8 +34,8 @@ texels of the larger one. The resulting textures have 8 bits, as their sources h
 take four times the memory for digits that no source states.
 """
 
-_MAP_ROWS = 256
-"""Number of rows of a map that are interpolated at a time."""
+MAP_ROWS = 256
+"""Number of rows of a map that are computed at a time."""
 
 EXCESS = 1e-6
 """Tolerance for the rounding of two float32 albedos that add up to 1."""
@@ -358,9 +358,9 @@ def resample_map(values: Map, height: int, width: int) -> Map:
     texture = Texture(texels=values)
     u, v = ((np.arange(count) + 0.5) / count for count in (width, height))
     resampled = np.zeros((height, width, values.shape[2]), np.float32)
-    for first in range(0, height, _MAP_ROWS):
-        uv = np.stack(np.meshgrid(u, v[first : first + _MAP_ROWS]), axis=-1)
-        resampled[first : first + _MAP_ROWS] = texture_values(texture, uv)
+    for first in range(0, height, MAP_ROWS):
+        uv = np.stack(np.meshgrid(u, v[first : first + MAP_ROWS]), axis=-1)
+        resampled[first : first + MAP_ROWS] = texture_values(texture, uv)
     return resampled
 
 

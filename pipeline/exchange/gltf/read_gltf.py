@@ -32,6 +32,7 @@ from pipeline.foreign.gltf.primitives import PlacedPrimitive, placed_primitives
 from pipeline.foreign.limits import ReadLimits
 from pipeline.foreign.numbers import read_number, read_numbers
 from pipeline.foreign.source_file import read_source
+from pipeline.objects.licences import USER_PROVIDED
 from storage.conventions import latlong_direction, latlong_uv
 from storage.errors import Rejected, TrilightError
 from storage.records.environment import Environment
@@ -50,10 +51,8 @@ _SIZE = 0.01
 """Radius of a light as a fraction of the diagonal of the scene."""
 
 
-def read_gltf(path: Path, licence: str) -> LoadedScene:
+def read_gltf(path: Path) -> LoadedScene:
     """Read the default scene of a file; buffers and pictures are in its folder or in the file.
-
-    Objects and textures get the licence, which glTF cannot state.
 
     Raises:
         TrilightError: the file is unusable or too large, or a `Scene` cannot hold it.
@@ -62,7 +61,7 @@ def read_gltf(path: Path, licence: str) -> LoadedScene:
         with refuse_malformed("load_error", "the glTF tree is"):
             document = read_source(path, _LIMITS).gltf
             assert document is not None
-            return _GltfReader(document, path.name, licence).scene()
+            return _GltfReader(document, path.name).scene()
     except Rejected as error:
         raise TrilightError(f"{path.name}: {error}") from error
 
@@ -70,10 +69,9 @@ def read_gltf(path: Path, licence: str) -> LoadedScene:
 class _GltfReader:
     """Reads the scene of one file."""
 
-    def __init__(self, document: GltfDocument, name: str, licence: str) -> None:
+    def __init__(self, document: GltfDocument, name: str) -> None:
         self.document = document
         self.name = name
-        self.licence = licence
         self.lost: list[str] = []
         self._attribution = str(document.tree.get("asset", {}).get("copyright", ""))[:1000]
         self._converter = PartConverter(self.lost)
@@ -151,14 +149,14 @@ class _GltfReader:
             colors=select(primitive.colors),
         )
         name = str(row.get("name", ""))[:200]
-        source = MapSource(name=name, licence=self.licence, attribution=self._attribution)
+        source = MapSource(name=name, licence=USER_PROVIDED, attribution=self._attribution)
         return self._converter.convert(part, source)
 
     def _entry(self, stated: Any) -> SceneObject:
         return SceneObject(
             name=str(stated)[:200].replace("\0", "_"),
             kind="object",
-            licence=self.licence,
+            licence=USER_PROVIDED,
             attribution=self._attribution,
         )
 

@@ -21,6 +21,7 @@ from pipeline.foreign.picture import Picture
 from pipeline.foreign.usd.placed import PlacedPrim
 from pipeline.foreign.usd.stage import OpenedStage
 from pipeline.foreign.usd.texture_nodes import asset_bytes, convert_to_rec709
+from pipeline.objects.licences import USER_PROVIDED
 from storage.errors import TrilightError
 from storage.records.environment import Environment
 from storage.records.texture import MapSource
@@ -186,16 +187,13 @@ _SHAPES: Mapping[str, tuple[Callable[[], NDArray[np.float64]], Sequence[str]]] =
 }
 """Shape of each light, and its sizes along the axes of the light."""
 
-_SAME_ROTATION = 1e-5
-"""Tolerance for a rotation that Trilight wrote: other programs keep angles in float32."""
-
 
 def read_foreign_dome(
-    prim: Any, to_world: NDArray[np.float64], time: Any, opened: OpenedStage, licence: str
+    prim: Any, to_world: NDArray[np.float64], time: Any, opened: OpenedStage
 ) -> Environment | None:
     """Read the environment of any DomeLight; return None, with a note, where it is unusable.
 
-    `to_world` [4, 4] is its transform; a map that states no licence gets `licence`.
+    `to_world` [4, 4] is its transform.
 
     Raises:
         TrilightError: the map file is outside the folder or on the network.
@@ -215,7 +213,7 @@ def read_foreign_dome(
         radiance_rgb=tinted.astype(np.float32),
         rotation=(rotation @ layout.TO_OUR_AXES.T).astype(np.float32),
         is_seen=bool(visibility and visibility.Get(time)),
-        source=MapSource(name=prim.GetName(), licence=licence),
+        source=MapSource(name=prim.GetName(), licence=USER_PROVIDED),
     )
     try:
         sky.check()
@@ -242,7 +240,7 @@ def _take_held(sky: Environment, dome: Any, time: Any) -> Environment:
     if not dome.HasAttribute(layout.VISIBLE_TO_CAMERA):
         sky = dataclasses.replace(sky, is_seen=bool(read_value(layout.SKY_VISIBLE)))
     rows = list(map(read_value, layout.SKY_ROWS))
-    if None in rows or not np.allclose(rows, sky.rotation, atol=_SAME_ROTATION):
+    if None in rows or not np.allclose(rows, sky.rotation, atol=layout.SAME_VALUE):
         return sky
     return dataclasses.replace(sky, rotation=np.array(rows, np.float32))
 

@@ -23,19 +23,13 @@ from pipeline.exchange.textured_triangles import (
     join_triangles,
     rigid_pose,
 )
+from pipeline.exchange.usd import layout
 from pipeline.exchange.usd.foreign_lights import (
     compute_radiance,
     light_triangles,
     read_foreign_dome,
 )
 from pipeline.exchange.usd.held_materials import HeldMaterial, keep_exact, read_columns
-from pipeline.exchange.usd.layout import (
-    FOV_DEG,
-    INDEX,
-    MATERIAL_ATTRIBUTES,
-    OBJECT_TEXTS,
-    parse_camera_row,
-)
 from pipeline.foreign.numbers import read_number
 from pipeline.foreign.usd.materials import MeshMaterials
 from pipeline.foreign.usd.object_source import UsdStage, read_stage_materials
@@ -44,6 +38,7 @@ from pipeline.foreign.usd.polygons import CutMesh, as_array, cut_mesh
 from pipeline.foreign.usd.shaders import StatedMaterial, read_material
 from pipeline.foreign.usd.solids import SOLIDS
 from pipeline.foreign.usd.stage import OpenedStage
+from pipeline.objects.licences import USER_PROVIDED
 from pipeline.scenes.shading_normals import smooth_shaded
 from storage.errors import TrilightError
 from storage.records.environment import Environment
@@ -55,9 +50,6 @@ _MESHES = ("Mesh", *SOLIDS)
 
 _MOST_NOTED = 2
 """Maximum number of notes in the message on a stage without light."""
-
-_SAME_LENS = 1e-5
-"""Relative tolerance for a lens that Trilight wrote."""
 
 
 def _name_lights(notes: Sequence[str]) -> str:
@@ -71,9 +63,9 @@ def _name_lights(notes: Sequence[str]) -> str:
 def _read_row(each: PlacedPrim) -> float:
     """Return the row that Trilight wrote on an object or camera; infinity for other prims."""
     prim = each.prim
-    row = prim.GetAttribute(INDEX).Get()
-    if prim.HasAttribute(FOV_DEG):
-        row = parse_camera_row(prim.GetName())
+    row = prim.GetAttribute(layout.INDEX).Get()
+    if prim.HasAttribute(layout.FOV_DEG):
+        row = layout.parse_camera_row(prim.GetName())
     return row if isinstance(row, int) else math.inf
 
 
@@ -119,13 +111,11 @@ class StageReader:
         stage: Any,
         time: Any,
         opened: OpenedStage,
-        licence: str,
         written: Mapping[str, NDArray[np.float32]],
     ) -> None:
         """Read all materials of a Usd.Stage; `opened.lost` receives notes on losses.
 
-        Objects and textures get the licence; `written` has material rows as Trilight wrote them, by
-        the paths of their prims, where known.
+        `written` has material rows as Trilight wrote them, by the paths of their prims, if known.
 
         Raises:
             Rejected: a picture is outside of the folder, or too large.
@@ -134,7 +124,6 @@ class StageReader:
         self._time = time
         self._lost = opened.lost
         self._opened = opened
-        self._licence = licence
         self._written = written
         self._converter = PartConverter(self._lost)
         self._placed = sorted(placed_prims(stage, time, self._lost), key=_read_row)
@@ -179,7 +168,7 @@ class StageReader:
             elif sky is not None:
                 self._note(each.prim, "a second dome; a scene has one environment")
             else:
-                sky = read_foreign_dome(each.prim, each.to_world, time, self._opened, self._licence)
+                sky = read_foreign_dome(each.prim, each.to_world, time, self._opened)
         is_lit = sky is not None and sky.radiance_rgb.any()
         if not is_lit and not parts.has_emitters:
             raise TrilightError(
@@ -195,11 +184,11 @@ class StageReader:
 
     def _entry(self, prim: Any) -> SceneObject:
         """Return the object entry of a prim: values that Trilight wrote on it, or its name."""
-        texts = {field: prim.GetAttribute(name).Get() for field, name in OBJECT_TEXTS.items()}
+        fields = layout.OBJECT_TEXTS.items()
+        texts = {field: prim.GetAttribute(name).Get() for field, name in fields}
         known = {field: text for field, text in texts.items() if text and isinstance(text, str)}
         known["kind"] = "shell" if known.get("kind") == "shell" else "object"
-        fields: dict[str, Any] = {"name": prim.GetName(), "licence": self._licence, **known}
-        return SceneObject(**fields)
+        return SceneObject(**{"name": prim.GetName(), "licence": USER_PROVIDED, **known})
 
     def _read_camera(self, placed: PlacedPrim) -> tuple[NDArray[np.float64], float] | None:
         """Return pose [4, 4] and full angle in degrees of a camera; None for an unusable one."""
@@ -218,8 +207,8 @@ class StageReader:
             self._note(placed.prim, "no perspective camera with a focal length")
             return None
         angle = math.degrees(2 * math.atan(wide / (2 * focal)))
-        held = placed.prim.GetAttribute(FOV_DEG).Get(time)
-        is_held = isinstance(held, float) and math.isclose(held, angle, rel_tol=_SAME_LENS)
+        held = placed.prim.GetAttribute(layout.FOV_DEG).Get(time)
+        is_held = isinstance(held, float) and math.isclose(held, angle, rel_tol=layout.SAME_VALUE)
         if not is_held and not math.isclose(wide, high, rel_tol=1e-4):
             self._note(placed.prim, "pictures are square; its horizontal angle was used")
         if any(a.Get(time) for a in (camera.GetHorizontalApertureOffsetAttr(),
@@ -322,7 +311,7 @@ class StageReader:
             coordinates=coordinates,
             colors=None if (tints == 1).all() else tints,
         )
-        source = MapSource(name=name, licence=self._licence)
+        source = MapSource(name=name, licence=USER_PROVIDED)
         triangles = self._converter.convert(part, source)
         places = column_places()
         for column, value in added.items():
@@ -333,7 +322,7 @@ class StageReader:
         """Return the inputs of a material; None, with a note, where none are understood."""
         columns = read_columns(material.GetPrim(), self._time, self._lost)
         held = None
-        if columns.keys() >= MATERIAL_ATTRIBUTES.keys():
+        if columns.keys() >= layout.MATERIAL_ATTRIBUTES.keys():
             held = HeldMaterial(material, columns, self._written, self._time, self._opened)
         known = () if held is None else ("specular",)  # Blender writes its specular level there
         stated = read_material(material, self._time, self._opened, known)
@@ -344,6 +333,6 @@ class StageReader:
         if stated is None:
             self._note(material, "no supported shader; its display color is used")
             return None
-        added = {name: columns[name] for name in columns.keys() - MATERIAL_ATTRIBUTES.keys()}
+        added = {name: columns[name] for name in columns.keys() - layout.MATERIAL_ATTRIBUTES.keys()}
         self._extras.append((stated.name, added, exact))
         return stated

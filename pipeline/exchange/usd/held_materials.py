@@ -56,9 +56,6 @@ from storage.records.texture import TEXTURED, MapSource, Texture
 _OPENPBR = f"its shader {OPENPBR}"
 """Words for the shader, for notes."""
 
-_SAME_VALUE = 1e-5
-"""Relative tolerance for a value that Trilight wrote: programs compute in float32."""
-
 _INPUTS = {
     "diffuse": ("base_weight", "base_color"),
     "specular": ("specular_weight", "specular_color", "specular_ior"),
@@ -192,7 +189,7 @@ class HeldMaterial:
                 continue
             constant = parse_color(self._shader.GetInput(name).Get(self._time))
             written = self._columns[column]
-            if constant is not None and not np.allclose(constant, written, _SAME_VALUE, 0):
+            if constant is not None and not np.allclose(constant, written, layout.SAME_VALUE, 0):
                 self._note(
                     f"{column} has a texture, which is used, not its changed constant; disconnect "
                     "the texture to use that"
@@ -264,7 +261,7 @@ class HeldMaterial:
                 place: value
                 for place, value in places.items()
                 if not np.allclose(
-                    value, expected.get(place, written[column]), rtol=_SAME_VALUE, atol=0
+                    value, expected.get(place, written[column]), rtol=layout.SAME_VALUE, atol=0
                 )
             }
             if self._written or len(changed) <= len(places) - 2:

@@ -32,6 +32,9 @@ ROOT = "/Scene"
 SHARD_ROOT = "/Scenes"
 VARIANT_SET = "scene"
 
+SAME_VALUE = 1e-5
+"""Tolerance for a value that Trilight wrote: other programs compute in float32."""
+
 VERSION = NAMESPACE + "schemaVersion"
 DIGEST = NAMESPACE + "sceneSha256"
 PROVENANCE = NAMESPACE + "provenance"

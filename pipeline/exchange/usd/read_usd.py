@@ -69,19 +69,18 @@ def usd_keys(path: Path, folder: Path | None = None) -> list[str]:
     return _read_file(path, lambda: _keys(OpenedStage(path, folder)))
 
 
-def read_usd(path: Path, key: str | None, folder: Path | None, licence: str) -> LoadedScene:
+def read_usd(path: Path, key: str | None = None, folder: Path | None = None) -> LoadedScene:
     """Return one scene of a file.
 
     Args:
         path: the file.
         key: key in a shard, or time code; the first scene by default.
         folder: folder whose files may be read; that of `path` by default.
-        licence: licence of objects that state none.
 
     Raises:
         TrilightError: the file is unusable, lacks the scene, or a `Scene` cannot hold it.
     """
-    return _read_file(path, lambda: _read(OpenedStage(path, folder), key, licence))
+    return _read_file(path, lambda: _read(OpenedStage(path, folder), key))
 
 
 def _read_file(path: Path, read: Callable[[], Read]) -> Read:
@@ -96,7 +95,7 @@ def _read_file(path: Path, read: Callable[[], Read]) -> Read:
         raise TrilightError(f"{path.name}: {text}") from error
 
 
-def _read(opened: OpenedStage, key: str | None, licence: str) -> LoadedScene:
+def _read(opened: OpenedStage, key: str | None) -> LoadedScene:
     from pxr import Usd
 
     shard = _scene_keys(opened.root)
@@ -117,7 +116,7 @@ def _read(opened: OpenedStage, key: str | None, licence: str) -> LoadedScene:
     if frames and key is None:
         opened.lost.append(f"time codes other than {chosen} of {len(frames)}")
     time = Usd.TimeCode(float(chosen)) if chosen else Usd.TimeCode.EarliestTime()
-    scene = StageReader(stage, time, opened, licence, _read_written_rows(opened)).scene()
+    scene = StageReader(stage, time, opened, _read_written_rows(opened)).scene()
     return LoadedScene(scene=scene, notes=opened.notes)
 
 

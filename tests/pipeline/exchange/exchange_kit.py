@@ -59,7 +59,7 @@ def assert_usd_keeps_all(scene: Scene, folder: Path, suffix: str) -> None:
     """To the last bit of everything, and USD's own judges find no fault."""
     path = folder / f"again{suffix}"
     write_usd(path, scene)
-    found = read_usd(path, None, None, "")
+    found = read_usd(path)
     assert not found.notes
     assert encode_scene(found.scene) == encode_scene(scene)
     assert errors_of(Usd.Stage.Open(str(path))) == []

@@ -75,7 +75,7 @@ def quad(
 
 
 def saved(folder: Path, tree: dict[str, Any], buffer: bytes) -> LoadedScene:
-    return read_gltf(write_glb(folder / "a.glb", tree, buffer), "CC0-1.0")
+    return read_gltf(write_glb(folder / "a.glb", tree, buffer))
 
 
 def read(folder: Path, *pictures: bytes | str, **changes: Any) -> LoadedScene:
@@ -222,7 +222,7 @@ def test_coordinates_that_are_not_finite_are_refused(tmp_path: Path) -> None:
 
 def there_and_back(folder: Path, scene: Scene) -> Scene:
     write_scene(folder / "a.glb", scene)
-    return read_gltf(folder / "a.glb", "CC0-1.0").scene
+    return read_gltf(folder / "a.glb").scene
 
 
 @for_each("specular", [(0.2, 0.2, 0.2), (0, 0, 0), (0.4, 0.1, 0.3), (0.9, 0.5, 0.1)])

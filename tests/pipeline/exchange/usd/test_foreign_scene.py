@@ -26,7 +26,7 @@ from tests.scenes_by_hand import tiny_scene
 
 
 def read(path: Path, key: str | None = None) -> LoadedScene:
-    return read_usd(path, key, None, "LicenseRef-user-provided")
+    return read_usd(path, key)
 
 
 def edited(folder: Path, edit: Callable[[Any], object] = lambda stage: None) -> LoadedScene:
@@ -260,7 +260,7 @@ def test_a_huge_picture_is_refused(tmp_path: Path) -> None:
     path = write_stage(tmp_path)
     Image.new("L", (9000, 9000)).save(tmp_path / "tex.png")
     with pytest.raises(TrilightError, match=r"tex.png': 9000 x 9000 pixels; expected at most"):
-        read_usd(path, None, None, "CC0-1.0")
+        read_usd(path)
 
 
 @for_each("is_there", [False, True])
@@ -294,7 +294,7 @@ def child() -> Iterator[IsolatedChild]:
 def read_all(path: Path) -> int:
     """Read every scene of a file; only children come here."""
     for key in usd_keys(path)[:3]:
-        read_usd(path, key or None, None, "").scene.check()
+        read_usd(path, key or None).scene.check()
     return 1
 
 
@@ -378,7 +378,7 @@ def test_values_that_contradict_each_other_or_their_kind_are_refused_or_noted(
     spec.default = value
     stage.GetRootLayer().Export(str(tmp_path / "odd.usda"))
     try:
-        found = read_usd(tmp_path / "odd.usda", None, None, "")
+        found = read_usd(tmp_path / "odd.usda")
     except TrilightError as error:
         assert str(error).startswith("odd.usda: ") and str(error).isprintable()
         assert said in str(error)

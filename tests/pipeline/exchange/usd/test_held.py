@@ -48,7 +48,7 @@ def edited(tmp_path: Path, scene: Scene, edit: Callable[[Any], None]) -> LoadedS
     layer = Sdf.Layer.OpenAsAnonymous(str(tmp_path / "a.usda"))
     edit(layer)
     layer.Export(str(tmp_path / "b.usda"))
-    return read_usd(tmp_path / "b.usda", None, None, "CC0-1.0")
+    return read_usd(tmp_path / "b.usda")
 
 
 def as_blender_writes(layer: Any) -> None:
@@ -299,10 +299,10 @@ def test_a_file_with_the_older_name_of_centers_is_exact(tmp_path: Path) -> None:
     """As the example that comes with the checkout is."""
     room = Path(__file__).parents[4] / "examples" / "room.usdz"
     assert "xformOp:translate:center" in Sdf.Layer.FindOrOpen(str(room)).ExportToString()
-    found = read_usd(room, None, None, "CC0-1.0")
+    found = read_usd(room)
     assert not found.notes
     write_usd(tmp_path / "again.usdz", found.scene)
-    again = read_usd(tmp_path / "again.usdz", None, None, "CC0-1.0")
+    again = read_usd(tmp_path / "again.usdz")
     assert not again.notes and encode_scene(again.scene) == encode_scene(found.scene)
 
 
@@ -379,7 +379,7 @@ def test_the_tutorial_keeps_everything(
         mirrored = dataclasses.replace(scene, uv=scene.uv * np.array([-1, 1], np.float32))
         turned = dataclasses.replace(scene, environment=_turned(scene.environment))
         assert max(_db(mirrored, theirs), _db(turned, theirs)) < 25
-    found = read_usd(tmp_path / "back.usdc", None, None, "LicenseRef-other")
+    found = read_usd(tmp_path / "back.usdc")
     assert_kept(found, scene, lamp, painted)
     done = trilight(["convert", str(tmp_path / "back.usdc"), str(tmp_path / "back.safetensors")])
     assert done.exit_code == 0 and "diffuse was changed" in " ".join(done.output.split())
@@ -474,7 +474,7 @@ def test_a_scene_that_blender_exports_looks_as_blender_renders_it(
     the noise of 128 samples on another processor. A light 10 % brighter gives 27.7 dB.
     """
     theirs = run_blender(tmp_path, {"resolution": SCENE_PX, "spp": SCENE_SPP})
-    found = read_usd(tmp_path / "scene.usdc", None, None, "LicenseRef-user-provided")
+    found = read_usd(tmp_path / "scene.usdc")
     picture = ours(found.scene, SCENE_PX, SCENE_SPP)
     both = np.concatenate([preview_srgb8(theirs), preview_srgb8(picture)], axis=1)
     Image.fromarray(both).save(tmp_path / "blender_and_ours.png")
@@ -485,7 +485,7 @@ def test_a_scene_that_blender_exports_looks_as_blender_renders_it(
     assert agreement > 36
     assert ratio == pytest.approx([1, 1, 1], abs=0.05)
     assert_read(found)
-    again = read_usd(tmp_path / "instances.usdc", None, None, "LicenseRef-user-provided")
+    again = read_usd(tmp_path / "instances.usdc")
     assert sizes(again) == sizes(found)  # instances or copies: the same triangles
 
 

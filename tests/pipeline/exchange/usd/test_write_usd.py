@@ -127,7 +127,7 @@ def scenes(draw: st.DrawFn) -> Scene:
 def test_any_scene_comes_back(tmp_path_factory: Any, scene: Scene, suffix: str) -> None:
     path = tmp_path_factory.mktemp("usd") / f"a{suffix}"
     write_usd(path, scene)
-    back = read_usd(path, None, None, "")
+    back = read_usd(path)
     assert back.notes == () and encode_scene(back.scene) == encode_scene(scene)
 
 
@@ -203,14 +203,14 @@ def test_a_shard_shows_one_scene_at_a_time(tmp_path: Path, suffix: str) -> None:
         stage.GetPrimAtPath("/Scenes").GetVariantSet("scene").SetVariantSelection(key)
         meshes = [prim for prim in stage.Traverse() if prim.IsA(UsdGeom.Mesh)]
         assert len(meshes) == len(set(scene.object_index))
-        found = read_usd(tmp_path / f"s{suffix}", key, None, "")
+        found = read_usd(tmp_path / f"s{suffix}", key)
         assert encode_scene(found.scene) == encode_scene(scene)
     assert usd_keys(tmp_path / f"s{suffix}") == list(kept)
     if suffix != ".usdz":  # one content, one file
         assert len(list(tmp_path.glob("sky-*.exr"))) == 1
         assert len(list(tmp_path.glob("texture-*.png"))) == 3
     with pytest.raises(TrilightError, match="no scene 000000033; expected one of 000000001"):
-        read_usd(tmp_path / f"s{suffix}", "000000033", None, "")
+        read_usd(tmp_path / f"s{suffix}", "000000033")
 
 
 def set_default(path: str, value: Any) -> Callable[[Any], None]:
@@ -239,7 +239,7 @@ def test_what_was_changed_or_added_is_no_longer_ours(
     layer = Sdf.Layer.FindOrOpen(str(tmp_path / "a.usda"))
     edit(layer)
     layer.Export(str(tmp_path / "b.usda"))
-    assert read_usd(tmp_path / "b.usda", None, None, "").notes
+    assert read_usd(tmp_path / "b.usda").notes
 
 
 @pytest.mark.parametrize(
@@ -264,7 +264,7 @@ def test_what_is_not_written(tmp_path: Path, scene: Scene, name: str, message: s
 
 
 def _read(path: Path) -> LoadedScene:
-    return read_usd(path, None, None, "CC0-1.0")
+    return read_usd(path)
 
 
 def _sky(scene: Scene) -> Environment:

@@ -236,7 +236,7 @@ def test_an_object_and_a_scene_are_what_the_file_says(
     assert found.shape == wanted.shape
     np.testing.assert_allclose(found, wanted, atol=2e-3)
     if len(wanted):
-        np.testing.assert_allclose(scene_surface(read_gltf(path, "CC0-1.0")), wanted, atol=2e-3)
+        np.testing.assert_allclose(scene_surface(read_gltf(path)), wanted, atol=2e-3)
 
 
 def test_many_colors_of_vertices_are_a_texture_of_a_scene(tmp_path: Path) -> None:
@@ -248,14 +248,14 @@ def test_many_colors_of_vertices_are_a_texture_of_a_scene(tmp_path: Path) -> Non
     file.add("materials", {"pbrMetallicRoughness": {"metallicFactor": 0}})
     file.add("nodes", {"mesh": 0})
     path = file.save(tmp_path, "glb")
-    scene = read_gltf(path, "CC0-1.0")
+    scene = read_gltf(path)
     assert len(scene.scene.textures) == 1
     np.testing.assert_allclose(scene_surface(scene), surface(path), atol=0.01)
 
 
 def assert_same_surfaces(path: Path) -> None:
     with case(path.name):
-        seen = scene_surface(read_gltf(path, "CC0-1.0"))
+        seen = scene_surface(read_gltf(path))
         np.testing.assert_allclose(seen, surface(path), atol=0.02)
 
 
@@ -336,7 +336,7 @@ def test_what_is_refused(tmp_path: Path, name: str) -> None:
         load_mesh(read_source(path, KEPT))
     assert refusal.value.reason == reason
     with pytest.raises(TrilightError):
-        read_gltf(path, "CC0-1.0")
+        read_gltf(path)
 
 
 @for_each("keep", [4, 11, 30, 0.5, 0.97, -1])
@@ -381,7 +381,7 @@ def test_what_no_code_reads_is_named_once(tmp_path: Path, sentence: str) -> None
     path = plain(UNREAD[sentence]).save(tmp_path, "glb")
     source = read_source(path, KEPT)
     assert source.unread == ((sentence,) if sentence else ())
-    assert set(source.unread) <= set(read_gltf(path, "CC0-1.0").notes)
+    assert set(source.unread) <= set(read_gltf(path).notes)
     assert len(load_mesh(source).faces) == (12 if "instancing" in sentence else 2)
 
 

@@ -68,7 +68,7 @@ def diffuse_of(rgb: Any) -> tuple[float, ...]:
 
 
 def read(path: Path) -> LoadedScene:
-    return read_usd(path, None, None, "CC0-1.0")
+    return read_usd(path)
 
 
 def of_scene(path: Path) -> Looks:
