@@ -554,7 +554,7 @@ def _bytes_of(path: Path) -> bytes:
 
 def _picture(data: bytes, path: Path, widths: Sequence[int]) -> NDArray[np.float32]:
     """Return the radiance [R, R, 3] of a file whose width is one of `widths`."""
-    pixels = decode_pixels(data, path.name)
+    pixels = decode_pixels(data, path.name, [])
     if pixels is None or pixels.dtype != np.float32 or pixels.shape[2] < 3:
         raise TrilightError(
             f"{path.name}: no readable OpenEXR picture of channels R, G and B; expected linear "

@@ -24,7 +24,7 @@ def decode_values(data: bytes, name: str, lost: list[str]) -> NDArray:
         return decode_image(data, name, MAX_PIXELS, lost, replaces_nan=True)
 
 
-def decode_pixels(data: bytes, name: str, lost: list[str] | None = None) -> NDArray | None:
+def decode_pixels(data: bytes, name: str, lost: list[str]) -> NDArray | None:
     """Return a picture [H, W, C], the top row first; None where the bytes are not one.
 
     OpenEXR and Radiance are linear float32 of 1 to 4 channels; others are as `decode_image`.
@@ -33,7 +33,6 @@ def decode_pixels(data: bytes, name: str, lost: list[str] | None = None) -> NDAr
     Raises:
         TrilightError: the picture has more pixels than MAX_PIXELS.
     """
-    lost = [] if lost is None else lost
     try:
         with _refuse_large(name):
             picture = read_linear_picture(data, MAX_PIXELS)

@@ -13,13 +13,7 @@ from numpy.typing import NDArray
 from PIL import Image
 
 from model.scene_tensors import scene_tensors
-from pipeline.exchange.exports.export import (
-    FORMS,
-    MOST_NOTES,
-    SCENE_FORMS,
-    _limit_notes,
-    picture_name,
-)
+from pipeline.exchange.exports import export
 from pipeline.exchange.exports.pictures import stands_alone
 from pipeline.exchange.open_scene import load_source, scene_source
 from storage.conventions import in_camera, preview_srgb8, srgb8
@@ -138,7 +132,7 @@ def test_names_pair_and_targets_are_bit_for_bit(benchmark: Path) -> None:
         sample = toy_sample(int(row["scene"]), resolution=PX)
         assert row["split"] == "train" and row["noise_floor_db"] == "100.000"
         target = benchmark / row["target"]
-        assert target.name == picture_name(row["scene"], int(row["view"]))
+        assert target.name == export.picture_name(row["scene"], int(row["view"]))
         # the published inference drops the suffix of the HDF5 file and adds _view_N.exr
         assert target.name == f"{Path(row['h5']).stem}_view_{row['view']}.exr"
         half = sample.radiance_rgb[int(row["view"])].astype(np.float16)
@@ -160,10 +154,10 @@ def _same_scene(path: Path, sample: Sample) -> bool:
 
 
 def test_many_losses_are_counted_once_each_is_told() -> None:
-    assert _limit_notes("h5", ["a", "b"]) == ["h5 cannot hold a", "h5 cannot hold b"]
-    told = _limit_notes("json", [str(number) for number in range(MOST_NOTES + 3)])
-    assert len(told) == MOST_NOTES + 1 and told[-1] == "json loses 3 more things of this kind"
-    assert set(SCENE_FORMS) == {"h5", "json", "usd", "exr"}
+    assert export._limit_notes("h5", ["a", "b"]) == ["h5 cannot hold a", "h5 cannot hold b"]
+    told = export._limit_notes("json", [str(number) for number in range(export.MOST_NOTES + 3)])
+    assert told[export.MOST_NOTES :] == ["json loses 3 more things of this kind"]
+    assert set(export.SCENE_FORMS) == {"h5", "json", "usd", "exr"}
 
 
 SIZE = 16
@@ -332,7 +326,7 @@ def test_hypersim(dataset: Path) -> None:
     np.testing.assert_allclose(world[hit], read(f"{geometry}.normal_world.hdf5")[hit], atol=1e-6)
 
 
-@for_each("form", FORMS)
+@for_each("form", export.FORMS)
 def test_the_same_dataset_gives_the_same_bytes(dataset: Path, form: str) -> None:
     first = _files(exported(dataset, form, "--split", "test"))
     (dataset.parent / form).rename(dataset.parent / f"first {form}")
