@@ -95,18 +95,31 @@ def choose_variant(default: Device = "cpu", *, device: Device | None = None) -> 
     Later calls read the remembered probes.
 
     Args:
+        default, device: as `choose_gpu`.
+
+    Raises:
+        TrilightError: as `choose_gpu`, or no LLVM library works here.
+        EnvironmentFailure: a probe gave no answer, which says nothing about its library: with
+            another one, the same dataset would be of other bytes.
+    """
+    gpu, note = choose_gpu(default, device=device)
+    return gpu or dataclasses.replace(_on_processor(), note=note)
+
+
+def choose_gpu(default: Device, *, device: Device | None = None) -> tuple[Variant | None, str]:
+    """Return the variant of a GPU, or None and a note for the user where the CPU is to work.
+
+    Args:
         default: device where neither `device` nor TRILIGHT_VARIANT names one.
         device: device of an option or a dataset, before which TRILIGHT_VARIANT does not count.
 
     Raises:
-        TrilightError: no LLVM library works here; TRILIGHT_VARIANT names no variant; a GPU is named
-            and renders no right picture.
-        EnvironmentFailure: a probe gave no answer, which says nothing about its library: with
-            another one, the same dataset would be of other bytes.
+        TrilightError: TRILIGHT_VARIANT names no variant; a GPU is named and renders no right
+            picture.
     """
     chosen = device or named_device() or default
     if chosen == "cpu" or (chosen == "auto" and not visible_gpus()):
-        return _on_processor()
+        return None, ""
     if not visible_gpus():
         raise _refused_gpu(device, "no NVIDIA GPU is visible here")
     versions = map(_version, ("mitsuba", "drjit", "pyoidn"))
@@ -116,10 +129,9 @@ def choose_variant(default: Device = "cpu", *, device: Device | None = None) -> 
         note = (
             probed.denoiser_problem and f"{probed.denoiser_problem}, so the CPU denoises pictures"
         )
-        return dataclasses.replace(_GPU, denoiser="CPU" if note else "CUDA", note=note)
+        return dataclasses.replace(_GPU, denoiser="CPU" if note else "CUDA", note=note), ""
     if chosen == "auto":
-        note = f"the GPU renders no right picture ({probed.problem}), so the CPU renders"
-        return dataclasses.replace(_on_processor(), note=note)
+        return None, f"the GPU renders no right picture ({probed.problem}), so the CPU renders"
     raise _refused_gpu(device, f"the GPU renders no right picture ({probed.problem})")
 
 
