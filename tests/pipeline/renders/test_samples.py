@@ -26,7 +26,7 @@ from pipeline.renders.samples import (
     slope_db,
     tile_means,
 )
-from pipeline.renders.settings import NoiseTargets, RenderSettings
+from pipeline.renders.settings import RenderSettings, target_overrides
 from pipeline.renders.tracer import Chosen, PixelCamera, load_tracer
 from storage.conventions import log10_radiance
 from storage.errors import TrilightError
@@ -147,13 +147,13 @@ def test_a_narrow_picture_has_more_samples_before_the_first_look() -> None:
 
 def test_targets_go_by_the_name_of_their_metric() -> None:
     for targets, expected in (
-        (NoiseTargets(), {"psnr_log_db": 40.0}),
-        (NoiseTargets(linear_db=35.0), {"psnr_linear_db": 35.0}),
-        (NoiseTargets(log_db=44.0, objects_db=43.0),
+        ({}, {"psnr_log_db": 40.0}),
+        ({"noise_floor_linear_db": 35.0}, {"psnr_linear_db": 35.0}),
+        ({"noise_floor_db": 44.0, "noise_floor_objects_db": 43.0},
          {"psnr_log_db": 44.0, "object_psnr_log_db": 43.0}),
     ):  # fmt: skip
         assert ToStatedError(targets=targets).settings(64).targets_db == expected
-        assert RenderSettings(**{**GOOD, **targets.overrides}).targets_db == expected
+        assert RenderSettings(**{**GOOD, **target_overrides(targets)}).targets_db == expected
 
 
 def log_goal(target_db: float, step: int, max_spp: int) -> Goal:
