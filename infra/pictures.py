@@ -33,7 +33,7 @@ from pipeline.foreign.source_file import load_mesh, read_source
 from pipeline.generation.generate_options import GenerateOptions
 from pipeline.generation.pipeline import make_dataset
 from pipeline.renders.mitsuba_variant import choose_variant
-from pipeline.renders.results import RenderedView
+from pipeline.renders.renderer import RenderedView
 from storage.conventions import preview_gain, preview_srgb8
 from storage.dataset.dataset import open_dataset
 from storage.metrics import psnr_log_db

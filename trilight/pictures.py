@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from infra.render.quality import MOST_TRACED_SPP, ToStatedError
 from infra.render.sources import own_camera
 from infra.torch_library import require_torch
-from pipeline.renders.results import RenderedView
+from pipeline.renders.renderer import RenderedView
 from pipeline.renders.settings import StatedError
 from storage.atomic import write_atomically
 from storage.conventions import HALF_FLOAT_MAX, preview_srgb8

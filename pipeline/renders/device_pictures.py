@@ -202,7 +202,7 @@ class DevicePictures(ViewPictures):
 
     @staticmethod
     def mean_radiance(samples: DualBuffer) -> float:
-        resolution = len(samples.spp_of(0))
+        resolution = samples.spp_by_half.shape[-1]
         total, broken = read_back(_brightness(KernelInputs(), _sums(samples), resolution))
         require_finite(int(broken))
         return float(total) / (3 * resolution**2)

@@ -359,12 +359,7 @@ def floors_of(numbers: LookNumbers, counts: tuple[NDArray[np.float64], ...]) -> 
     errors = numbers.adds[3:]
     surprises = numbers.most[:-1].max(axis=1)
     counts = counts * (len(errors) // 3)
-    rows = [
-        (total / max(count.sum(), 1), float(surprise), error, count)
-        for total, surprise, error, count in zip(
-            numbers.sums[3:], surprises, errors, counts, strict=True
-        )
-    ]
+    rows = list(zip(numbers.sums[3:], surprises, errors, counts, strict=True))
     return [measured_floor(rows[first : first + 3]) for first in range(0, len(rows), 3)]
 
 
@@ -378,13 +373,14 @@ NUMPY = Pixels()
 
 def read_sums(samples: DualBuffer, *, squares: bool = False) -> Sums:
     """Return the sums of a view, with their squares or 0; raises as `ViewPictures.look`."""
-    shape = samples.spp_of(0).shape
     sums = [
         [
-            [*each.read(), each.read_squares() if squares else np.zeros(shape), spp, passes]
-            for each in samples.sums[half]
+            [*each.read(), each.read_squares() if squares else np.zeros(spp.shape), spp, passes]
+            for each in half
         ]
-        for half, spp, passes in ((n, samples.spp_of(n), samples.count_of(n)) for n in range(2))
+        for half, spp, passes in zip(
+            samples.sums, samples.spp_by_half, samples.passes_by_half, strict=True
+        )
     ]
     require_finite(int(broken_pixels(sums, NUMPY).sum()))
     return sums

@@ -161,16 +161,18 @@ def sky_share(scene: Scene, sky: Environment) -> float:
     """Return the share of the picks that go to the environment: above 0, and 1 without lamps.
 
     Lamps weigh area x radiance. In that unit a map weighs 2 pi R^2 times its mean radiance, with R
-    the radius of the scene. But most of a smooth map is found by directions that the surface draws,
-    and samples that pick it are taken from the lamps: picked by its whole power, a bright constant
-    map had twice the error. So a map weighs what it has in peaks, its mean less its median, and at
-    least as much as the average lamp (study S29).
+    the radius of the sphere around the bounding box of all surfaces. But most of a smooth map is
+    found by directions that the surface draws, and samples that pick it are taken from the lamps:
+    picked by its whole power, a bright constant map had twice the error. So a map weighs what it
+    has in peaks, its mean less its median, and at least as much as the average lamp (study S29).
     """
     power = lamp_power(scene)
     lamps = len(np.unique(scene.object_index[scene.triangle_emits]))
     if not power > 0:
         return 1.0
-    weight = max(2 * np.pi * surface_radius(scene) ** 2 * peaked_radiance(sky), power / lamps)
+    corners = scene.vertex_positions[scene.faces[~scene.triangle_emits]].reshape(-1, 3)
+    radius = float(0.5 * np.linalg.norm(np.ptp(corners.astype(np.float64), axis=0)))
+    weight = max(2 * np.pi * radius**2 * peaked_radiance(sky), power / lamps)
     return float(weight / (weight + power))
 
 
@@ -179,12 +181,6 @@ def lamp_power(scene: Scene) -> float:
     emits = scene.triangle_emits
     radiance = scene.materials[scene.material_index[emits]][:, EMISSION].astype(np.float64)
     return float((triangle_areas(scene, emits)[3] * radiance.mean(axis=1)).sum())
-
-
-def surface_radius(scene: Scene) -> float:
-    """Return the radius of the sphere around the bounding box of all surfaces, emitters not."""
-    corners = scene.vertex_positions[scene.faces[~scene.triangle_emits]].reshape(-1, 3)
-    return float(0.5 * np.linalg.norm(np.ptp(corners.astype(np.float64), axis=0)))
 
 
 def peaked_radiance(sky: Environment) -> float:

@@ -35,18 +35,6 @@ _RAYS_PER_SIDE = 64
 """The ray spacing is 2.8 % of the box: one ray in forty hits the outline of a large object."""
 
 
-@dataclass(frozen=True, kw_only=True)
-class EdgeCounts:
-    """Numbers of edges by how many faces share them."""
-
-    open: int
-    """Edges of one face: the border of an open surface."""
-    nonmanifold: int
-    """Edges that three or more faces share."""
-    most_faces: int
-    """Largest number of faces that share one edge."""
-
-
 def level_mesh(level: Level) -> TriangleMesh:
     """Return the mesh of a level in double precision."""
     return TriangleMesh(
@@ -80,15 +68,10 @@ def smallest_angles_deg(mesh: TriangleMesh) -> NDArray[np.float64]:
     return np.degrees(np.arccos(np.clip(cosine, -1.0, 1.0)))
 
 
-def count_edges(mesh: TriangleMesh) -> EdgeCounts:
-    """Count the open and non-manifold edges."""
+def faces_of_edges(mesh: TriangleMesh) -> NDArray[np.int64]:
+    """Return the number [E] of faces that share each edge: 1 at the border of an open surface."""
     ends = np.sort(half_edges(mesh), axis=1)
-    shared = np.unique(ends[:, 0] * len(mesh.positions) + ends[:, 1], return_counts=True)[1]
-    return EdgeCounts(
-        open=int((shared == 1).sum()),
-        nonmanifold=int((shared > 2).sum()),
-        most_faces=int(shared.max()),
-    )
+    return np.unique(ends[:, 0] * len(mesh.positions) + ends[:, 1], return_counts=True)[1]
 
 
 def half_edges(mesh: TriangleMesh) -> NDArray[np.int64]:
@@ -224,7 +207,7 @@ class MeasuredSource:
             lost_area=round_digits(self._lost_area(measured.to_other)),
             area_variation=round_digits(area_variation(result)),
             min_angle_p5_deg=round_digits(np.percentile(smallest_angles_deg(result), 5)),
-            open_edges=count_edges(result).open,
+            open_edges=int((faces_of_edges(result) == 1).sum()),
         )
 
 

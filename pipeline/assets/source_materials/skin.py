@@ -158,16 +158,15 @@ def read_source_surface(
             texture_coordinates_not_finite.
     """
     decode = Decoder(settings.max_pixels)
-    parts = _parts(source, decode, emission=settings.emission, normals=settings.normal_maps)
+    parts = _parts(source, decode, settings)
     source.notes.extend(decode.notes)
     lost = {word for material in parts.materials for word in material.lost}
     lost -= {"emission"} if settings.emission else set()
     return match_source_surface(mesh, parts), OwnMaterials(lost=tuple(sorted(lost)))
 
 
-def _parts(
-    source: SourceFile, decode: Decode, *, emission: bool, normals: bool = False
-) -> TexturedMesh:
+def _parts(source: SourceFile, decode: Decode, settings: OwnMaterialSettings) -> TexturedMesh:
+    emission, normals = settings.emission, settings.normal_maps
     if source.usd is not None:  # whose normal maps its limits have chosen
         return usd_textured_mesh(source.usd, decode, emission=emission)
     if source.gltf is not None:

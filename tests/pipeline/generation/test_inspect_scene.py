@@ -25,7 +25,7 @@ from pipeline.generation.render_sample import RenderInput, ViewProgress, render_
 from pipeline.presets.registry import preset_settings
 from pipeline.presets.settings import DatasetSettings
 from pipeline.renders.mitsuba_variant import Device, Variant, activate, choose_variant
-from pipeline.renders.results import RenderedView
+from pipeline.renders.renderer import RenderedView
 from storage.conventions import look_at_c2w
 from storage.dataset.layout import DatasetFolder
 from storage.dataset.shard import write_shard

@@ -19,8 +19,7 @@ from pipeline.renders.preview import (
     timed_parts,
     usual_filter,
 )
-from pipeline.renders.renderer import SceneRenderer
-from pipeline.renders.results import GrowingPicture, RenderedView, run_to_end
+from pipeline.renders.renderer import GrowingPicture, RenderedView, SceneRenderer, run_to_end
 from pipeline.renders.settings import Filtered, RenderSettings
 from pipeline.renders.tracer import PixelCamera
 from storage.denoiser import Features

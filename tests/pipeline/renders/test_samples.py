@@ -343,7 +343,7 @@ def _adapted(
     tracer: object, seed: int, measured_at: Sequence[int], counted: NDArray[np.bool_] = EVERYWHERE
 ) -> DualBuffer:
     samples = DualBuffer([tracer], CAMERA, seed, first_spp=32, max_spp=4096)  # type: ignore[list-item]
-    samples.count_over(counted)
+    samples.counted = counted
     tiles, before = TileChoice(counted), np.zeros((2, 1, 1, 1))
     for spp in measured_at:
         more = tiles.passes(samples, spp) if samples.spp else None
@@ -367,7 +367,7 @@ def test_the_mean_stays_unbiased_where_tiles_are_chosen_by_rare_light() -> None:
     for seed in range(1000):
         samples = _adapted(RareLight(), seed, [32, 128, 512])
         means.append(mean_of(samples).mean())
-        spread.append(samples.spp_of(0).max() > samples.spp_of(0).min())
+        spread.append(samples.spp_by_half[0].max() > samples.spp_by_half[0].min())
     assert np.mean(spread) > 0.9, "the samples are spread unevenly"
     error = np.std(means, ddof=1) / np.sqrt(len(means))
     assert error < 0.02 * truth, "a bias of 8 % would show"
@@ -412,7 +412,7 @@ def test_noisy_tiles_get_more_and_what_shows_nothing_gets_no_more() -> None:
     tracer, counted = RareLight(), np.ones((32, 32), bool)
     tracer.ODDS, counted[:, 24:] = 0.0, False
     samples = _adapted(tracer, 1, [32, 128, 512], counted)
-    of_column = (samples.spp_of(0) + samples.spp_of(1)).mean(axis=0)[::TILE_PX]
+    of_column = samples.spp_by_half.sum(axis=0).mean(axis=0)[::TILE_PX]
     assert of_column[0] < of_column[1] < of_column[2], "the noise grows to the right"
     assert of_column[3] == 128, "as many as before tiles were chosen"
     assert 512 <= samples.spp <= 512 + 2 * PASS
