@@ -56,6 +56,9 @@ class KernelPixels(Pixels):
     select: Any = staticmethod(dr.select)
     sqrt: Any = staticmethod(dr.sqrt)
     maximum: Any = staticmethod(dr.maximum)
+    brightest: Any = staticmethod(dr.max)
+    channels: Any = staticmethod(list)
+    mean: Any = staticmethod(operator.truediv)
 
     def __init__(self, resolution: int) -> None:
         self._resolution = resolution
@@ -72,20 +75,11 @@ class KernelPixels(Pixels):
     def clamp(self, radiance: Any) -> Any:
         return dr.clip(radiance, 0, 1)
 
-    def channels(self, color: Any) -> Sequence[Any]:
-        return list(color)
-
     def channel_mean(self, color: Any) -> Any:
         return channel_sum(color) / 3
 
-    def brightest(self, color: Any) -> Any:
-        return dr.max(color)
-
     def is_finite(self, color: Any) -> Any:
         return dr.all(dr.isfinite(color))
-
-    def mean(self, total: Any, count: Any) -> Any:
-        return total / count
 
     def difference(self, first: Any, second: Any) -> Any:
         return mi.Color3d(first) - mi.Color3d(second)

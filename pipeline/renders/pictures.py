@@ -226,7 +226,7 @@ def clean_pictures(
         inputs = list(to_filter(pictures, names))
         are_lights = len(inputs) > len(names or ("",))
         cleaned = pixels.clean(inputs, outputs, guides, are_lights=are_lights)
-        denoised.append(put_together(pictures, cleaned, names, pixels.with_means, pixels.shares))
+        denoised.append(put_together(pictures, cleaned, names, pixels))
     return denoised
 
 

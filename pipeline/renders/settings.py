@@ -1,6 +1,5 @@
 """`RenderSettings`: how good a picture must be, and how much it may cost."""
 
-import math
 from collections.abc import Mapping
 from typing import Annotated, Any, Literal
 
@@ -156,12 +155,6 @@ class RenderSettings:
         for complaint, holds in laws.items():
             if not holds:
                 raise TrilightError(f"render settings: {complaint}.")
-
-    @property
-    def first_spp(self) -> int:
-        """Samples per pixel before the first measurement, both halves together."""
-        narrower = max(1, math.ceil(self.min_spp_px / self.resolution))
-        return min(self.min_spp * narrower, self.max_spp)
 
     @property
     def part_names(self) -> tuple[str, ...]:

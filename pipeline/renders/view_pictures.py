@@ -14,9 +14,9 @@ came out darker, by 1.3 % on average over the views of 16 scenes at 256 samples 
 
 import functools
 import operator
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -24,6 +24,9 @@ from numpy.typing import NDArray
 from pipeline.renders.noise_floor import MeasuredFloor
 from storage.conventions import HALF_FLOAT_MAX
 from storage.errors import Rejected
+
+if TYPE_CHECKING:
+    from pipeline.renders.pixels import Pixels
 
 LEAST_PASSES = 10
 """Passes from which on their spread says how far a pixel has converged: of fewer, 4 standard errors
@@ -129,8 +132,7 @@ def put_together(
     pictures: Sequence[Any],
     filtered: Sequence[Any],
     names: Sequence[str],
-    with_means_of: Callable[[Sequence[tuple[Any, Any]]], Sequence[Any]],
-    shares_of: Callable[[Sequence[Any]], Sequence[Any]],
+    pixels: "Pixels",
 ) -> list[Any]:
     """Return the pictures without noise, from those that `to_filter` yields as they were denoised.
 
@@ -142,18 +144,17 @@ def put_together(
     Args:
         pictures: as they were traced.
         filtered: one for each that `to_filter` yields.
-        with_means_of: gives pairs, denoised and raw, the mean brightness of the raw ones.
-        shares_of: returns what share of their sum each of some pictures is.
+        pixels: operations on all of these.
     """
     count = max(1, len(names))
     num_lights = len(pictures) // count
     every = 1 if num_lights == 1 else 1 + num_lights
     raws = [add_up(pictures[part::count]) for part in range(count)]
-    together = with_means_of(list(zip(filtered[::every], raws, strict=True)))
+    together = pixels.with_means(list(zip(filtered[::every], raws, strict=True)))
     denoised = list(pictures)
     for part, picture in enumerate(together):
         alone = filtered[part * every + 1 : (part + 1) * every]
-        shares = shares_of(alone) if alone else []
+        shares = pixels.shares(alone) if alone else []
         denoised[part::count] = [picture * share for share in shares] or [picture]
     return denoised
 

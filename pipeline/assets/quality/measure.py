@@ -55,7 +55,7 @@ def round_digits(value: float) -> float:
 
 def area_variation(mesh: TriangleMesh) -> float:
     """Return the standard deviation of the areas over their mean; 0 where all are equal."""
-    areas = np.linalg.norm(mesh.double_area_vectors, axis=1)
+    areas = mesh.areas
     return float(areas.std() / areas.mean())
 
 
@@ -117,7 +117,7 @@ def sample_surface(
         mesh: at least one face with area.
         uniform: [N, 3] independent numbers in [0, 1).
     """
-    total = np.cumsum(np.linalg.norm(mesh.double_area_vectors, axis=1))
+    total = np.cumsum(mesh.areas)
     target = (np.arange(len(uniform)) + uniform[:, 0]) / len(uniform) * total[-1]
     face = np.minimum(np.searchsorted(total, target, side="right"), len(total) - 1)
     root = np.sqrt(uniform[:, 1])
@@ -167,11 +167,11 @@ class MeasuredSource:
         self.num_components = len(extents)
         self._lost_beyond = np.maximum(_OWN_SIZE * extents, _VISIBLE)[self._component]
         self._silhouette = silhouette(mesh)
-        self._area = _area(mesh)
+        self._area = float(mesh.areas.sum())
 
     def area_ratio(self, result: TriangleMesh) -> float:
         """Return the area of `result` as a multiple of the source's."""
-        return _area(result) / self._area
+        return float(result.areas.sum()) / self._area
 
     def _lost_area(self, distances: NDArray[np.float64]) -> float:
         """Return the fraction of the source's area in lost components.
@@ -209,10 +209,6 @@ class MeasuredSource:
             min_angle_p5_deg=round_digits(np.percentile(smallest_angles_deg(result), 5)),
             open_edges=int((faces_of_edges(result) == 1).sum()),
         )
-
-
-def _area(mesh: TriangleMesh) -> float:
-    return 0.5 * float(np.linalg.norm(mesh.double_area_vectors, axis=1).sum())
 
 
 def label_components(mesh: TriangleMesh) -> NDArray[np.int64]:

@@ -266,8 +266,7 @@ class SourceSurface:
     @cached_property
     def _areas(self) -> NDArray[np.float64]:
         """Area [R] of each face of the file, in the unit box."""
-        vectors = normalize(self.parts.mesh).double_area_vectors
-        return 0.5 * np.linalg.norm(vectors, axis=1)
+        return normalize(self.parts.mesh).areas
 
 
 def _unit_normals(corners: NDArray[np.float64]) -> NDArray[np.float64]:

@@ -401,7 +401,7 @@ def test_far_from_its_targets_a_view_goes_on_by_its_halves(
     np.testing.assert_array_equal(found.radiance_rgb, expected.radiance_rgb)
     measured.clear()
     view = render_view(lit_scene(), dataclasses.replace(near, noise_floor_db=1.0), 3)
-    assert len(measured) == 1 and view.spp == near.first_spp and not view.at_cap
+    assert len(measured) == 1 and view.spp == first_spp(near) and not view.at_cap
 
 
 def test_other_versions_and_damage(tmp_path: Path) -> None:

@@ -11,6 +11,7 @@ from hypothesis.extra import numpy as hnp
 from numpy.typing import NDArray
 
 from infra.render.quality import ToStatedError
+from pipeline.renders.calibrated_error import first_spp
 from pipeline.renders.noise_floor import Curve
 from pipeline.renders.pictures import NUMPY, means, pixel_errors, read_sums
 from pipeline.renders.renderer import SceneRenderer
@@ -60,7 +61,7 @@ class Recorder:
 
 
 def test_passes_are_the_largest_that_fit_and_weigh_by_their_samples() -> None:
-    for first_spp, spp, max_spp, of_a_half in (
+    for least_spp, spp, max_spp, of_a_half in (
         (128, 128, 512, [64]),
         (32, 32, 4096, [16]),
         (32, 160, 160, [16, 16, 16, 16, 16]),
@@ -69,7 +70,7 @@ def test_passes_are_the_largest_that_fit_and_weigh_by_their_samples() -> None:
         (32, 256, 4096, [16, 16, 16, 16, 64]),
     ):
         tracer = Recorder()
-        samples = DualBuffer([tracer], CAMERA, 0, first_spp=first_spp, max_spp=max_spp)  # type: ignore[list-item]
+        samples = DualBuffer([tracer], CAMERA, 0, first_spp=least_spp, max_spp=max_spp)  # type: ignore[list-item]
         for _ in samples.passes_to(spp):
             pass
         assert samples.spp == spp
@@ -139,10 +140,10 @@ def test_a_narrow_picture_has_more_samples_before_the_first_look() -> None:
     for resolution, max_spp, first in ((512, 4096, 64), (128, 4096, 64), (64, 4096, 128),
                                        (96, 4096, 128), (8, 64, 64)):  # fmt: skip
         settings = {**GOOD, "resolution": resolution, "min_spp": 64, "max_spp": max_spp}
-        assert RenderSettings(**settings).first_spp == first, (resolution, max_spp)
+        assert first_spp(RenderSettings(**settings)) == first, (resolution, max_spp)
     for resolution, first in ((512, 32), (256, 32), (128, 64), (64, 128)):
         settings = {**GOOD, "resolution": resolution, "min_spp": 32, "min_spp_px": 256}
-        assert RenderSettings(**settings).first_spp == first, resolution
+        assert first_spp(RenderSettings(**settings)) == first, resolution
 
 
 def test_targets_go_by_the_name_of_their_metric() -> None:
