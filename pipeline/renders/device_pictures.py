@@ -28,7 +28,6 @@ from pipeline.renders.pictures import (
     means,
     measure_pixels,
 )
-from pipeline.renders.pixels import Pixels
 from pipeline.renders.samples import TILE_PX, DualBuffer
 from pipeline.renders.settings import Filtered
 from pipeline.renders.tracer import PixelCamera
@@ -37,6 +36,7 @@ from pipeline.renders.view_pictures import (
     GLINT,
     MOST_APART,
     Group,
+    Pixels,
     add_up,
     require_finite,
     to_filter,

@@ -71,7 +71,7 @@ class KernelScene:
 
     def to_pick_pdf(self, pdf: Any) -> Any:
         """Return a density among lamps (Float) as a density among lamps and sky."""
-        return pdf if self.sky is None else self.sky.of_lamps(pdf)
+        return pdf if self.sky is None else pdf * self.sky.rest
 
 
 def build_mitsuba_scene(scene: Scene, triangles: NDArray[np.intp], child: Any = None) -> Any:

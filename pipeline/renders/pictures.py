@@ -21,7 +21,6 @@ from pipeline.renders.noise_floor import (
     measured_floor,
     secant_slope,
 )
-from pipeline.renders.pixels import Pixels
 from pipeline.renders.samples import TILE_PX, DualBuffer, by_tiles, tile_means
 from pipeline.renders.settings import Filtered, RenderSettings
 from pipeline.renders.tracer import PixelCamera
@@ -29,6 +28,7 @@ from pipeline.renders.view_pictures import (
     LEAST_PASSES,
     Group,
     MeasuredLook,
+    Pixels,
     add_up,
     floor_groups,
     put_together,

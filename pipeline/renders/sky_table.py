@@ -44,7 +44,8 @@ class SkyTable:
         self._height, self._width = (dr.opaque(mi.UInt32, side) for side in (height, width))
         self._to_world = [opaque_vector(sky.rotation[:, axis]) for axis in range(3)]
         self._share = dr.opaque(mi.Float, share)
-        self._rest = dr.opaque(mi.Float, 1 - share)
+        self.rest = dr.opaque(mi.Float, 1 - share)
+        """Share of the lamps, Float: a density among them times this is one among all picks."""
         self.is_seen = sky.is_seen
         """True if camera rays that hit nothing see the map."""
 
@@ -52,12 +53,8 @@ class SkyTable:
         """Return which picks go to the map (Bool), and the uniform Point2f for map and lamp."""
         last = ONE_MINUS_EPSILON
         to_sky = dr.minimum(u.x / self._share, last)
-        to_lamp = dr.clip((u.x - self._share) / dr.maximum(self._rest, _TINY), 0, last)
+        to_lamp = dr.clip((u.x - self._share) / dr.maximum(self.rest, _TINY), 0, last)
         return u.x < self._share, mi.Point2f(to_sky, u.y), mi.Point2f(to_lamp, u.y)
-
-    def of_lamps(self, value: Any) -> Any:
-        """Return a density (Float) among lamps as one among all picks."""
-        return value * self._rest
 
     def sample(self, u: Any, active: Any) -> tuple[Any, Any, Any]:
         """Return a direction drawn by the light of the map, from a uniform Point2f.

@@ -32,11 +32,10 @@ from pipeline.renders.pictures import (
     read_sums,
     squared_error,
 )
-from pipeline.renders.pixels import with_mean_of
 from pipeline.renders.samples import DualBuffer, TileChoice
 from pipeline.renders.settings import Arithmetic, RenderSettings
 from pipeline.renders.tracer import load_tracer
-from pipeline.renders.view_pictures import LEAST_PASSES
+from pipeline.renders.view_pictures import LEAST_PASSES, with_mean_of
 from storage import denoiser
 from storage.denoiser import Features, denoise, load_oidn, set_denoiser_device
 from storage.errors import TrilightError
