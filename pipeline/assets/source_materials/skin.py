@@ -8,6 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pipeline.assets.quality.measure import (
+    half_edges,
     level_mesh,
     round_digits,
     sample_surface,
@@ -207,8 +208,7 @@ def _color_errors(
 
 def _torn_seams(level: TriangleMesh, source: SourceSurface, reach: float, texel: float) -> float:
     """Return the fraction of inner edge length whose two sides show distant source points."""
-    directed = np.stack([level.faces, np.roll(level.faces, -1, axis=1)], axis=-1).reshape(-1, 2)
-    ends = np.sort(directed, axis=1)
+    ends = np.sort(half_edges(level), axis=1)
     edges, edge, count = np.unique(ends, axis=0, return_inverse=True, return_counts=True)
     edge = edge.ravel()
     order = np.argsort(edge, kind="stable")
