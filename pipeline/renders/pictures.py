@@ -88,7 +88,9 @@ def pixel_errors(
     if not is_filtered:
         return mean(_square(curve(halves.a) - curve(halves.b))) / 2, surprise
     slope = secant_slope(curve, halves.denoised, halves.raw, select=pixels.select)
-    return mean(_square(slope) * _half_estimate(halves)), surprise
+    a, b, denoised_a, denoised_b, difference = halves
+    estimate = _square(denoised_a - b) + _square(denoised_b - a) - _square(a - b)
+    return mean(_square(slope) * (estimate / 2 - _square(difference) / 4)), surprise
 
 
 def pixel_measures(
@@ -119,12 +121,6 @@ def pixel_measures(
     ]
     signed = [slope * (picture - halves.raw), slope * (halves.a - halves.b) / 2, difference]
     return values, signed, surprise
-
-
-def _half_estimate(halves: Halves) -> Any:
-    a, b, denoised_a, denoised_b, difference = halves
-    estimate = _square(denoised_a - b) + _square(denoised_b - a) - _square(a - b)
-    return estimate / 2 - _square(difference) / 4
 
 
 def _square(value: Any) -> Any:

@@ -167,7 +167,8 @@ def read_source_surface(
 
 
 def _parts(source: SourceFile, decode: Decode, settings: OwnMaterialSettings) -> TexturedMesh:
-    emission, normals = settings.emission, settings.normal_maps
+    emission = settings.emission
+    normals = settings.normal_maps
     if source.usd is not None:  # whose normal maps its limits have chosen
         return usd_textured_mesh(source.usd, decode, emission=emission)
     if source.gltf is not None:
