@@ -33,8 +33,7 @@ from pipeline.foreign.source_file import load_mesh, read_source
 from pipeline.generation.generate_options import GenerateOptions
 from pipeline.generation.pipeline import make_dataset
 from pipeline.renders.mitsuba_variant import choose_variant
-from pipeline.renders.results import RenderedView
-from pipeline.renders.settings import NoiseTargets
+from pipeline.renders.renderer import RenderedView
 from storage.conventions import preview_gain, preview_srgb8
 from storage.dataset.dataset import open_dataset
 from storage.metrics import psnr_log_db
@@ -286,7 +285,7 @@ _CARD = "[...document.querySelectorAll('.card')].find(c => c.innerText.startsWit
 
 
 def _trace(scene: Scene, view: int, resolution: int, target_db: float) -> RenderedView:
-    quality = ToStatedError(targets=NoiseTargets(log_db=target_db))
+    quality = ToStatedError(targets={"noise_floor_db": target_db})
     tracer = PathTracer(RenderChild(choose_variant("auto")), quality, resolution)
     with contextlib.closing(tracer):
         camera = own_camera(scene, view, named="view")

@@ -26,7 +26,7 @@ if TYPE_CHECKING:
     from model.inference import NeuralRenderer as NeuralRenderer
     from pipeline.generation.generate_options import GenerateOptions as GenerateOptions
     from pipeline.generation.generation_run import Outcome as Outcome
-    from pipeline.renders.results import RenderedView as RenderedView
+    from pipeline.renders.renderer import RenderedView as RenderedView
     from storage.conventions import preview_srgb8 as preview_srgb8
     from storage.dataset.dataset import Dataset as Dataset
     from storage.dataset.dataset import open_dataset as open_dataset

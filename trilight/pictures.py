@@ -12,8 +12,8 @@ from numpy.typing import NDArray
 from infra.render.quality import MOST_TRACED_SPP, ToStatedError
 from infra.render.sources import own_camera
 from infra.torch_library import require_torch
-from pipeline.renders.results import RenderedView
-from pipeline.renders.settings import NoiseTargets, StatedError
+from pipeline.renders.renderer import RenderedView
+from pipeline.renders.settings import StatedError
 from storage.atomic import write_atomically
 from storage.conventions import HALF_FLOAT_MAX, preview_srgb8
 from storage.errors import TrilightError
@@ -114,13 +114,12 @@ def render_views(
     rows = range(scene.num_views) if views is None else views
     cameras = [own_camera(scene, row, named="view") for row in rows]
     scene.check()
-    targets = NoiseTargets(
-        log_db=noise_floor_db,
-        linear_db=noise_floor_linear_db,
-        objects_db=noise_floor_objects_db,
-    )
     quality = ToStatedError(
-        targets=targets,
+        targets={
+            "noise_floor_db": noise_floor_db,
+            "noise_floor_linear_db": noise_floor_linear_db,
+            "noise_floor_objects_db": noise_floor_objects_db,
+        },
         max_spp=max_spp,
         stated_error=stated_error,
         split=split,

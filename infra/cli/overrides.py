@@ -70,7 +70,7 @@ def with_base_settings(options: Options, base: BaseSettings) -> Options:
     """
     from pipeline.presets.registry import option_overrides, preset_settings  # train does without
 
-    from_options = option_overrides(options.seed, options.resolution, options.noise_targets)
+    from_options = option_overrides(options.seed, options.resolution, vars(options))
     stated = {**from_options, **options.changes}
     changes = merge_overrides(preset_settings(options.build), base, _dataset_record(base), stated)
     if not base.is_given:

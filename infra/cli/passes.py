@@ -1,13 +1,17 @@
 """`trilight passes`: writes depth, normals, ids and more of stored scenes as OpenEXR."""
 
+from collections.abc import Callable
 from pathlib import Path
 from typing import Annotated
 
 from infra.cli.console import first_words, print_result, progress_bars
 from infra.cli.options import command
+from pipeline.renders.mitsuba_variant import Device, activate, choose_gpu
+from storage.raycast.caster import FirstHitCaster, Surfaces
 from storage.records.exr import MAX_RESOLUTION
 from storage.records.passes.declared import pass_names
 from storage.records.passes.pictures import MOST_A_SIDE
+from storage.records.scene import Scene
 from storage.settings.described import checked
 from storage.settings.ranges import Within
 
@@ -30,14 +34,25 @@ class PassOptions:
     """Width of the images; by default the dataset's width, or 256 for a scene file."""
     rays_a_side: Annotated[int, Within(1, MOST_A_SIDE, unit="rays")] = 1
     """Rays along each pixel side, for averaged passes; stored ones have one."""
+    device: Device | None = None
+    """Device that traces: cpu, gpu, or auto (a GPU that renders a test scene correctly); by default
+    auto. Files of cpu equal stored ones byte for byte; on a GPU a pixel on a rim may show the
+    neighboring triangle."""
 
 
 @command("source")
 def passes(options: PassOptions) -> None:
     names = pass_names(name for words in options.passes for name in words.split(","))
+    gpu, note = choose_gpu("auto", device=options.device)
     first_words(f"Writing {', '.join(names)} to {options.out}")
     from pipeline.exchange.pass_files import write_passes
 
+    caster: Callable[[Scene], FirstHitCaster] = Surfaces
+    if gpu is not None:
+        activate(gpu)
+        from pipeline.renders.kernel_scene import CameraRays
+
+        caster = CameraRays
     files: list[Path] = []
     with progress_bars() as bars:
         task = bars.add_task("views", total=None, note="")
@@ -46,7 +61,7 @@ def passes(options: PassOptions) -> None:
             files.append(path)
             bars.advance(task)
 
-        notes = write_passes(
+        scene_notes = write_passes(
             options.source,
             options.out,
             names,
@@ -55,7 +70,9 @@ def passes(options: PassOptions) -> None:
             resolution=options.resolution,
             rays_a_side=options.rays_a_side,
             done=on_file,
+            caster=caster,
         )
-    record = {"files": list(map(str, files)), "notes": list(notes), "passes": names}
+    notes = [*scene_notes, *([f"{note}; see trilight doctor"] if note else [])]
+    record = {"files": list(map(str, files)), "notes": notes, "passes": names}
     rows = [("written", f"{len(files)} files"), ("passes", ", ".join(names))]
     print_result("Passes", rows, record, notes=notes)

@@ -16,7 +16,6 @@ from pipeline.renders.preview import MOST_SPP, usual_filter
 from pipeline.renders.settings import (
     Filtered,
     NoiseFloor,
-    NoiseTargets,
     Resolution,
     Samples,
     StatedError,
@@ -122,11 +121,7 @@ class RenderOptions:
         if self.spp is not None:
             return FixedSamples(spp=self.spp, denoiser=self.denoiser or usual_filter(self.spp))
         return ToStatedError(
-            targets=NoiseTargets(
-                log_db=self.noise_floor_db,
-                linear_db=self.noise_floor_linear_db,
-                objects_db=self.noise_floor_objects_db,
-            ),
+            targets=vars(self),
             max_spp=self.max_spp,
             stated_error=self.stated_error,
             split=self.split,

@@ -18,8 +18,7 @@ from pipeline.isolation import ChildFailed, ChildLimits, IsolatedChild, Result, 
 from pipeline.renders.mitsuba_variant import Variant, activate, environment
 from pipeline.renders.noise_floor import MeasuredFloor
 from pipeline.renders.preview import Preview, PreviewRenderer, PreviewSettings
-from pipeline.renders.renderer import SceneRenderer, set_threads
-from pipeline.renders.results import GrowingPicture, RenderedView
+from pipeline.renders.renderer import GrowingPicture, RenderedView, SceneRenderer, set_threads
 from pipeline.renders.settings import FIRST_SPP, RenderSettings
 from storage.errors import Rejected, Unrenderable
 from storage.machine import available_cores

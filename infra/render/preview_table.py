@@ -22,7 +22,7 @@ import numpy as np
 from infra.processor import processor
 from infra.render.quality import Budget, FixedSamples
 from pipeline.renders.mitsuba_variant import Variant
-from pipeline.renders.preview import MOST_SPP, SCENE, preview_parts, seconds_of
+from pipeline.renders.preview import MOST_SPP, SCENE, preview_parts
 from pipeline.renders.settings import Filtered, Resolution
 from storage.atomic import write_atomically
 from storage.cache import cache_folder
@@ -260,7 +260,8 @@ def price_all(
             seconds = part_s[NETWORK_SCENE] / per_scene + part_s[NETWORK_VIEW]
         else:
             parts = preview_parts(samples.spp, samples.denoiser)
-            seconds = part_s[SCENE] / per_scene + seconds_of(parts, part_s)
+            seconds = sum(count * part_s[name] for name, count in parts.items())
+            seconds += part_s[SCENE] / per_scene
         priced.append(
             Priced(
                 samples=samples,

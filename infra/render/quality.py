@@ -1,7 +1,7 @@
 """Quality of a picture: a measured error, a number of samples, or a budget that chooses them."""
 
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import Any, Literal
 
 from pipeline.renders.preview import PreviewSettings
@@ -10,12 +10,11 @@ from pipeline.renders.settings import (
     FIRST_SPP,
     USUAL_FLOOR_DB,
     Filtered,
-    NoiseTargets,
     RenderSettings,
     StatedError,
+    Targets,
+    target_overrides,
 )
-
-USUAL_TARGETS = NoiseTargets(log_db=USUAL_FLOOR_DB)
 
 MOST_TRACED_SPP = 4096
 """Default maximum number of samples per pixel."""
@@ -25,7 +24,7 @@ MOST_TRACED_SPP = 4096
 class ToStatedError:
     """Samples until the measured error reaches its targets."""
 
-    targets: NoiseTargets = USUAL_TARGETS
+    targets: Targets = field(default_factory=dict)
     """Target errors; psnr_log_db of 40 where none is set."""
     max_spp: int = MOST_TRACED_SPP
     split: bool = False
@@ -42,21 +41,18 @@ class ToStatedError:
         Raises:
             TrilightError: a value is invalid; the message names it.
         """
-        targets = self.targets if self.targets.overrides else USUAL_TARGETS
+        targets = target_overrides(self.targets) or {"noise_floor_db": USUAL_FLOOR_DB}
         is_bound = self.stated_error == "bound"
         looks: Mapping[str, Any] = {"min_spp": FIRST_SPP} if is_bound else CALIBRATED_LOOKS
         return RenderSettings(
             resolution=resolution,
-            noise_floor_db=targets.log_db,
-            noise_floor_linear_db=targets.linear_db,
-            noise_floor_objects_db=targets.objects_db,
             max_spp=self.max_spp,
             max_depth=self.max_depth,
             min_mean_radiance=0.0,
             split=self.split,
             split_lobes=self.split_lobes,
             arithmetic="device",
-            **dict(looks) | {"min_spp": min(looks["min_spp"], self.max_spp)},
+            **{**targets, **looks, "min_spp": min(looks["min_spp"], self.max_spp)},
         )
 
 

@@ -232,7 +232,8 @@ returns them as arrays, with row 0 on top, in the conventions of [Formats](forma
 - Emitters are hidden from cameras, as in the pictures: rays pass through them. So the emission of
   what is seen is always 0.
 - Embree finds the triangle that a ray meets, in single precision. The point on the triangle is then
-  computed in double precision from its stored corners.
+  computed in double precision from its stored corners. `trilight passes` traces on a GPU where one
+  passes the probe: a pixel on a rim may then show the neighboring triangle.
 - By default a pixel has one ray, through its centre, and every pass is exactly what that ray meets.
   With `rays_a_side=4`, a pixel has 4 x 4 rays on a regular grid. A pass whose averaging is
   `surfaces` is then the mean over the rays that meet a surface; times `coverage` it is the mean
@@ -260,11 +261,12 @@ degrees in 99 of 100 pixels, and diffuse colours not at all; Cycles turns normal
 
 `trilight passes SRC --passes depth,normal,object --out FOLDER` writes one OpenEXR file a view, of a
 dataset or of any scene that `trilight convert` reads. `--set storage.passes=[depth,normal,object]`
-makes `trilight generate` store the same bytes in the shards, as `000000123.0.passes.exr`; by
-default nothing is stored. `sample.view_passes(["depth_axis_m"])` of a sample of a dataset returns
-the same numbers, whether they are stored or not: ids as int32, others as float32. `motion_px` needs
-a second moment or camera and is not stored. The pages of a dataset's report show small pictures of
-depth, normals, object ids, diffuse albedo and roughness, computed when they are written.
+makes `trilight generate` store the bytes of `--device cpu` in the shards, as
+`000000123.0.passes.exr`; by default nothing is stored. `sample.view_passes(["depth_axis_m"])` of a
+sample of a dataset returns the same numbers, whether they are stored or not: ids as int32, others
+as float32. `motion_px` needs a second moment or camera and is not stored. The pages of a dataset's
+report show small pictures of depth, normals, object ids, diffuse albedo and roughness, computed
+when they are written.
 
 - All channels are 32-bit floats, compressed without loss (ZIP). Ids below 2^24 are exact in them;
   scenes with more triangles are refused.

@@ -16,7 +16,6 @@ from infra.render.quality import FixedSamples, ToStatedError
 from infra.viewer.picture_options import PictureOptions
 from pipeline.documents.scene_page import PASS_VIEWS, PassView
 from pipeline.renders.preview import usual_filter
-from pipeline.renders.settings import NoiseTargets
 from storage.errors import Unrenderable
 from storage.records.passes.declared import pass_names
 from storage.records.passes.pictures import view_passes
@@ -168,7 +167,7 @@ def page_renderers(
 def _path_tracer(
     child: RenderChild, options: PictureOptions, max_depth: int = ToStatedError.max_depth
 ) -> PathTracer:
-    targets = NoiseTargets(log_db=options.error_db)
+    targets = {"noise_floor_db": options.error_db}
     quality = ToStatedError(targets=targets, max_depth=max_depth)
     return PathTracer(child, quality, options.resolution, shows_looks=True)
 

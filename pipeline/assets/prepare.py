@@ -12,7 +12,7 @@ from pipeline.assets.decimation.decimate import decimate, safe_method, smallest_
 from pipeline.assets.quality.measure import (
     MeasuredSource,
     check_level,
-    count_edges,
+    faces_of_edges,
     require_watertight,
 )
 from pipeline.assets.recipe import RECIPE
@@ -75,14 +75,14 @@ def prepare_asset(
 def _facts(
     raw: TriangleMesh, cleaned: TriangleMesh, source: MeasuredSource, front_share: float
 ) -> SourceFacts:
-    edges = count_edges(source.mesh)
+    shared = faces_of_edges(source.mesh)
     return SourceFacts(
         num_faces_read=len(raw.faces),
         num_faces=len(source.mesh.faces),
         num_faces_turned=_count_flipped(cleaned, source.mesh),
         num_parts=source.num_components,
-        open_edges=edges.open,
-        nonmanifold_edges=edges.nonmanifold,
+        open_edges=int((shared == 1).sum()),
+        nonmanifold_edges=int((shared > 2).sum()),
         front_share=round(front_share, 6),
     )
 

@@ -8,7 +8,9 @@ close.
 """
 
 import itertools
+from collections.abc import Callable
 from dataclasses import dataclass, replace
+from functools import partial
 from typing import Literal
 
 import igl
@@ -63,11 +65,15 @@ def make_watertight(source: MeasuredSource, settings: AssetSettings) -> LevelBas
     """
     low, high = settings.gate.area_ratio
     two_sided = replace(settings.gate, area_ratio=(low, 2 * high))
-    gates: dict[Form, GateSettings] = {"source": settings.gate, "capped": settings.gate}
-    gates |= {"solid": two_sided, "hollow": two_sided}
+    forms: dict[Form, tuple[GateSettings, Callable[[TriangleMesh], TriangleMesh]]] = {
+        "source": (settings.gate, lambda mesh: mesh),
+        "capped": (settings.gate, _fill_holes),
+        "solid": (two_sided, partial(surface_around, fills=True)),
+        "hollow": (two_sided, partial(surface_around, fills=False)),
+    }
     refusals: dict[Form, Rejected] = {}
-    for form, gate in gates.items():
-        mesh = _in_form(source.mesh, form)
+    for form, (gate, make) in forms.items():
+        mesh = make(source.mesh)
         try:
             require_watertight(mesh)
             check_level(mesh, source, len(mesh.faces), gate, gate.max_error_p99)
@@ -79,14 +85,6 @@ def make_watertight(source: MeasuredSource, settings: AssetSettings) -> LevelBas
         return LevelBase(mesh=mesh, start=start, gate=gate, form=form)
     reason = refusals["solid"]
     raise Rejected(reason.reason, f"made watertight: {reason.message}")
-
-
-def _in_form(mesh: TriangleMesh, form: Form) -> TriangleMesh:
-    if form == "source":
-        return mesh
-    if form == "capped":
-        return _fill_holes(mesh)
-    return surface_around(mesh, fills=form == "solid")
 
 
 def _fill_holes(mesh: TriangleMesh) -> TriangleMesh:

@@ -236,7 +236,7 @@ def _reduce_piece(piece: ScenePiece, count: int) -> ScenePiece:
 
 
 def _decimate_mesh(piece: ScenePiece, count: int) -> tuple[NDArray[np.float32], NDArray[np.uint32]]:
-    from pipeline.assets.scene_mesh import remesh  # loads mesh libraries
+    from pipeline.assets.decimation.decimate import remesh  # loads mesh libraries
 
     faces = piece.mesh.faces.astype(np.int64)
     raw = TriangleMesh(positions=piece.mesh.positions.astype(np.float64), faces=faces)

@@ -11,9 +11,11 @@ from storage.atomic import write_atomically
 from storage.conventions import SPLITS
 from storage.dataset.dataset import Dataset, open_dataset
 from storage.errors import TrilightError
+from storage.raycast.caster import FirstHitCaster, Surfaces
 from storage.raycast.first_hits import require_row
 from storage.records.passes.pictures import passes_exr
 from storage.records.sample import Sample, sample_key
+from storage.records.scene import Scene
 
 _RESOLUTION = 256
 """Width and height in pixels for scenes without pictures."""
@@ -29,11 +31,13 @@ def write_passes(
     resolution: int | None,
     rays_a_side: int,
     done: Callable[[Path], None],
+    caster: Callable[[Scene], FirstHitCaster] = Surfaces,
 ) -> tuple[str, ...]:
     """Write `SCENE.VIEW.passes.exr` into a folder for each chosen view; return notes.
 
-    With the resolution and the single ray of a dataset that stores the same passes, the files equal
-    the stored ones byte for byte.
+    With Embree, and the resolution and single ray of a dataset that stores the same passes, the
+    files equal the stored ones byte for byte. On a GPU a pixel on a rim may show the neighboring
+    triangle.
 
     Args:
         source: a dataset (folder or URL), or a scene in any form that `trilight convert` reads.
@@ -43,6 +47,7 @@ def write_passes(
         resolution: width and height in pixels; None for that of the dataset's pictures, or 256.
         rays_a_side: rays along each side of a pixel.
         done: called with each written file.
+        caster: returns what finds the triangles that cameras of a scene see.
 
     Raises:
         TrilightError: the source is unusable, there is no such scene, view or pass, or the folder
@@ -51,6 +56,7 @@ def write_passes(
     notes: list[str] = []
     for name, loaded, size in _scenes(source, scene):
         notes += loaded.notes
+        surfaces = caster(loaded.scene)
         for row in range(loaded.scene.num_views) if view is None else [view]:
             require_row("view", row, loaded.scene.num_views)
             path = out / f"{name}.{row}.passes.exr"
@@ -60,6 +66,7 @@ def write_passes(
                 view=row,
                 resolution=resolution or size,
                 rays_a_side=rays_a_side,
+                surfaces=surfaces,
             )
             write_atomically(path, data)
             done(path)

@@ -30,6 +30,11 @@ class TriangleMesh:
         return np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
 
     @property
+    def areas(self) -> NDArray[np.float64]:
+        """[F] area of every face."""
+        return 0.5 * np.linalg.norm(self.double_area_vectors, axis=1)
+
+    @property
     def diagonal(self) -> float:
         """Length of the diagonal of the bounding box."""
         return float(np.linalg.norm(np.ptp(self.positions, axis=0)))

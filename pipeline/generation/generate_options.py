@@ -9,7 +9,7 @@ from pipeline.exchange.from_description import AlbedoOverOne
 from pipeline.presets.registry import DATASET_PRESETS, preset_settings
 from pipeline.presets.settings import DatasetSettings
 from pipeline.renders.mitsuba_variant import Device
-from pipeline.renders.settings import NoiseFloor, NoiseTargets, Resolution
+from pipeline.renders.settings import NoiseFloor, Resolution
 from storage.dataset.layout import dataset_folder
 from storage.dataset.settings import MOST_SCENES
 from storage.errors import TrilightError
@@ -132,14 +132,6 @@ class GenerateOptions:
         self.shard_range()
 
     @property
-    def noise_targets(self) -> NoiseTargets:
-        return NoiseTargets(
-            log_db=self.noise_floor_db,
-            linear_db=self.noise_floor_linear_db,
-            objects_db=self.noise_floor_objects_db,
-        )
-
-    @property
     def num_scenes(self) -> int:
         return DATASET_PRESETS[self.build].num_scenes if self.scenes is None else self.scenes
 
@@ -153,7 +145,7 @@ class GenerateOptions:
             self.build,
             seed=self.seed,
             resolution=self.resolution,
-            noise_targets=self.noise_targets,
+            noise_targets=vars(self),
             allow_licences=self.allow_licences,
             changes=self.changes,
         )

@@ -13,8 +13,7 @@ from numpy.typing import NDArray
 
 from pipeline.presets.settings import DatasetSettings
 from pipeline.renders.noise_floor import MeasuredFloor
-from pipeline.renders.renderer import SceneRenderer
-from pipeline.renders.results import RenderedView
+from pipeline.renders.renderer import RenderedView, SceneRenderer
 from pipeline.scenes.views import ViewCamera, Visibility, cameras_of, cameras_of_view, with_cameras
 from storage.dataset.layout import DatasetFolder
 from storage.dataset.progress import tell_views

@@ -10,7 +10,7 @@ from pipeline.presets.frozen_v1 import PRESETS_FOR_JUDGING
 from pipeline.presets.renderformer import RENDERFORMER_PRESETS
 from pipeline.presets.settings import DatasetPreset, DatasetSettings
 from pipeline.presets.training import PRESETS_FOR_TRAINING
-from pipeline.renders.settings import NoiseTargets
+from pipeline.renders.settings import Targets, target_overrides
 from storage.aliases import OBJECTS, PRESET_ALIASES, stored_name
 from storage.dataset.statistics import Statistics
 from storage.errors import TrilightError
@@ -59,7 +59,7 @@ def preset_settings(
     *,
     seed: int | None = None,
     resolution: int | None = None,
-    noise_targets: NoiseTargets | None = None,
+    noise_targets: Targets | None = None,
     allow_licences: tuple[str, ...] = (),
     changes: Mapping[str, Any] | None = None,
 ) -> DatasetSettings:
@@ -68,7 +68,7 @@ def preset_settings(
     Args:
         name: one of DATASET_PRESETS.
         seed, resolution: replace the preset's value unless None.
-        noise_targets: if one is set, they replace all of the preset's targets.
+        noise_targets: by name; if one is set, they replace all of the preset's targets.
         allow_licences: licences that are allowed in addition to the preset's.
         changes: any other settings by dotted name, such as `scenes.lights.coloured_share`.
 
@@ -83,20 +83,18 @@ def preset_settings(
             f"Trilight's own; expected another name, such as dataclasses.replace(..., "
             f"build='my-{settings.build}')."
         )
-    settings = apply_overrides(
-        settings, option_overrides(seed, resolution, noise_targets or NoiseTargets())
-    )
+    settings = apply_overrides(settings, option_overrides(seed, resolution, noise_targets or {}))
     licences = tuple(sorted({*settings.allowed_licences, *allow_licences}))
     return apply_overrides(dataclasses.replace(settings, allowed_licences=licences), changes or {})
 
 
 def option_overrides(
-    seed: int | None, resolution: int | None, noise_targets: NoiseTargets
+    seed: int | None, resolution: int | None, noise_targets: Targets
 ) -> dict[str, Any]:
     """Return the settings that single options state, by dotted name; None states nothing."""
     stated = {"seed": seed, "renders.resolution": resolution}
     changes: dict[str, Any] = {name: value for name, value in stated.items() if value is not None}
-    return changes | {f"renders.{name}": db for name, db in noise_targets.overrides.items()}
+    return changes | {f"renders.{name}": db for name, db in target_overrides(noise_targets).items()}
 
 
 def object_source(settings: DatasetSettings, objects: str | None) -> str:

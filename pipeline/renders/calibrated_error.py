@@ -196,13 +196,13 @@ def statement_for(settings: RenderSettings, samples: DualBuffer) -> CalibratedSt
 
 
 def first_spp(settings: RenderSettings) -> int:
-    """Return the samples per pixel of the first measurement.
+    """Return the samples per pixel of the first measurement, both halves together.
 
     A bound that takes the place of a calibrated statement is measured after FIRST_SPP or more.
     """
     is_other = settings.stated_error == "calibrated" and _statement_of(settings) is None
-    spp = max(settings.first_spp, FIRST_SPP) if is_other else settings.first_spp
-    return min(spp, settings.max_spp)
+    spp = settings.min_spp * max(1, math.ceil(settings.min_spp_px / settings.resolution))
+    return min(max(spp, FIRST_SPP) if is_other else spp, settings.max_spp)
 
 
 def _statement_of(settings: RenderSettings) -> CalibratedStatement | None:

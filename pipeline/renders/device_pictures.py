@@ -28,7 +28,6 @@ from pipeline.renders.pictures import (
     means,
     measure_pixels,
 )
-from pipeline.renders.pixels import Pixels
 from pipeline.renders.samples import TILE_PX, DualBuffer
 from pipeline.renders.settings import Filtered
 from pipeline.renders.tracer import PixelCamera
@@ -37,6 +36,7 @@ from pipeline.renders.view_pictures import (
     GLINT,
     MOST_APART,
     Group,
+    Pixels,
     add_up,
     require_finite,
     to_filter,
@@ -56,6 +56,9 @@ class KernelPixels(Pixels):
     select: Any = staticmethod(dr.select)
     sqrt: Any = staticmethod(dr.sqrt)
     maximum: Any = staticmethod(dr.maximum)
+    brightest: Any = staticmethod(dr.max)
+    channels: Any = staticmethod(list)
+    mean: Any = staticmethod(operator.truediv)
 
     def __init__(self, resolution: int) -> None:
         self._resolution = resolution
@@ -72,20 +75,11 @@ class KernelPixels(Pixels):
     def clamp(self, radiance: Any) -> Any:
         return dr.clip(radiance, 0, 1)
 
-    def channels(self, color: Any) -> Sequence[Any]:
-        return list(color)
-
     def channel_mean(self, color: Any) -> Any:
         return channel_sum(color) / 3
 
-    def brightest(self, color: Any) -> Any:
-        return dr.max(color)
-
     def is_finite(self, color: Any) -> Any:
         return dr.all(dr.isfinite(color))
-
-    def mean(self, total: Any, count: Any) -> Any:
-        return total / count
 
     def difference(self, first: Any, second: Any) -> Any:
         return mi.Color3d(first) - mi.Color3d(second)
@@ -202,7 +196,7 @@ class DevicePictures(ViewPictures):
 
     @staticmethod
     def mean_radiance(samples: DualBuffer) -> float:
-        resolution = len(samples.spp_of(0))
+        resolution = samples.spp_by_half.shape[-1]
         total, broken = read_back(_brightness(KernelInputs(), _sums(samples), resolution))
         require_finite(int(broken))
         return float(total) / (3 * resolution**2)

@@ -15,6 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pipeline.renders.device_memory import opaque_vector, own_floats
+from pipeline.renders.surface_table import SurfacePoint
 from storage.errors import Rejected
 from storage.records.material import EMISSION
 from storage.records.scene import Scene
@@ -23,13 +24,9 @@ ONE_MINUS_EPSILON = 0.99999994
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
-class EmitterPoint:
-    """A sampled point on an emitter, lane by lane."""
+class EmitterPoint(SurfacePoint):
+    """A sampled point on an emitter, lane by lane; the side of its normal does not matter."""
 
-    position: Any
-    """Position on the triangle, Point3f in meters."""
-    normal: Any
-    """Vector3f, unit; its side does not matter."""
     area_pdf: Any
     """Probability of this point among all emitters, Float per square meter."""
     radiance: Any
@@ -89,7 +86,7 @@ class EmitterTable:
         weights = mi.warp.square_to_uniform_triangle(mi.Point2f(fraction, u.y))
         return EmitterPoint(
             position=mi.Point3f(mi.Point3f(corner.xyz) + edge1 * weights.x + edge2 * weights.y),
-            normal=dr.normalize(dr.cross(edge1, edge2)),
+            geometric_normal=dr.normalize(dr.cross(edge1, edge2)),
             area_pdf=corner.w,
             radiance=mi.Color3f(radiance.xyz),
         )

@@ -46,23 +46,13 @@ def _answer(variant: Variant) -> dict[str, str]:
 
 def _view_seconds() -> float:
     """Return the wall-clock seconds of a view of the probe's scene, once kernels are compiled."""
-    from pipeline.renders.renderer import SceneRenderer
-    from pipeline.renders.settings import RenderSettings
-    from pipeline.renders.variant_probe import probe_scene
+    from pipeline.renders.variant_probe import load_probe
 
-    scene = probe_scene()
-    settings = RenderSettings(
-        resolution=VIEW_PX,
-        noise_floor_db=90,
-        min_spp=VIEW_SPP,
-        max_spp=VIEW_SPP,
-        arithmetic="device",
-    )
-    renderer = SceneRenderer(scene, settings)
+    render_view = load_probe(VIEW_PX, VIEW_SPP)
     seconds = []
     for seed in range(3):
         began = time.perf_counter()
-        renderer.render_view(scene.c2w[0], float(scene.fov_deg[0]), seed)
+        render_view(seed)
         seconds.append(time.perf_counter() - began)
     return min(seconds)
 

@@ -9,13 +9,14 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pipeline.renders import ggx
-from pipeline.renders.device_memory import own_floats, own_integers
+from pipeline.renders.device_memory import own_floats, own_integers, read_back
 from pipeline.renders.emitter_table import EmissionCone, EmitterTable
 from pipeline.renders.ggx import AlbedoLookup, KernelLobes
 from pipeline.renders.guide_table import GuideTable
 from pipeline.renders.sky_table import SkyTable, sky_share
 from pipeline.renders.surface_table import Hit, SurfacePoint, SurfaceTable
 from pipeline.renders.tracer import split_triangles
+from storage.raycast.caster import MISS, RayHits
 from storage.records.lights import part_names, shining_sky
 from storage.records.scene import Scene
 
@@ -70,7 +71,7 @@ class KernelScene:
 
     def to_pick_pdf(self, pdf: Any) -> Any:
         """Return a density among lamps (Float) as a density among lamps and sky."""
-        return pdf if self.sky is None else self.sky.of_lamps(pdf)
+        return pdf if self.sky is None else pdf * self.sky.rest
 
 
 def build_mitsuba_scene(scene: Scene, triangles: NDArray[np.intp], child: Any = None) -> Any:
@@ -191,6 +192,27 @@ def hit_of(intersection: Any) -> tuple[Hit, Any]:
         barycentric=mi.Point2f(intersection.prim_uv),
     )
     return hit, intersection.is_valid()
+
+
+class CameraRays:
+    """The triangles of a scene that cameras see, as Mitsuba's rays meet them: a `FirstHitCaster`.
+
+    Call after `activate`.
+    """
+
+    def __init__(self, scene: Scene) -> None:
+        rows, _ = split_triangles(scene)
+        self._rows = np.append(rows, MISS)
+        # Mitsuba has no empty mesh: without surfaces, any triangle counts as nothing
+        self._scene = build_mitsuba_scene(scene, rows if len(rows) else np.array([0]))
+
+    def intersect(self, origins: NDArray[np.float32], directions: NDArray[np.float32]) -> RayHits:
+        """Return the first hits of rays [N, 3] from `origins` [N, 3], from either side."""
+        start = dr.unravel(mi.Point3f, own_floats(origins))
+        ray = mi.Ray3f(start, dr.unravel(mi.Vector3f, own_floats(directions)))
+        hit, is_met = hit_of(self._scene.ray_intersect_preliminary(ray, coherent=True))
+        position = read_back(dr.select(is_met, hit.triangle, len(self._rows) - 1))
+        return RayHits(triangle=self._rows[position], uv=np.array(hit.barycentric))
 
 
 def off_surface(point: SurfacePoint, direction: Any) -> Any:

@@ -60,7 +60,6 @@ from pipeline.renders.kernel_scene import (
     roulette,
     vertex_at,
 )
-from pipeline.renders.surface_table import SurfacePoint
 
 
 @dataclass(frozen=True, eq=False)
@@ -100,15 +99,14 @@ def trace_light(
         sampler: mi.Sampler with a lane for each path.
         record: `CameraJoin` or `PhotonRecords`.
     """
-    direction = scene.cone.sample(emitter.position, emitter.normal, u_direction)
-    leaving = scene.cone.pdf(emitter.position, emitter.normal, direction)
-    cosine = dr.abs(dr.dot(emitter.normal, direction))
-    start = SurfacePoint(position=emitter.position, geometric_normal=emitter.normal)
+    direction = scene.cone.sample(emitter.position, emitter.geometric_normal, u_direction)
+    leaving = scene.cone.pdf(emitter.position, emitter.geometric_normal, direction)
+    cosine = dr.abs(dr.dot(emitter.geometric_normal, direction))
     active = mi.Bool((leaving > 0) & (dr.max(emitter.radiance) > 0))
     hit_mis_ratio = mi.Float(cosine / (emitter.area_pdf * leaving))  # C+ / (a e)
     strength = dr.max(emitter.radiance) * hit_mis_ratio
     throughput = mi.Color3f(emitter.radiance / dr.max(emitter.radiance))
-    hit, is_met = next_hit(scene, start, direction, active)
+    hit, is_met = next_hit(scene, emitter, direction, active)
     active &= is_met
     pick_mis_ratio = mi.Float(scene.to_pick_pdf(dr.square(hit.distance) / leaving))
     drawn = mi.Float(0)

@@ -27,7 +27,6 @@ from importlib import metadata
 from pathlib import Path
 from typing import Any, Literal
 
-from pipeline.renders import probe_picture
 from storage.atomic import write_atomically
 from storage.cache import cache_folder
 from storage.denoiser import DenoiserDevice, set_denoiser_device
@@ -44,6 +43,32 @@ _REMEMBERED_TRIES = 32
 _RAYS_LEFT_OUT = "Disabling this ray tracing operation"
 """Dr.Jit only logs this where a kernel is too large for OptiX; it raises no error."""
 
+
+PROBE_PICTURE = """
+0.02642 0.01907 0.01140 0.0002921 0.0001690 6.412e-05
+0.07167 0.05284 0.03035 0.0003407 0.0003220 8.808e-05
+0.03219 0.02473 0.01407 0.0002694 0.0003256 6.697e-05
+0.01020 0.007436 0.004571 0.0002357 0.0001461 5.090e-05
+0.04946 0.03132 0.01544 0.0008953 0.0004946 0.0001695
+0.04933 0.03792 0.01681 0.0008166 0.0005259 0.0001596
+0.02762 0.02673 0.01053 0.0006331 0.0004875 0.0001281
+0.02206 0.01789 0.007704 0.0005913 0.0003370 0.0001136
+0.08784 0.06104 0.03826 0.0006802 0.0004250 0.0001939
+0.04782 0.04380 0.02195 0.0004827 0.0003253 0.0001424
+0.009158 0.02190 0.005475 4.609e-05 9.437e-05 1.411e-05
+0.02014 0.02160 0.009289 0.0003597 0.0002455 0.0001096
+0.1086 0.07708 0.05013 0.0005907 0.0003705 0.0001748
+0.1035 0.07626 0.04860 0.0004233 0.0002804 0.0001276
+0.08441 0.06418 0.04021 7.366e-05 0.0001190 2.842e-05
+0.06741 0.05008 0.03187 0.0002304 0.0001623 7.051e-05
+"""
+"""The right picture of pipeline.renders.variant_probe. A line is a block, row after row: the mean
+of R, G and B, and their standard deviations.
+
+Printed by tests.pipeline.renders.probe_reference: the mean of 1,024 pictures, of which one has this
+standard deviation. Print it anew only when the light itself or the probe's scene is meant to
+change.
+"""
 
 VariantName = Literal["llvm_ad_rgb", "cuda_ad_rgb"]
 
@@ -95,31 +120,43 @@ def choose_variant(default: Device = "cpu", *, device: Device | None = None) -> 
     Later calls read the remembered probes.
 
     Args:
+        default, device: as `choose_gpu`.
+
+    Raises:
+        TrilightError: as `choose_gpu`, or no LLVM library works here.
+        EnvironmentFailure: a probe gave no answer, which says nothing about its library: with
+            another one, the same dataset would be of other bytes.
+    """
+    gpu, note = choose_gpu(default, device=device)
+    return gpu or dataclasses.replace(_on_processor(), note=note)
+
+
+def choose_gpu(default: Device, *, device: Device | None = None) -> tuple[Variant | None, str]:
+    """Return the variant of a GPU, or None and a note for the user where the CPU is to work.
+
+    Args:
         default: device where neither `device` nor TRILIGHT_VARIANT names one.
         device: device of an option or a dataset, before which TRILIGHT_VARIANT does not count.
 
     Raises:
-        TrilightError: no LLVM library works here; TRILIGHT_VARIANT names no variant; a GPU is named
-            and renders no right picture.
-        EnvironmentFailure: a probe gave no answer, which says nothing about its library: with
-            another one, the same dataset would be of other bytes.
+        TrilightError: TRILIGHT_VARIANT names no variant; a GPU is named and renders no right
+            picture.
     """
     chosen = device or named_device() or default
     if chosen == "cpu" or (chosen == "auto" and not visible_gpus()):
-        return _on_processor()
+        return None, ""
     if not visible_gpus():
         raise _refused_gpu(device, "no NVIDIA GPU is visible here")
     versions = map(_version, ("mitsuba", "drjit", "pyoidn"))
-    identity = sha256_hex(canonical_json([gpu_identity(), *versions, probe_picture.TABLE]))
+    identity = sha256_hex(canonical_json([gpu_identity(), *versions, PROBE_PICTURE]))
     probed = _remembered_probe(_GPU, identity, retry_failed=chosen == "gpu")
     if not probed.problem:
         note = (
             probed.denoiser_problem and f"{probed.denoiser_problem}, so the CPU denoises pictures"
         )
-        return dataclasses.replace(_GPU, denoiser="CPU" if note else "CUDA", note=note)
+        return dataclasses.replace(_GPU, denoiser="CPU" if note else "CUDA", note=note), ""
     if chosen == "auto":
-        note = f"the GPU renders no right picture ({probed.problem}), so the CPU renders"
-        return dataclasses.replace(_on_processor(), note=note)
+        return None, f"the GPU renders no right picture ({probed.problem}), so the CPU renders"
     raise _refused_gpu(device, f"the GPU renders no right picture ({probed.problem})")
 
 
@@ -139,7 +176,7 @@ def _on_processor() -> Variant:
     tried = []
     for library in llvm_libraries():
         variant = Variant(name="llvm_ad_rgb", libllvm=str(library), note="")
-        identity = sha256_hex(canonical_json([_identity(library), probe_picture.TABLE]))
+        identity = sha256_hex(canonical_json([_identity(library), PROBE_PICTURE]))
         probed = _remembered_probe(variant, identity, retry_failed=True)
         if probed.is_silent:
             raise EnvironmentFailure(

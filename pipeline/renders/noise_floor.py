@@ -54,8 +54,9 @@ SMALLEST_STEP = 1e-4
 """Radiance, relative to 1 + radiance, over which a secant is taken at least: below it, differences
 of float32 values are rounding."""
 
-LINEAR_STANDARD_ERRORS = 2.0
-"""Of one, 3 to 10 % of the linear floors of 16 scenes were more than 1 dB too good (study S16)."""
+_STANDARD_ERRORS = (1.0, 2.0, 1.0)
+"""Of log and linear light and of objects, added to the mean. With one, 3 to 10 % of the linear
+floors of 16 scenes were more than 1 dB too good (study S16)."""
 
 Curve = Callable[[Any], Any]
 """What errors are taken in, of radiance."""
@@ -75,11 +76,15 @@ class MeasuredFloor:
     @property
     def by_metric(self) -> dict[str, float]:
         """The three errors in dB by the name of their metric (storage.metrics)."""
-        return {
-            "psnr_log_db": self.log_db,
-            "psnr_linear_db": self.linear_db,
-            "object_psnr_log_db": self.object_log_db,
-        }
+        return {metric: getattr(self, field) for field, metric in _FIELDS.items()}
+
+
+_FIELDS = {
+    "log_db": "psnr_log_db",
+    "linear_db": "psnr_linear_db",
+    "object_log_db": "object_psnr_log_db",
+}
+"""The metric of each error."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -109,44 +114,26 @@ class ErrorMeasures:
     """Share of the pixels of the picture that show geometry."""
 
 
-def estimate_noise_floor_db(
-    mean_error: float,
-    surprise: float,
-    error_sums: NDArray[np.float64],
-    counts: NDArray[np.float64],
-    standard_errors: float = 1.0,
-) -> float:
-    """Return the floor of a picture in dB.
-
-    Args:
-        mean_error: of the estimates of all pixels.
-        surprise: the largest of the picture's.
-        error_sums: [T] of the estimates over the blocks of the picture.
-        counts: [T] pixels of each block; where there are none at all, the floor is the highest.
-        standard_errors: so many are added to the mean.
-    """
-    count = counts.sum()
-    if not count:
-        return MAX_DB
-    bound = max(mean_error, 0.0) + surprise / count
-    bound += standard_errors * _standard_error(error_sums, counts)
-    return MAX_DB if bound <= 10 ** (-MAX_DB / 10) else float(-10 * np.log10(bound))
-
-
 def measured_floor(
     rows: Iterable[tuple[float, float, NDArray[np.float64], NDArray[np.float64]]],
 ) -> MeasuredFloor:
     """Return the floor of a picture.
 
     Args:
-        rows: of log and linear light and of objects: mean error, greatest surprise, and the sums of
-            estimates and pixels over the blocks, as `estimate_noise_floor_db` takes them.
+        rows: of log and linear light and of objects: sum of the estimates of all pixels, greatest
+            surprise, and [T] the sums of estimates and the pixels of each block. Where there are
+            no pixels at all, the floor is the highest.
     """
-    log_db, linear_db, object_log_db = (
-        estimate_noise_floor_db(*row, standard_errors)
-        for row, standard_errors in zip(rows, (1.0, LINEAR_STANDARD_ERRORS, 1.0), strict=True)
-    )
-    return MeasuredFloor(log_db=log_db, linear_db=linear_db, object_log_db=object_log_db)
+    floors_db = []
+    for (error, surprise, sums, counts), deviations in zip(rows, _STANDARD_ERRORS, strict=True):
+        count = counts.sum()
+        bound = 0.0
+        if count:
+            bound = max(error / count, 0.0) + surprise / count
+            bound += deviations * _standard_error(sums, counts)
+        smallest = 10 ** (-MAX_DB / 10)
+        floors_db.append(MAX_DB if bound <= smallest else float(-10 * np.log10(bound)))
+    return MeasuredFloor(**dict(zip(_FIELDS, floors_db, strict=True)))
 
 
 def _standard_error(sums: NDArray[np.float64], counts: NDArray[np.float64]) -> float:

@@ -264,12 +264,12 @@ def _of_lamps(scene: KernelScene, position: Any, u: Any, active: Any) -> PickedL
     to_emitter = emitter.position - position
     distance_sq = dr.squared_norm(to_emitter)
     direction = to_emitter * dr.rsqrt(distance_sq)
-    cosine = dr.abs(dr.dot(emitter.normal, direction))
+    cosine = dr.abs(dr.dot(emitter.geometric_normal, direction))
     return PickedLight(
         direction=direction,
         pdf=emitter.area_pdf * distance_sq / cosine,
         radiance=emitter.radiance,
-        leaving=scene.cone.pdf(emitter.position, emitter.normal, -direction),
+        leaving=scene.cone.pdf(emitter.position, emitter.geometric_normal, -direction),
         distance_sq=distance_sq,
         position=emitter.position,
     )

@@ -21,7 +21,6 @@ from pipeline.renders.noise_floor import (
     measured_floor,
     secant_slope,
 )
-from pipeline.renders.pixels import Pixels
 from pipeline.renders.samples import TILE_PX, DualBuffer, by_tiles, tile_means
 from pipeline.renders.settings import Filtered, RenderSettings
 from pipeline.renders.tracer import PixelCamera
@@ -29,6 +28,7 @@ from pipeline.renders.view_pictures import (
     LEAST_PASSES,
     Group,
     MeasuredLook,
+    Pixels,
     add_up,
     floor_groups,
     put_together,
@@ -88,7 +88,9 @@ def pixel_errors(
     if not is_filtered:
         return mean(_square(curve(halves.a) - curve(halves.b))) / 2, surprise
     slope = secant_slope(curve, halves.denoised, halves.raw, select=pixels.select)
-    return mean(_square(slope) * _half_estimate(halves)), surprise
+    a, b, denoised_a, denoised_b, difference = halves
+    estimate = _square(denoised_a - b) + _square(denoised_b - a) - _square(a - b)
+    return mean(_square(slope) * (estimate / 2 - _square(difference) / 4)), surprise
 
 
 def pixel_measures(
@@ -119,12 +121,6 @@ def pixel_measures(
     ]
     signed = [slope * (picture - halves.raw), slope * (halves.a - halves.b) / 2, difference]
     return values, signed, surprise
-
-
-def _half_estimate(halves: Halves) -> Any:
-    a, b, denoised_a, denoised_b, difference = halves
-    estimate = _square(denoised_a - b) + _square(denoised_b - a) - _square(a - b)
-    return estimate / 2 - _square(difference) / 4
 
 
 def _square(value: Any) -> Any:
@@ -226,7 +222,7 @@ def clean_pictures(
         inputs = list(to_filter(pictures, names))
         are_lights = len(inputs) > len(names or ("",))
         cleaned = pixels.clean(inputs, outputs, guides, are_lights=are_lights)
-        denoised.append(put_together(pictures, cleaned, names, pixels.with_means, pixels.shares))
+        denoised.append(put_together(pictures, cleaned, names, pixels))
     return denoised
 
 
@@ -359,12 +355,7 @@ def floors_of(numbers: LookNumbers, counts: tuple[NDArray[np.float64], ...]) -> 
     errors = numbers.adds[3:]
     surprises = numbers.most[:-1].max(axis=1)
     counts = counts * (len(errors) // 3)
-    rows = [
-        (total / max(count.sum(), 1), float(surprise), error, count)
-        for total, surprise, error, count in zip(
-            numbers.sums[3:], surprises, errors, counts, strict=True
-        )
-    ]
+    rows = list(zip(numbers.sums[3:], surprises, errors, counts, strict=True))
     return [measured_floor(rows[first : first + 3]) for first in range(0, len(rows), 3)]
 
 
@@ -378,13 +369,14 @@ NUMPY = Pixels()
 
 def read_sums(samples: DualBuffer, *, squares: bool = False) -> Sums:
     """Return the sums of a view, with their squares or 0; raises as `ViewPictures.look`."""
-    shape = samples.spp_of(0).shape
     sums = [
         [
-            [*each.read(), each.read_squares() if squares else np.zeros(shape), spp, passes]
-            for each in samples.sums[half]
+            [*each.read(), each.read_squares() if squares else np.zeros(spp.shape), spp, passes]
+            for each in half
         ]
-        for half, spp, passes in ((n, samples.spp_of(n), samples.count_of(n)) for n in range(2))
+        for half, spp, passes in zip(
+            samples.sums, samples.spp_by_half, samples.passes_by_half, strict=True
+        )
     ]
     require_finite(int(broken_pixels(sums, NUMPY).sum()))
     return sums

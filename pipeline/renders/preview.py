@@ -6,7 +6,7 @@ of samples, so that nothing tells how far it is from the truth, and it says so.
 
 import time
 from collections import Counter
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from functools import partial
 from typing import TYPE_CHECKING, Annotated, Any, get_args
@@ -205,11 +205,6 @@ def all_parts() -> tuple[str, ...]:
     passes = map(_PASS, PASSES)
     guides = map(_GUIDES, PASS_SPP[1:])
     return (SCENE, *passes, *guides, *get_args(Quality))
-
-
-def seconds_of(parts: Mapping[str, int], part_s: Mapping[str, float]) -> float:
-    """Return the seconds of parts that occur so often."""
-    return sum(count * part_s[name] for name, count in parts.items())
 
 
 FIRST_LOOKS_SPP = (1, 4, 16)

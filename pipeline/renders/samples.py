@@ -71,26 +71,18 @@ class DualBuffer:
         """Of each half, and in it of each tracer."""
         self.is_guided = False
         """True once a pass may be guided."""
-        self._spp, self._count = np.zeros((2, 2, camera.resolution, camera.resolution), np.int64)
+        self.spp_by_half, self.passes_by_half = np.zeros(
+            (2, 2, camera.resolution, camera.resolution), np.int64
+        )
+        """[2, R, R] samples and passes of each pixel in each half."""
         self._passes = 0
-        self.count_over(np.ones(self._spp.shape[1:], bool))
-
-    def count_over(self, counted: NDArray[np.bool_]) -> None:
-        """Let `spp` be a mean over some pixels, [R, R], from now on; before, it is over all."""
-        self._counted = counted
+        self.counted = np.ones(self.spp_by_half.shape[1:], bool)
+        """[R, R] pixels over which `spp` is a mean: at first all."""
 
     @property
     def spp(self) -> int:
         """Samples per pixel so far, both halves together: the mean over the counted pixels."""
-        return int(self._spp.sum(axis=0).mean(where=self._counted))
-
-    def spp_of(self, half: int) -> NDArray[np.int64]:
-        """Return the samples of each pixel in one half, [R, R]."""
-        return self._spp[half]
-
-    def count_of(self, half: int) -> NDArray[np.int64]:
-        """Return the passes of each pixel in one half, [R, R]."""
-        return self._count[half]
+        return int(self.spp_by_half.sum(axis=0).mean(where=self.counted))
 
     @property
     def pass_spp(self) -> int:
@@ -99,7 +91,7 @@ class DualBuffer:
         It divides what is there already and what is left, so that a half which has 64 samples goes
         on in passes of 64, however small its first ones were.
         """
-        done = int(self._spp[0].max())
+        done = int(self.spp_by_half[0].max())
         remaining = (self._most if done else self._first) - done
         return next(size for size in PASS_SPP if done % size == 0 and remaining % size == 0)
 
@@ -135,8 +127,8 @@ class DualBuffer:
             light_seed = seed_for(light_seed, "pass", self._passes, half)
         for tracer in self.sums[half]:
             tracer.add(seed=seed, spp=size, chosen=chosen, light_seed=light_seed)
-        self._spp[half] += size if chosen is None else size * chosen
-        self._count[half] += 1 if chosen is None else chosen
+        self.spp_by_half[half] += size if chosen is None else size * chosen
+        self.passes_by_half[half] += 1 if chosen is None else chosen
 
     def guide(self) -> None:
         """Let the passes from now on be guided (pipeline.renders.guide_table)."""
@@ -188,7 +180,7 @@ class TileChoice:
                 nothing new is known.
         """
         tiles = slice(None, None, TILE_PX)
-        seen = [samples.spp_of(half)[tiles, tiles].copy() for half in range(len(changes))]
+        seen = [samples.spp_by_half[half][tiles, tiles].copy() for half in range(len(changes))]
         if self._seen and quality == self._filter:
             known = self._variance or [np.zeros_like(self._weight)] * 2
             self._variance = [

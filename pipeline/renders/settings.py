@@ -1,17 +1,13 @@
 """`RenderSettings`: how good a picture must be, and how much it may cost."""
 
-import math
 from collections.abc import Mapping
-from dataclasses import dataclass
 from typing import Annotated, Any, Literal
-
-import pydantic
 
 from storage.conventions import HALF_FLOAT_MAX
 from storage.errors import TrilightError
 from storage.metrics import MAX_DB
 from storage.records.lights import part_names
-from storage.settings.described import checked
+from storage.settings.described import checked, leaves_out
 from storage.settings.ranges import Within
 
 Filtered = Literal["high", "fast", "off"]
@@ -58,19 +54,6 @@ StatedError = Literal["bound", "calibrated"]
 
 Arithmetic = Literal["numpy", "device"]
 """Where the pictures of a view are worked out."""
-
-_LATER = {
-    "noise_floor_linear_db": None,
-    "noise_floor_objects_db": None,
-    "split": False,
-    "split_lobes": False,
-    "arithmetic": "numpy",
-    "min_spp_px": 128,
-    "light_paths": "view",
-    "stated_error": "bound",
-    "picture_within_db": None,
-}
-"""Settings that no record holds at these values, so that digests of earlier presets stay."""
 
 CALIBRATED_LOOKS: Mapping[str, Any] = {
     "stated_error": "calibrated",
@@ -151,6 +134,11 @@ class RenderSettings:
     """Where the bound by the halves misses a target by more than this, sampling goes on by it,
     without a picture to calibrate the error by; None takes a picture each time."""
 
+    _record = leaves_out(
+        "noise_floor_linear_db", "noise_floor_objects_db", "split", "split_lobes", "arithmetic",
+        "min_spp_px", "light_paths", "stated_error", "picture_within_db",
+    )  # fmt: skip
+
     def __post_init__(self) -> None:
         unit = 2 * PASS_SPP[-1]
         spp = f"min_spp is {self.min_spp} and max_spp {self.max_spp}; expected"
@@ -169,12 +157,6 @@ class RenderSettings:
                 raise TrilightError(f"render settings: {complaint}.")
 
     @property
-    def first_spp(self) -> int:
-        """Samples per pixel before the first measurement, both halves together."""
-        narrower = max(1, math.ceil(self.min_spp_px / self.resolution))
-        return min(self.min_spp * narrower, self.max_spp)
-
-    @property
     def part_names(self) -> tuple[str, ...]:
         """Names of the parts that are stored (storage.records.lights); empty where none are."""
         return part_names(bounces=self.split, lobes=self.split_lobes)
@@ -185,25 +167,13 @@ class RenderSettings:
         targets = {metric: getattr(self, name) for name, metric in _METRICS.items()}
         return {metric: db for metric, db in targets.items() if db is not None}
 
-    @pydantic.model_serializer(mode="wrap")
-    def _record(self, as_usual: pydantic.SerializerFunctionWrapHandler) -> dict[str, Any]:
-        record: dict[str, Any] = as_usual(self)
-        return {k: value for k, value in record.items() if k not in _LATER or value != _LATER[k]}
+
+Targets = Mapping[str, float | None]
+"""Target errors of a picture in dB by their field of RenderSettings. Those that are set are all
+reached, or the cap is."""
 
 
-@dataclass(frozen=True, kw_only=True)
-class NoiseTargets:
-    """Target errors of a picture in dB; those that are set are all reached, or the cap is."""
-
-    log_db: float | None = None
-    """psnr_log_db: over all pixels, of log radiance."""
-    linear_db: float | None = None
-    """psnr_linear_db: of radiance clamped to [0, 1]."""
-    objects_db: float | None = None
-    """object_psnr_log_db: over the pixels that show geometry."""
-
-    @property
-    def overrides(self) -> dict[str, float | None]:
-        """Values of the fields of RenderSettings; empty if no target is set."""
-        values = (self.log_db, self.linear_db, self.objects_db)
-        return {} if values == (None, None, None) else dict(zip(_METRICS, values, strict=True))
+def target_overrides(stated: Mapping[str, Any]) -> dict[str, float | None]:
+    """Return the targets among stated values, None for others; empty if no target is set."""
+    targets = {name: stated.get(name) for name in _METRICS}
+    return {} if set(targets.values()) == {None} else targets

@@ -44,7 +44,8 @@ class SkyTable:
         self._height, self._width = (dr.opaque(mi.UInt32, side) for side in (height, width))
         self._to_world = [opaque_vector(sky.rotation[:, axis]) for axis in range(3)]
         self._share = dr.opaque(mi.Float, share)
-        self._rest = dr.opaque(mi.Float, 1 - share)
+        self.rest = dr.opaque(mi.Float, 1 - share)
+        """Share of the lamps, Float: a density among them times this is one among all picks."""
         self.is_seen = sky.is_seen
         """True if camera rays that hit nothing see the map."""
 
@@ -52,12 +53,8 @@ class SkyTable:
         """Return which picks go to the map (Bool), and the uniform Point2f for map and lamp."""
         last = ONE_MINUS_EPSILON
         to_sky = dr.minimum(u.x / self._share, last)
-        to_lamp = dr.clip((u.x - self._share) / dr.maximum(self._rest, _TINY), 0, last)
+        to_lamp = dr.clip((u.x - self._share) / dr.maximum(self.rest, _TINY), 0, last)
         return u.x < self._share, mi.Point2f(to_sky, u.y), mi.Point2f(to_lamp, u.y)
-
-    def of_lamps(self, value: Any) -> Any:
-        """Return a density (Float) among lamps as one among all picks."""
-        return value * self._rest
 
     def sample(self, u: Any, active: Any) -> tuple[Any, Any, Any]:
         """Return a direction drawn by the light of the map, from a uniform Point2f.
@@ -161,16 +158,18 @@ def sky_share(scene: Scene, sky: Environment) -> float:
     """Return the share of the picks that go to the environment: above 0, and 1 without lamps.
 
     Lamps weigh area x radiance. In that unit a map weighs 2 pi R^2 times its mean radiance, with R
-    the radius of the scene. But most of a smooth map is found by directions that the surface draws,
-    and samples that pick it are taken from the lamps: picked by its whole power, a bright constant
-    map had twice the error. So a map weighs what it has in peaks, its mean less its median, and at
-    least as much as the average lamp (study S29).
+    the radius of the sphere around the bounding box of all surfaces. But most of a smooth map is
+    found by directions that the surface draws, and samples that pick it are taken from the lamps:
+    picked by its whole power, a bright constant map had twice the error. So a map weighs what it
+    has in peaks, its mean less its median, and at least as much as the average lamp (study S29).
     """
     power = lamp_power(scene)
     lamps = len(np.unique(scene.object_index[scene.triangle_emits]))
     if not power > 0:
         return 1.0
-    weight = max(2 * np.pi * surface_radius(scene) ** 2 * peaked_radiance(sky), power / lamps)
+    corners = scene.vertex_positions[scene.faces[~scene.triangle_emits]].reshape(-1, 3)
+    radius = float(0.5 * np.linalg.norm(np.ptp(corners.astype(np.float64), axis=0)))
+    weight = max(2 * np.pi * radius**2 * peaked_radiance(sky), power / lamps)
     return float(weight / (weight + power))
 
 
@@ -179,12 +178,6 @@ def lamp_power(scene: Scene) -> float:
     emits = scene.triangle_emits
     radiance = scene.materials[scene.material_index[emits]][:, EMISSION].astype(np.float64)
     return float((triangle_areas(scene, emits)[3] * radiance.mean(axis=1)).sum())
-
-
-def surface_radius(scene: Scene) -> float:
-    """Return the radius of the sphere around the bounding box of all surfaces, emitters not."""
-    corners = scene.vertex_positions[scene.faces[~scene.triangle_emits]].reshape(-1, 3)
-    return float(0.5 * np.linalg.norm(np.ptp(corners.astype(np.float64), axis=0)))
 
 
 def peaked_radiance(sky: Environment) -> float:

@@ -1,7 +1,7 @@
 """Run as a process of its own: renders a small picture with the variant that its argument names.
 
 LLVM's library is the one of the environment. Ends with status 0 only when the picture is the right
-one (pipeline.renders.probe_picture) within its noise. The scene needs every kind of ray: it has a
+one (PROBE_PICTURE) within its noise. The scene needs every kind of ray: it has a
 lamp beside the view, a glossy wall that reflects light, and a screen that hides and shades what is
 behind it. Where a kernel misses one kind of hit, some block of the picture is wrong.
 
@@ -10,7 +10,9 @@ On a GPU it then prints why pictures cannot be denoised there, if so.
 
 import resource
 import sys
-from typing import Literal
+from collections.abc import Callable
+from functools import partial
+from typing import TYPE_CHECKING, Literal
 
 import drjit
 import mitsuba
@@ -18,14 +20,21 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from pipeline.isolation import die_with_parent
-from pipeline.renders.probe_picture import DEVIATION_RGB, MEAN_RGB
+from pipeline.renders.mitsuba_variant import PROBE_PICTURE
 from storage.conventions import look_at_c2w
 from storage.denoiser import DenoiserDevice, gpu_is_supported, set_denoiser_device
 from storage.records.material import completed_rows
 from storage.records.scene import ObjectKind, Scene, SceneObject
 
+if TYPE_CHECKING:
+    from pipeline.renders.renderer import RenderedView
+
 BLOCK = 4
 """Width in pixels of the blocks whose means are compared: a few bright samples decide a pixel."""
+
+_numbers = np.array(PROBE_PICTURE.split(), np.float64).reshape(4, 4, 2, 3)
+MEAN_RGB = _numbers[:, :, 0]
+DEVIATION_RGB = _numbers[:, :, 1]
 
 _MOST_DEVIATIONS = 6
 """Standard deviations by which a right picture is off, somewhere, once in ten million probes."""
@@ -86,22 +95,30 @@ def probe_blocks(
     seed: int, denoiser: Literal["high", "off"] = "off"
 ) -> tuple[NDArray[np.float64], bool]:
     """Return the means [4, 4, 3] of the picture's blocks, and whether all pixels see the scene."""
+    view = load_probe(4 * BLOCK, 512, denoiser)(seed)
+    cells = view.radiance_rgb.astype(np.float64).reshape(4, BLOCK, 4, BLOCK, 3)
+    return cells.mean(axis=(1, 3)), bool(view.hits.all())
+
+
+def load_probe(
+    resolution: int, spp: int, denoiser: Literal["high", "off"] = "high"
+) -> "Callable[[int], RenderedView]":
+    """Load the probe's scene; return what renders its view with a seed."""
     from pipeline.renders.renderer import SceneRenderer
     from pipeline.renders.settings import RenderSettings
 
+    scene = probe_scene()
     settings = RenderSettings(
-        resolution=4 * BLOCK,
+        resolution=resolution,
         noise_floor_db=90,
-        min_spp=512,
-        max_spp=512,
+        min_spp=spp,
+        max_spp=spp,
         denoiser=denoiser,
         min_mean_radiance=0,
         arithmetic="device",
     )
-    scene = probe_scene()
-    view = SceneRenderer(scene, settings).render_view(scene.c2w[0], float(scene.fov_deg[0]), seed)
-    cells = view.radiance_rgb.astype(np.float64).reshape(4, BLOCK, 4, BLOCK, 3)
-    return cells.mean(axis=(1, 3)), bool(view.hits.all())
+    renderer = SceneRenderer(scene, settings)
+    return partial(renderer.render_view, scene.c2w[0], float(scene.fov_deg[0]))
 
 
 def probe_scene() -> Scene:

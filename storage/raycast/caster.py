@@ -1,6 +1,7 @@
 """`RayCaster`: which triangles rays meet, on the CPU or on a GPU.
 
-Embree is its form for numpy; a kernel of model.hits is that for tensors.
+Embree is its form for numpy; a kernel of model.hits is that for tensors. A `FirstHitCaster` is
+enough for passes: Embree, or Mitsuba on a GPU (pipeline.renders.kernel_scene).
 """
 
 from dataclasses import dataclass
@@ -25,11 +26,15 @@ class RayHits:
     """[2, N] weights of its second and third corner; undefined where nothing is met; float32."""
 
 
-class RayCaster(Protocol):
+class FirstHitCaster(Protocol):
     """Some triangles of many, as rays meet them; arrays are of one kind, all float32."""
 
     def intersect(self, origins: Any, directions: Any) -> RayHits:
         """Return the first hits of rays [N, 3] from `origins` [N, 3], from either side."""
+
+
+class RayCaster(FirstHitCaster, Protocol):
+    """A caster that also says what is free, for shadows."""
 
     def is_free(self, origins: Any, directions: Any, distances_m: Any) -> Any:
         """Return [N] whether rays meet nothing up to a distance [N], in lengths of directions."""

@@ -1,6 +1,6 @@
 """First hits of a camera's pixels: triangle, object, depth, position, normals, material.
 
-Embree finds the triangle, in single precision (storage.raycast.caster); where on it, is then
+A caster finds the triangle, in single precision (storage.raycast.caster); where on it, is then
 computed in double precision from the triangle's stored corners. Emitters are hidden from cameras,
 so rays pass through them. Each quantity is computed on first use.
 """
@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 
 from storage.conventions import camera_rays
 from storage.errors import TrilightError
-from storage.raycast.caster import MISS, Surfaces
+from storage.raycast.caster import MISS, FirstHitCaster, Surfaces
 from storage.records.lookup import mapped_normals, normal_texels, textured_rows, u_directions
 from storage.records.scene import Scene
 
@@ -24,10 +24,13 @@ class SeenFrom:
     Each table has T + 1 rows. The last one, which MISS picks, stands for nothing: NaN.
     """
 
-    def __init__(self, scene: Scene, origin: NDArray[np.float64]) -> None:
+    def __init__(
+        self, scene: Scene, origin: NDArray[np.float64], surfaces: FirstHitCaster | None = None
+    ) -> None:
+        """Take a scene and a place; `surfaces` are its own, by default as Embree meets them."""
         self.scene = scene
         self.origin = origin
-        self.surfaces = Surfaces(scene)
+        self.surfaces = surfaces or Surfaces(scene)
 
     def hits(self, directions: NDArray[np.float64]) -> "FirstHits":
         """Return the first hits of rays along unit `directions` [..., 3]."""

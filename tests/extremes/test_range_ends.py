@@ -24,8 +24,7 @@ from model.open import BUILTIN_TOKENS, open_network
 from model.positions import TriangleRotary
 from model.renderformer import RenderFormer
 from model.scene_tensors import MAX_NETWORK_M, SceneBatch, batch_scenes, scene_tensors
-from pipeline.renders.renderer import SceneRenderer
-from pipeline.renders.results import RenderedView
+from pipeline.renders.renderer import RenderedView, SceneRenderer
 from pipeline.renders.settings import MAX_SPP, RenderSettings
 from pipeline.scenes.compose import compose_scene
 from pipeline.scenes.triangle_budget import PooledAsset

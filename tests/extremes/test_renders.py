@@ -17,8 +17,7 @@ import numpy as np
 import pytest
 from numpy.typing import ArrayLike, NDArray
 
-from pipeline.renders.renderer import SceneRenderer
-from pipeline.renders.results import RenderedView
+from pipeline.renders.renderer import RenderedView, SceneRenderer
 from pipeline.renders.settings import RenderSettings
 from pipeline.renders.tracer import load_tracer
 from storage.conventions import camera_rays

@@ -21,7 +21,7 @@ from infra.bench_options import BenchOptions
 from infra.render.raw_references import RawReference, first_camera, raw_reference, true_error_db
 from pipeline.presets.training import object_views
 from pipeline.renders.noise_floor import clamped_radiance
-from pipeline.renders.results import RenderedView
+from pipeline.renders.renderer import RenderedView
 from pipeline.renders.settings import USUAL_FLOOR_DB
 from pipeline.renders.tracer import pixel_camera
 from storage.conventions import log10_radiance

@@ -32,8 +32,7 @@ from infra.render.raw_references import (
 from pipeline.isolation import IsolatedChild
 from pipeline.renders.calibrated_error import LEAST_ERROR
 from pipeline.renders.noise_floor import Curve, clamped_radiance, secant_slope
-from pipeline.renders.renderer import SceneRenderer
-from pipeline.renders.results import RenderedView
+from pipeline.renders.renderer import RenderedView, SceneRenderer
 from pipeline.renders.settings import RenderSettings
 from pipeline.renders.tracer import PixelCamera, load_tracer
 from storage.atomic import write_atomically

@@ -149,9 +149,9 @@ def check_raw(mesh: TriangleMesh, settings: AssetSettings, *, is_single: bool) -
 
 def check_clean(mesh: TriangleMesh) -> None:
     """Raise Rejected where a cleaned mesh has too little area to render."""
-    double_areas = np.linalg.norm(mesh.double_area_vectors, axis=1)
-    area = 0.5 * float(double_areas.sum())
-    bulk = _bulk_extent(mesh.corners.reshape(-1, 3), np.repeat(double_areas, 3)) if area else 0.0
+    areas = mesh.areas
+    area = float(areas.sum())
+    bulk = _bulk_extent(mesh.corners.reshape(-1, 3), np.repeat(areas, 3)) if area else 0.0
     if area and bulk < MIN_BULK:
         raise Rejected(
             "far_outlier", f"99 % of the area lies within {bulk:.2g} of the box; >= {MIN_BULK}"

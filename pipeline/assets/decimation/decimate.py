@@ -6,9 +6,11 @@ from typing import TypeVar
 import igl
 import numpy as np
 
-from pipeline.assets.cleaning.clean import clean
+from pipeline.assets.cleaning.clean import clean, normalize
 from pipeline.assets.decimation import meshopt
-from pipeline.assets.quality.measure import count_edges
+from pipeline.assets.quality.measure import faces_of_edges
+from pipeline.assets.recipe import methods_of
+from pipeline.assets.settings import Profile
 from pipeline.foreign.mesh import TriangleMesh
 from storage.errors import Rejected
 
@@ -31,18 +33,6 @@ _FEWEST = 4
 """Faces of the smallest closed surface."""
 
 
-def _remesh_evenly(mesh: TriangleMesh, budget: int) -> TriangleMesh:
-    from pipeline.assets.decimation import pymeshlab_filters  # may not be installed
-
-    return pymeshlab_filters.remesh_evenly(mesh, budget)
-
-
-def _collapse(mesh: TriangleMesh, budget: int) -> TriangleMesh:
-    from pipeline.assets.decimation import pymeshlab_filters  # may not be installed
-
-    return pymeshlab_filters.collapse(mesh, budget)
-
-
 def collapse_by_qslim(mesh: TriangleMesh, budget: int) -> TriangleMesh:
     """Return the mesh with at most `budget` faces where its topology allows that many collapses.
 
@@ -59,14 +49,12 @@ def collapse_by_qslim(mesh: TriangleMesh, budget: int) -> TriangleMesh:
 
 
 _METHODS: Mapping[str, Callable[[TriangleMesh, int], TriangleMesh]] = {
-    "pymeshlab_uniform": _remesh_evenly,
-    "pymeshlab_collapse": _collapse,
     "libigl_qslim": collapse_by_qslim,
     "libigl_qslim_alone": collapse_by_qslim,
     "meshoptimizer": meshopt.simplify,
     "meshoptimizer_sloppy": meshopt.simplify_sloppily,
 }
-"""Methods by the names that `recipe.methods_of` lists in order of trial."""
+"""Methods by the names that `recipe.methods_of` lists in order of trial, without pymeshlab's."""
 _MAY_HANG = ("pymeshlab_uniform", "pymeshlab_collapse")
 _AFTER_MESHOPTIMIZER = (*_MAY_HANG, "libigl_qslim")
 
@@ -75,6 +63,10 @@ def decimate(mesh: TriangleMesh, budget: int, method: str) -> TriangleMesh:
     """Return a mesh of about `budget` faces by a method of `recipe.methods_of`; raises Rejected."""
     if method in _AFTER_MESHOPTIMIZER and len(mesh.faces) > 1.25 * _DETOUR * budget:
         mesh = clean(meshopt.simplify(mesh, _DETOUR * budget))
+    if method in _MAY_HANG:
+        from pipeline.assets.decimation.pymeshlab_filters import collapse, remesh_evenly
+
+        return (remesh_evenly if method == "pymeshlab_uniform" else collapse)(mesh, budget)
     return _METHODS[method](mesh, budget)
 
 
@@ -83,8 +75,34 @@ def safe_method(mesh: TriangleMesh, method: str) -> str:
     if method not in _MAY_HANG:
         return method
     valence = np.bincount(mesh.faces.ravel()).max()
-    wild = valence > _MAX_VALENCE or count_edges(mesh).most_faces > _MAX_FACES_PER_EDGE
+    wild = valence > _MAX_VALENCE or faces_of_edges(mesh).max() > _MAX_FACES_PER_EDGE
     return "meshoptimizer" if wild else method
+
+
+def remesh(raw: TriangleMesh, num_faces: int, profile: Profile = "uniform") -> TriangleMesh:
+    """Return the surface with at most `num_faces` triangles, in the units of the file.
+
+    This is the mesh stage without its quality checks; RenderFormer's own remeshing gives other
+    triangles.
+
+    Raises:
+        Rejected: "remesh_failed" where no method gives that many.
+        TrilightError: `uniform` without pymeshlab.
+    """
+    used = raw.positions[np.unique(raw.faces)]
+    low = used.min(axis=0)
+    high = used.max(axis=0)
+    unit = clean(normalize(raw))
+    if len(unit.faces):
+        for method in methods_of(profile):
+            try:
+                result = decimate(unit, num_faces, safe_method(unit, method))
+            except Rejected:
+                continue
+            if 0 < len(result.faces) <= num_faces:
+                positions = result.positions * (high - low).max() + (low + high) / 2
+                return TriangleMesh(positions=positions, faces=result.faces)
+    raise Rejected("remesh_failed", f"no method gives at most {num_faces} triangles")
 
 
 def smallest_passing(attempt: Callable[[int], Result], largest: int) -> Result:

@@ -94,8 +94,7 @@ def remesh_evenly(mesh: TriangleMesh, budget: int) -> TriangleMesh:
     that fills most of the budget with equilateral triangles. A source with fewer triangles than the
     budget gains some. Raises Rejected `decimation_failed` too.
     """
-    area = 0.5 * float(np.linalg.norm(mesh.double_area_vectors, axis=1).sum())
-    edge = float(np.sqrt(4 * area / (np.sqrt(3) * _FILL * budget)))
+    edge = float(np.sqrt(4 * float(mesh.areas.sum()) / (np.sqrt(3) * _FILL * budget)))
     length = {"targetlen": pymeshlab.PureValue(edge)}
     even = _apply(mesh, "meshing_isotropic_explicit_remeshing", {**_REMESH, **length})
     return collapse(even, budget) if len(even.faces) > budget else even

@@ -35,18 +35,6 @@ _RAYS_PER_SIDE = 64
 """The ray spacing is 2.8 % of the box: one ray in forty hits the outline of a large object."""
 
 
-@dataclass(frozen=True, kw_only=True)
-class EdgeCounts:
-    """Numbers of edges by how many faces share them."""
-
-    open: int
-    """Edges of one face: the border of an open surface."""
-    nonmanifold: int
-    """Edges that three or more faces share."""
-    most_faces: int
-    """Largest number of faces that share one edge."""
-
-
 def level_mesh(level: Level) -> TriangleMesh:
     """Return the mesh of a level in double precision."""
     return TriangleMesh(
@@ -67,7 +55,7 @@ def round_digits(value: float) -> float:
 
 def area_variation(mesh: TriangleMesh) -> float:
     """Return the standard deviation of the areas over their mean; 0 where all are equal."""
-    areas = np.linalg.norm(mesh.double_area_vectors, axis=1)
+    areas = mesh.areas
     return float(areas.std() / areas.mean())
 
 
@@ -80,15 +68,10 @@ def smallest_angles_deg(mesh: TriangleMesh) -> NDArray[np.float64]:
     return np.degrees(np.arccos(np.clip(cosine, -1.0, 1.0)))
 
 
-def count_edges(mesh: TriangleMesh) -> EdgeCounts:
-    """Count the open and non-manifold edges."""
+def faces_of_edges(mesh: TriangleMesh) -> NDArray[np.int64]:
+    """Return the number [E] of faces that share each edge: 1 at the border of an open surface."""
     ends = np.sort(half_edges(mesh), axis=1)
-    shared = np.unique(ends[:, 0] * len(mesh.positions) + ends[:, 1], return_counts=True)[1]
-    return EdgeCounts(
-        open=int((shared == 1).sum()),
-        nonmanifold=int((shared > 2).sum()),
-        most_faces=int(shared.max()),
-    )
+    return np.unique(ends[:, 0] * len(mesh.positions) + ends[:, 1], return_counts=True)[1]
 
 
 def half_edges(mesh: TriangleMesh) -> NDArray[np.int64]:
@@ -134,7 +117,7 @@ def sample_surface(
         mesh: at least one face with area.
         uniform: [N, 3] independent numbers in [0, 1).
     """
-    total = np.cumsum(np.linalg.norm(mesh.double_area_vectors, axis=1))
+    total = np.cumsum(mesh.areas)
     target = (np.arange(len(uniform)) + uniform[:, 0]) / len(uniform) * total[-1]
     face = np.minimum(np.searchsorted(total, target, side="right"), len(total) - 1)
     root = np.sqrt(uniform[:, 1])
@@ -184,11 +167,11 @@ class MeasuredSource:
         self.num_components = len(extents)
         self._lost_beyond = np.maximum(_OWN_SIZE * extents, _VISIBLE)[self._component]
         self._silhouette = silhouette(mesh)
-        self._area = _area(mesh)
+        self._area = float(mesh.areas.sum())
 
     def area_ratio(self, result: TriangleMesh) -> float:
         """Return the area of `result` as a multiple of the source's."""
-        return _area(result) / self._area
+        return float(result.areas.sum()) / self._area
 
     def _lost_area(self, distances: NDArray[np.float64]) -> float:
         """Return the fraction of the source's area in lost components.
@@ -224,12 +207,8 @@ class MeasuredSource:
             lost_area=round_digits(self._lost_area(measured.to_other)),
             area_variation=round_digits(area_variation(result)),
             min_angle_p5_deg=round_digits(np.percentile(smallest_angles_deg(result), 5)),
-            open_edges=count_edges(result).open,
+            open_edges=int((faces_of_edges(result) == 1).sum()),
         )
-
-
-def _area(mesh: TriangleMesh) -> float:
-    return 0.5 * float(np.linalg.norm(mesh.double_area_vectors, axis=1).sum())
 
 
 def label_components(mesh: TriangleMesh) -> NDArray[np.int64]:

@@ -12,6 +12,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from pipeline.assets.quality.measure import unit_normals
 from pipeline.assets.settings import OwnMaterialSettings
 from pipeline.assets.source_materials.source_surface import SourceSurface
 from pipeline.foreign.mesh import TriangleMesh
@@ -196,8 +197,9 @@ def bake(
     corners = np.take_along_axis(level.corners, order[..., None], axis=1)
     cells, density = _cells(corners, settings)
     texels = _bake_texels(corners, cells, source, reach, density)
-    tile_of, first_of = _tiles(cells, texels)
-    plan = pack_atlas(np.where(_is_flat(texels), 0, cells)[first_of])
+    is_flat = _is_flat(texels)
+    tile_of, first_of = _tiles(is_flat, texels)
+    plan = pack_atlas(np.where(is_flat, 0, cells)[first_of])
     uv = np.zeros((len(corners), 3, 2))
     for face, tile in enumerate(tile_of):
         uv[face, order[face]] = plan.uv(int(tile))
@@ -283,17 +285,15 @@ def _has_flat_normals(codes: NDArray[np.uint8]) -> NDArray[np.bool_]:
 
 
 def _tiles(
-    cells: NDArray[np.int64], texels: _Texels
+    is_flat: NDArray[np.bool_], texels: _Texels
 ) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
     """Return the tile [F] of each triangle, and the first triangle [K] of each tile.
 
     Triangles of the same flat color share a tile.
     """
-    flat = _is_flat(texels)
-    count = len(cells)
     codes = texels.codes[texels.start[:-1]].astype(np.int64)
-    number = np.where(flat, 0, 1 + np.arange(count))
-    names = np.column_stack([number, np.where(flat[:, None], codes, 0)])
+    number = np.where(is_flat, 0, 1 + np.arange(len(is_flat)))
+    names = np.column_stack([number, np.where(is_flat[:, None], codes, 0)])
     _, first, tile = np.unique(names, axis=0, return_index=True, return_inverse=True)
     return tile.ravel(), first
 
@@ -383,11 +383,9 @@ def level_emission(
     weights = spread_points()
     corners = level.corners
     points = np.einsum("pc,fcd->fpd", weights, corners)
-    normal = level.double_area_vectors
-    areas = 0.5 * np.linalg.norm(normal, axis=1)
-    normals = np.repeat(normal / (2 * areas[:, None]), len(weights), axis=0)
+    normals = np.repeat(unit_normals(level), len(weights), axis=0)
     locations, _ = source.lookup.find(points.reshape(-1, 3), normals, reach)
-    cell = float(np.sqrt(np.median(areas) / len(weights)))
+    cell = float(np.sqrt(np.median(level.areas) / len(weights)))
     seen = source.emission(locations, cell).reshape(len(corners), -1, 3)
     mean = seen.mean(axis=1)
     if not mean.max() < _MOST:  # or not a number

@@ -8,6 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pipeline.assets.quality.measure import (
+    half_edges,
     level_mesh,
     round_digits,
     sample_surface,
@@ -158,16 +159,16 @@ def read_source_surface(
             texture_coordinates_not_finite.
     """
     decode = Decoder(settings.max_pixels)
-    parts = _parts(source, decode, emission=settings.emission, normals=settings.normal_maps)
+    parts = _parts(source, decode, settings)
     source.notes.extend(decode.notes)
     lost = {word for material in parts.materials for word in material.lost}
     lost -= {"emission"} if settings.emission else set()
     return match_source_surface(mesh, parts), OwnMaterials(lost=tuple(sorted(lost)))
 
 
-def _parts(
-    source: SourceFile, decode: Decode, *, emission: bool, normals: bool = False
-) -> TexturedMesh:
+def _parts(source: SourceFile, decode: Decode, settings: OwnMaterialSettings) -> TexturedMesh:
+    emission = settings.emission
+    normals = settings.normal_maps
     if source.usd is not None:  # whose normal maps its limits have chosen
         return usd_textured_mesh(source.usd, decode, emission=emission)
     if source.gltf is not None:
@@ -208,8 +209,7 @@ def _color_errors(
 
 def _torn_seams(level: TriangleMesh, source: SourceSurface, reach: float, texel: float) -> float:
     """Return the fraction of inner edge length whose two sides show distant source points."""
-    directed = np.stack([level.faces, np.roll(level.faces, -1, axis=1)], axis=-1).reshape(-1, 2)
-    ends = np.sort(directed, axis=1)
+    ends = np.sort(half_edges(level), axis=1)
     edges, edge, count = np.unique(ends, axis=0, return_inverse=True, return_counts=True)
     edge = edge.ravel()
     order = np.argsort(edge, kind="stable")

@@ -12,8 +12,6 @@ from typing import NamedTuple
 
 import igl
 import numpy as np
-from embreex.mesh_construction import TriangleMesh as EmbreeMesh
-from embreex.rtcore_scene import EmbreeScene
 from numpy.typing import NDArray
 
 from pipeline.assets.cleaning.clean import cell_keys, normalize, start_at_lowest
@@ -21,6 +19,7 @@ from pipeline.assets.quality.measure import unit_normals
 from pipeline.foreign.material import Slot, SourceMaterial, TexturedMesh, source_columns
 from pipeline.foreign.mesh import TriangleMesh
 from storage.errors import Rejected
+from storage.raycast.caster import MISS, Triangles
 from storage.records.lookup import LEAST_Z, u_directions, unit_or_zero
 
 _BEHIND = 1e-4
@@ -44,8 +43,7 @@ class SurfaceLookup:
         self._normals = unit_normals(mesh)
         self._tree = igl.AABB()
         self._tree.init(mesh.positions, mesh.faces)
-        self._embree = EmbreeScene(robust=True)
-        EmbreeMesh(self._embree, mesh.corners.astype(np.float32))
+        self._triangles = Triangles(mesh.corners.astype(np.float32), np.arange(len(mesh.faces)))
 
     def find(
         self, points: NDArray[np.float64], normals: NDArray[np.float64], reach: float
@@ -76,12 +74,11 @@ class SurfaceLookup:
     ) -> tuple[NDArray[np.int64], NDArray[np.float64], NDArray[np.float64]]:
         """Return face, weights and distance of each ray's first hit; infinite without one."""
         origins = (points - _BEHIND * directions).astype(np.float32)
-        hit = self._embree.run(origins, directions.astype(np.float32), output=True)
-        face = np.asarray(hit["primID"], np.int64)
-        u = np.asarray(hit["u"], np.float64)
-        v = np.asarray(hit["v"], np.float64)
-        distance = np.where(face < 0, np.inf, np.abs(np.asarray(hit["tfar"], np.float64) - _BEHIND))
-        return np.maximum(face, 0), np.stack([1 - u - v, u, v], axis=1), distance
+        hits = self._triangles.intersect(origins, directions.astype(np.float32))
+        u, v = hits.uv.astype(np.float64)
+        beyond = np.abs(hits.distance_m.astype(np.float64) - _BEHIND)
+        distance = np.where(hits.triangle == MISS, np.inf, beyond)
+        return np.maximum(hits.triangle, 0), np.stack([1 - u - v, u, v], axis=1), distance
 
     def _closest(
         self, points: NDArray[np.float64], normals: NDArray[np.float64], reach: float
@@ -269,8 +266,7 @@ class SourceSurface:
     @cached_property
     def _areas(self) -> NDArray[np.float64]:
         """Area [R] of each face of the file, in the unit box."""
-        vectors = normalize(self.parts.mesh).double_area_vectors
-        return 0.5 * np.linalg.norm(vectors, axis=1)
+        return normalize(self.parts.mesh).areas
 
 
 def _unit_normals(corners: NDArray[np.float64]) -> NDArray[np.float64]:

@@ -17,6 +17,7 @@ from numpy.typing import NDArray
 
 from storage.conventions import camera_rays
 from storage.errors import TrilightError
+from storage.raycast.caster import FirstHitCaster
 from storage.raycast.first_hits import SeenFrom, require_row
 from storage.records.exr import channel_names, decode_channels, encode_channels
 from storage.records.passes.declared import (
@@ -45,6 +46,7 @@ def view_passes(
     rays_a_side: int = 1,
     then: Scene | None = None,
     then_view: int | None = None,
+    surfaces: FirstHitCaster | None = None,
 ) -> dict[str, NDArray]:
     """Return passes of one camera of a scene: pictures of what its pixels see.
 
@@ -60,6 +62,7 @@ def view_passes(
             1 to 64, its square in all. With 1, everything is exactly what the centre's ray meets.
         then: for `motion_px`: the same triangles at another moment; by default this scene.
         then_view: for `motion_px`: row of the cameras of `then`; by default `view`.
+        surfaces: what finds the triangles that cameras of the scene see; by default Embree.
 
     Returns:
         for each name a picture [R, R], or [R, R, K] where the pass has K channels, row 0 on top:
@@ -80,9 +83,10 @@ def view_passes(
     if all(each.averaging == "centre ray" for each in chosen):
         rays_a_side = 1
     origin = scene.c2w[view, :3, 3].astype(np.float64)
+    seen = SeenFrom(scene, origin, surfaces)
     blocks = [
         _block(chosen, centre, spread, rays_a_side)
-        for centre, spread in _blocks(SeenFrom(scene, origin), view, resolution, rays_a_side, later)
+        for centre, spread in _blocks(seen, view, resolution, rays_a_side, later)
     ]
     return {each.name: np.concatenate([block[each.name] for block in blocks]) for each in chosen}
 
@@ -195,14 +199,20 @@ MOST_IDS = 2**24
 
 
 def passes_exr(
-    scene: Scene, names: Sequence[str], *, view: int, resolution: int, rays_a_side: int = 1
+    scene: Scene,
+    names: Sequence[str],
+    *,
+    view: int,
+    resolution: int,
+    rays_a_side: int = 1,
+    surfaces: FirstHitCaster | None = None,
 ) -> bytes:
     """Return the OpenEXR file of passes of one camera; equal arguments give equal bytes.
 
     Args:
         scene: passes `Scene.check`.
         names: of the passes; `passes_in_file` says which of them the file has.
-        view, resolution, rays_a_side: as `view_passes`.
+        view, resolution, rays_a_side, surfaces: as `view_passes`.
 
     Raises:
         TrilightError: as `view_passes`, or the scene has more than 2^24 triangles.
@@ -218,6 +228,7 @@ def passes_exr(
         view=view,
         resolution=resolution,
         rays_a_side=rays_a_side,
+        surfaces=surfaces,
     )
     is_hit = pictures[COVERAGE] > 0
     channels: dict[str, NDArray[np.float32]] = {}

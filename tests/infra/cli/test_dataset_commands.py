@@ -11,6 +11,7 @@ import numpy as np
 import pytest
 import torch
 
+from infra.cli import passes as passes_command
 from infra.cli.assets import generate_from_meshes
 from infra.cli.extend_option import load_extensions
 from infra.repair import repair
@@ -22,6 +23,7 @@ from pipeline.exchange.open_scene import load_source, scene_source
 from pipeline.exchange.renderformer_h5 import read_renderformer_h5
 from pipeline.exchange.renderformer_json import describe_scene
 from pipeline.generation.generate_options import GenerateOptions
+from pipeline.renders.mitsuba_variant import choose_variant
 from storage.dataset.dataset import open_dataset
 from storage.dataset.layout import DatasetFolder
 from storage.dataset.manifest import write_manifest
@@ -449,7 +451,7 @@ def dataset(tmp_path: Path) -> Path:
 def test_passes_are_of_the_views_that_are_named(dataset: Path, tmp_path: Path) -> None:
     """Of a dataset, of one scene of it, and of the file of a scene; what is not there is named."""
     out = tmp_path / "out"
-    words = ("--passes", "normal,depth", "--passes", "object", "--out", out)
+    words = ("--passes", "normal,depth", "--passes", "object", "--device", "cpu", "--out", out)
     found = said("passes", dataset, *words)
     assert found["passes"] == ["object", "depth_axis_m", "shading_normal"]
     assert [Path(path).name for path in found["files"]] == [
@@ -466,7 +468,8 @@ def test_passes_are_of_the_views_that_are_named(dataset: Path, tmp_path: Path) -
     }
     file = tmp_path / "floor.safetensors"
     file.write_bytes(encode_scene(tiny_scene()))
-    found = said("passes", file, "--view", "0", "--passes", "triangle", "--out", tmp_path)
+    options = ("--view", "0", "--passes", "triangle", "--device", "cpu")
+    found = said("passes", file, *options, "--out", tmp_path)
     assert found["files"] == [str(tmp_path / "floor.0.passes.exr")]
     data = (tmp_path / "floor.0.passes.exr").read_bytes()
     assert data == passes_exr(tiny_scene(), ["triangle"], view=0, resolution=256)
@@ -478,6 +481,25 @@ def test_passes_are_of_the_views_that_are_named(dataset: Path, tmp_path: Path) -
     ):
         assert message in refused("passes", dataset, option, value, "--out", tmp_path / "none")
     assert not (tmp_path / "none").exists()
+
+
+def test_passes_take_a_gpu_that_passes_the_probe(
+    dataset: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Here LLVM stands for it; without one `gpu` is refused, and a failed probe is a note."""
+    monkeypatch.setenv("CUDA_VISIBLE_DEVICES", "")
+    words = ("passes", dataset, "--scene", "1", "--view", "1", "--passes", "object")
+    told = refused(*words, "--device", "gpu", "--out", tmp_path / "none")
+    assert "--device is gpu, and no NVIDIA GPU is visible here" in told
+    assert not (tmp_path / "none").exists()
+    traced = []
+    for found in ((choose_variant("cpu"), ""), (None, "the GPU renders no right picture")):
+        monkeypatch.setattr(passes_command, "choose_gpu", lambda *_, device, found=found: found)
+        with monkeypatch.context() as patched:
+            patched.setattr(passes_command, "Surfaces", lambda scene: traced.append(scene))
+            notes = said(*words, "--out", tmp_path / "out")["notes"]
+        assert ("see trilight doctor" in str(notes)) == bool(found[1])
+        assert len(traced) == bool(found[1])
 
 
 def test_a_size_is_described() -> None:

@@ -34,7 +34,6 @@ from pipeline.exchange.reader import SceneReader
 from pipeline.isolation import Result
 from pipeline.renders.mitsuba_variant import choose_variant
 from pipeline.renders.noise_floor import clamped_radiance
-from pipeline.renders.settings import NoiseTargets
 from storage.conventions import log10_radiance, look_at_c2w
 from storage.dataset.shard import write_shard
 from storage.errors import TrilightError, Unrenderable
@@ -170,7 +169,7 @@ def test_two_renderers_without_noise() -> None:
 TINY = tiny_scene()
 TINY_CAMERA = Camera.of_scene(TINY, 0)
 FEW = FixedSamples(spp=4, denoiser="fast")
-MEASURED = ToStatedError(targets=NoiseTargets(log_db=95.0), max_spp=1024)
+MEASURED = ToStatedError(targets={"noise_floor_db": 95.0}, max_spp=1024)
 
 
 class Enough(Exception):

@@ -25,8 +25,7 @@ from pipeline.generation.render_sample import RenderInput, ViewProgress, render_
 from pipeline.presets.registry import preset_settings
 from pipeline.presets.settings import DatasetSettings
 from pipeline.renders.mitsuba_variant import Device, Variant, activate, choose_variant
-from pipeline.renders.results import RenderedView
-from pipeline.renders.settings import NoiseTargets
+from pipeline.renders.renderer import RenderedView
 from storage.conventions import look_at_c2w
 from storage.dataset.layout import DatasetFolder
 from storage.dataset.shard import write_shard
@@ -183,7 +182,7 @@ def _grey(source: SceneSource, variant: Variant) -> NDArray[np.uint8]:
 def test_rendering() -> None:
     """The child is killed between two passes of samples; the next one opens the scene again."""
     scene, kills = tiny_scene(), list[int]()
-    quality = ToStatedError(targets=NoiseTargets(log_db=99.0), max_spp=64)
+    quality = ToStatedError(targets={"noise_floor_db": 99.0}, max_spp=64)
     tracer = PathTracer(RenderChild(choose_variant(), threads=1), quality, 8)
     disturbed = False
 

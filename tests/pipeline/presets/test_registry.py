@@ -13,7 +13,6 @@ from pipeline.presets.frozen_v1 import PRESETS_FOR_JUDGING
 from pipeline.presets.registry import DATASET_PRESETS, frozen_note, object_source, preset_settings
 from pipeline.presets.renderformer import RENDERFORMER_PRESETS
 from pipeline.presets.settings import DatasetSettings, differences
-from pipeline.renders.settings import NoiseTargets
 from scene_templates import placement
 from scene_templates import sample_lights as emitters
 from scene_templates.sample_camera import sample_camera
@@ -48,7 +47,7 @@ def test_what_is_named_changes_and_nothing_else(name: str) -> None:
         name,
         seed=7,
         resolution=64,
-        noise_targets=NoiseTargets(log_db=33.0),
+        noise_targets={"noise_floor_db": 33.0},
         changes={"scenes.num_views": 3},
     )
     found = {path: value for path, _, value in differences(before.as_json(), after.as_json())}
@@ -62,7 +61,7 @@ def test_what_is_named_changes_and_nothing_else(name: str) -> None:
 
 def test_floors_licences_and_mistakes_of_a_build() -> None:
     plain = preset_settings("smoke").renders
-    linear = preset_settings("smoke", noise_targets=NoiseTargets(linear_db=33.0))
+    linear = preset_settings("smoke", noise_targets={"noise_floor_linear_db": 33.0})
     assert linear.renders.targets_db == {"psnr_linear_db": 33.0}
     added = preset_settings("smoke", changes={"renders.noise_floor_linear_db": 33.0})
     assert added.renders.targets_db == {**plain.targets_db, "psnr_linear_db": 33.0}

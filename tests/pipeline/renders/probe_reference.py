@@ -1,4 +1,4 @@
-"""Prints the table of pipeline.renders.probe_picture.
+"""Prints PROBE_PICTURE of pipeline.renders.mitsuba_variant.
 
 python -m tests.pipeline.renders.probe_reference
 """

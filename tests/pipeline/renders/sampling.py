@@ -19,8 +19,7 @@ from pipeline.renders.pictures import (
     join_halves,
     metric_counts,
 )
-from pipeline.renders.renderer import SceneRenderer
-from pipeline.renders.results import RenderedView
+from pipeline.renders.renderer import RenderedView, SceneRenderer
 from pipeline.renders.settings import RenderSettings
 from pipeline.renders.tracer import PixelCamera, load_tracer, pixel_camera
 from storage.records.scene import Scene

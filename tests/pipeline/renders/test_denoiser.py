@@ -32,11 +32,10 @@ from pipeline.renders.pictures import (
     read_sums,
     squared_error,
 )
-from pipeline.renders.pixels import with_mean_of
 from pipeline.renders.samples import DualBuffer, TileChoice
 from pipeline.renders.settings import Arithmetic, RenderSettings
 from pipeline.renders.tracer import load_tracer
-from pipeline.renders.view_pictures import LEAST_PASSES
+from pipeline.renders.view_pictures import LEAST_PASSES, with_mean_of
 from storage import denoiser
 from storage.denoiser import Features, denoise, load_oidn, set_denoiser_device
 from storage.errors import TrilightError
@@ -401,7 +400,7 @@ def test_far_from_its_targets_a_view_goes_on_by_its_halves(
     np.testing.assert_array_equal(found.radiance_rgb, expected.radiance_rgb)
     measured.clear()
     view = render_view(lit_scene(), dataclasses.replace(near, noise_floor_db=1.0), 3)
-    assert len(measured) == 1 and view.spp == near.first_spp and not view.at_cap
+    assert len(measured) == 1 and view.spp == first_spp(near) and not view.at_cap
 
 
 def test_other_versions_and_damage(tmp_path: Path) -> None:

@@ -20,8 +20,7 @@ from pipeline.renders import ggx, kernel_scene
 from pipeline.renders.device_memory import KernelInputs, read_back, record_launches
 from pipeline.renders.device_pictures import DevicePictures
 from pipeline.renders.ggx import AlbedoLookup, KernelLobes
-from pipeline.renders.renderer import SceneRenderer
-from pipeline.renders.results import RenderedView
+from pipeline.renders.renderer import RenderedView, SceneRenderer
 from pipeline.renders.settings import Filtered, RenderSettings
 from pipeline.renders.tracer import load_tracer
 from pipeline.renders.vector_tracer import VectorTracer

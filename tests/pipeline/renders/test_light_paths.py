@@ -25,8 +25,7 @@ from pipeline.renders.guide_table import (
     learn,
 )
 from pipeline.renders.kernel_scene import KernelScene
-from pipeline.renders.renderer import SceneRenderer
-from pipeline.renders.results import RenderedView
+from pipeline.renders.renderer import RenderedView, SceneRenderer
 from pipeline.renders.settings import RenderSettings
 from pipeline.renders.tracer import PixelCamera, load_tracer
 from pipeline.renders.vector_tracer import (

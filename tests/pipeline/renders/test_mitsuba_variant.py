@@ -24,8 +24,13 @@ from pipeline.renders.mitsuba_variant import (
     environment,
     llvm_libraries,
 )
-from pipeline.renders.probe_picture import DEVIATION_RGB, MEAN_RGB
-from pipeline.renders.variant_probe import BLOCK, probe_scene, wrong_picture
+from pipeline.renders.variant_probe import (
+    BLOCK,
+    DEVIATION_RGB,
+    MEAN_RGB,
+    probe_scene,
+    wrong_picture,
+)
 from storage import denoiser
 from storage.errors import EnvironmentFailure, TrilightError
 from storage.records.scene_file import encode_scene

@@ -10,7 +10,9 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
+from pipeline.renders.kernel_scene import CameraRays
 from pipeline.renders.tracer import load_tracer
+from storage.raycast.caster import Surfaces
 from storage.records.passes.pictures import view_passes
 from storage.records.scene import Scene
 from tests.oracle import plugin_scene, plugin_tracer
@@ -72,6 +74,24 @@ def _compare_depth(scene: Scene, ours: dict[str, NDArray], theirs: NDArray[np.fl
     before = _NEAR_CLIP * ours["depth_ray_m"][full] / ours["depth_axis_m"][full]
     off = abs(theirs[..., 0][full] + before - ours["depth_ray_m"][full])
     assert (off > 5e-6).mean() <= 0.002
+
+
+def test_rays_of_mitsuba_find_the_triangles_of_embree() -> None:
+    """As on a GPU: ids agree but for pixels on rims, and so do depths where ids do."""
+    scene = sampled_like_scene(np.random.default_rng(0), num_views=1)
+    names = ["triangle", "object", "depth_ray_m", "coverage"]
+    expected, found = (
+        view_passes(scene, names, resolution=64, rays_a_side=2, surfaces=caster(scene))
+        for caster in (Surfaces, CameraRays)
+    )
+    agree = found["triangle"] == expected["triangle"]
+    assert 0.2 < expected["coverage"].mean()
+    assert agree.mean() > 0.999  # measured: 1
+    for name in names[1:]:
+        np.testing.assert_allclose(found[name][agree], expected[name][agree], rtol=1e-5)
+    lamps = join([light([[-1, -1, 0], [1, -1, 0], [0, 1, 0]], 1.0)], eye=(0, -0.1, 2))
+    nothing = view_passes(lamps, ["hit"], resolution=8, surfaces=CameraRays(lamps))
+    assert not nothing["hit"].any()
 
 
 def test_a_lit_square_covers_the_pixels_that_it_should() -> None:

@@ -21,12 +21,11 @@ from infra.render.raw_references import raw_reference
 from pipeline.foreign.mesh import TriangleMesh
 from pipeline.renders import pictures
 from pipeline.renders.pictures import NUMPY, means, read_sums
-from pipeline.renders.pixels import with_mean_of
-from pipeline.renders.renderer import SceneRenderer, set_threads
-from pipeline.renders.results import RenderedView
+from pipeline.renders.renderer import RenderedView, SceneRenderer, set_threads
 from pipeline.renders.samples import DualBuffer
 from pipeline.renders.settings import RenderSettings
 from pipeline.renders.tracer import choose_tracing_scale, load_tracer
+from pipeline.renders.view_pictures import with_mean_of
 from storage.conventions import look_at_c2w
 from storage.denoiser import Features, Quality, denoise
 from storage.errors import Rejected

@@ -11,6 +11,7 @@ from hypothesis.extra import numpy as hnp
 from numpy.typing import NDArray
 
 from infra.render.quality import ToStatedError
+from pipeline.renders.calibrated_error import first_spp
 from pipeline.renders.noise_floor import Curve
 from pipeline.renders.pictures import NUMPY, means, pixel_errors, read_sums
 from pipeline.renders.renderer import SceneRenderer
@@ -26,7 +27,7 @@ from pipeline.renders.samples import (
     slope_db,
     tile_means,
 )
-from pipeline.renders.settings import NoiseTargets, RenderSettings
+from pipeline.renders.settings import RenderSettings, target_overrides
 from pipeline.renders.tracer import Chosen, PixelCamera, load_tracer
 from storage.conventions import log10_radiance
 from storage.errors import TrilightError
@@ -60,7 +61,7 @@ class Recorder:
 
 
 def test_passes_are_the_largest_that_fit_and_weigh_by_their_samples() -> None:
-    for first_spp, spp, max_spp, of_a_half in (
+    for least_spp, spp, max_spp, of_a_half in (
         (128, 128, 512, [64]),
         (32, 32, 4096, [16]),
         (32, 160, 160, [16, 16, 16, 16, 16]),
@@ -69,7 +70,7 @@ def test_passes_are_the_largest_that_fit_and_weigh_by_their_samples() -> None:
         (32, 256, 4096, [16, 16, 16, 16, 64]),
     ):
         tracer = Recorder()
-        samples = DualBuffer([tracer], CAMERA, 0, first_spp=first_spp, max_spp=max_spp)  # type: ignore[list-item]
+        samples = DualBuffer([tracer], CAMERA, 0, first_spp=least_spp, max_spp=max_spp)  # type: ignore[list-item]
         for _ in samples.passes_to(spp):
             pass
         assert samples.spp == spp
@@ -139,21 +140,21 @@ def test_a_narrow_picture_has_more_samples_before_the_first_look() -> None:
     for resolution, max_spp, first in ((512, 4096, 64), (128, 4096, 64), (64, 4096, 128),
                                        (96, 4096, 128), (8, 64, 64)):  # fmt: skip
         settings = {**GOOD, "resolution": resolution, "min_spp": 64, "max_spp": max_spp}
-        assert RenderSettings(**settings).first_spp == first, (resolution, max_spp)
+        assert first_spp(RenderSettings(**settings)) == first, (resolution, max_spp)
     for resolution, first in ((512, 32), (256, 32), (128, 64), (64, 128)):
         settings = {**GOOD, "resolution": resolution, "min_spp": 32, "min_spp_px": 256}
-        assert RenderSettings(**settings).first_spp == first, resolution
+        assert first_spp(RenderSettings(**settings)) == first, resolution
 
 
 def test_targets_go_by_the_name_of_their_metric() -> None:
     for targets, expected in (
-        (NoiseTargets(), {"psnr_log_db": 40.0}),
-        (NoiseTargets(linear_db=35.0), {"psnr_linear_db": 35.0}),
-        (NoiseTargets(log_db=44.0, objects_db=43.0),
+        ({}, {"psnr_log_db": 40.0}),
+        ({"noise_floor_linear_db": 35.0}, {"psnr_linear_db": 35.0}),
+        ({"noise_floor_db": 44.0, "noise_floor_objects_db": 43.0},
          {"psnr_log_db": 44.0, "object_psnr_log_db": 43.0}),
     ):  # fmt: skip
         assert ToStatedError(targets=targets).settings(64).targets_db == expected
-        assert RenderSettings(**{**GOOD, **targets.overrides}).targets_db == expected
+        assert RenderSettings(**{**GOOD, **target_overrides(targets)}).targets_db == expected
 
 
 def log_goal(target_db: float, step: int, max_spp: int) -> Goal:
@@ -343,7 +344,7 @@ def _adapted(
     tracer: object, seed: int, measured_at: Sequence[int], counted: NDArray[np.bool_] = EVERYWHERE
 ) -> DualBuffer:
     samples = DualBuffer([tracer], CAMERA, seed, first_spp=32, max_spp=4096)  # type: ignore[list-item]
-    samples.count_over(counted)
+    samples.counted = counted
     tiles, before = TileChoice(counted), np.zeros((2, 1, 1, 1))
     for spp in measured_at:
         more = tiles.passes(samples, spp) if samples.spp else None
@@ -367,7 +368,7 @@ def test_the_mean_stays_unbiased_where_tiles_are_chosen_by_rare_light() -> None:
     for seed in range(1000):
         samples = _adapted(RareLight(), seed, [32, 128, 512])
         means.append(mean_of(samples).mean())
-        spread.append(samples.spp_of(0).max() > samples.spp_of(0).min())
+        spread.append(samples.spp_by_half[0].max() > samples.spp_by_half[0].min())
     assert np.mean(spread) > 0.9, "the samples are spread unevenly"
     error = np.std(means, ddof=1) / np.sqrt(len(means))
     assert error < 0.02 * truth, "a bias of 8 % would show"
@@ -412,7 +413,7 @@ def test_noisy_tiles_get_more_and_what_shows_nothing_gets_no_more() -> None:
     tracer, counted = RareLight(), np.ones((32, 32), bool)
     tracer.ODDS, counted[:, 24:] = 0.0, False
     samples = _adapted(tracer, 1, [32, 128, 512], counted)
-    of_column = (samples.spp_of(0) + samples.spp_of(1)).mean(axis=0)[::TILE_PX]
+    of_column = samples.spp_by_half.sum(axis=0).mean(axis=0)[::TILE_PX]
     assert of_column[0] < of_column[1] < of_column[2], "the noise grows to the right"
     assert of_column[3] == 128, "as many as before tiles were chosen"
     assert 512 <= samples.spp <= 512 + 2 * PASS
