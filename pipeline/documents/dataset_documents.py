@@ -13,14 +13,7 @@ from pipeline.documents.croissant import encode_croissant
 from pipeline.documents.distributions import MEASURED, Distributions, dataset_distributions, setting
 from pipeline.documents.pages import render_markdown
 from pipeline.documents.report import write_report
-from pipeline.documents.rights import (
-    Rights,
-    attribution_of,
-    encode_licences,
-    hub_licence,
-    licence_facts,
-    rights_of,
-)
+from pipeline.documents.rights import Rights, encode_attribution, hub_licence, rights_of
 from pipeline.documents.sheets import write_contact_sheet
 from storage.atomic import write_atomically
 from storage.dataset.dataset import Dataset
@@ -84,7 +77,7 @@ def encode_card(
         derivation=derivation_of(manifest.settings),
         settings=[(label, value) for label, value in settings if value is not None],
         arrays=" or ".join(_arrays(distributions.packings)),
-        **licence_facts(rights),
+        rights=rights,
     )
 
 
@@ -182,8 +175,8 @@ def write_documents(dataset: Dataset, out: DatasetFolder | None = None) -> Stati
     statistics = dataset_statistics(dataset)
     distributions = dataset_distributions(dataset)
     rights = rights_of(distributions.locked)
-    write_atomically(out.attribution, attribution_of(distributions.locked, manifest.settings))
-    write_atomically(out.licences, encode_licences(rights))
+    write_atomically(out.attribution, encode_attribution(distributions.locked, manifest.settings))
+    write_atomically(out.licences, render_markdown("license.jinja", rights=rights))
     write_contact_sheet(dataset, statistics, out=out)
     write_report(dataset, distributions, out=out)
     write_atomically(out.croissant, encode_croissant(manifest, rights))

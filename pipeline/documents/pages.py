@@ -16,6 +16,7 @@ from markupsafe import Markup  # of jinja2
 from numpy.typing import NDArray
 
 from pipeline.documents.png import encode_png
+from storage.licences import DUTIES, duties_of, licence_url
 from storage.markdown import code, text
 
 
@@ -88,4 +89,9 @@ _MARKDOWN = _make_environment(
     keep_trailing_newline=True,
     finalize=lambda value: value if isinstance(value, Markup) else Markup(text(value)),
 )
+_MARKDOWN.globals |= {
+    "licence_url": licence_url,
+    "duties_of": duties_of,
+    "duty_texts": DUTIES,
+}
 _MARKDOWN.filters["code"] = lambda value: Markup(code(value))

@@ -146,10 +146,11 @@ def poll_run(
                 percent = float(str(data))
             elif artifact.type == "table" and artifact.key:
                 rows = json.loads(data) if isinstance(data, str) else data or []
-                named = [
-                    row for row in rows if {"what", "value"} <= set(row)
-                ]  # others are not ours
-                tables[artifact.key] = [(str(row["what"]), str(row["value"])) for row in named]
+                tables[artifact.key] = [
+                    (str(row["what"]), str(row["value"]))
+                    for row in rows
+                    if {"what", "value"} <= set(row)  # others are not ours
+                ]
         yield RunStatus(
             state=state.name or state.type.value,
             message=safe_text(state.message or ""),

@@ -9,18 +9,13 @@ that each is one flat chart; the cube of an object rotates with it.
 import dataclasses
 from collections.abc import Sequence
 from dataclasses import dataclass
+from itertools import accumulate
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from pipeline.scenes.shading_normals import (
-    ShadedMesh,
-    flat_shaded,
-    not_slivers,
-    smooth_shaded,
-    without_slivers,
-)
+from pipeline.scenes.shading_normals import ShadedMesh, flat_shaded, has_area, smooth_shaded
 from scene_templates.layout import Emitter, Layout, ShellPart, SurfaceLook
 from scene_templates.surfaces.maps import SurfaceMaps
 from scene_templates.textures import MOST_TEXTURED, TexturedLook, TextureSettings, draw_look
@@ -67,9 +62,9 @@ class ScenePiece:
 
 def shell_piece(part: ShellPart, rng: np.random.Generator, smooth_angle_deg: float) -> ScenePiece:
     """Return a floor or wall; if it has many colors, `rng` draws one per triangle."""
+    entry = SceneObject(name=part.name, kind="shell")
     positions = part.positions.astype(np.float32)
-    mesh = _shade_mesh(positions, part.faces, part.surface, smooth_angle_deg)
-    return _apply_surface(SceneObject(name=part.name, kind="shell"), mesh, part.surface, rng)
+    return _shaded_piece(entry, positions, part.faces, part.surface, rng, smooth_angle_deg)
 
 
 def object_piece(
@@ -85,21 +80,19 @@ def object_piece(
     Raises:
         Rejected: "no_faces" if no triangle has an area.
     """
-    faces = without_slivers(positions, faces)
+    faces = faces[has_area(positions, faces)]
     if len(faces) == 0:
         raise Rejected("no_faces", f"{entry.uid}: no triangle of the level has an area")
-    return _apply_surface(
-        entry, _shade_mesh(positions, faces, surface, smooth_angle_deg), surface, rng
-    )
+    return _shaded_piece(entry, positions, faces, surface, rng, smooth_angle_deg)
 
 
 def apply_skin(
     piece: ScenePiece, positions: NDArray[np.float32], faces: NDArray[np.uint32], skin: Skin
 ) -> ScenePiece:
     """Return the piece of `object_piece` with a skin that covers all faces, slivers included."""
-    has_area = not_slivers(positions, faces)
-    uv = skin.uv.reshape(-1, 3, 2)[has_area].reshape(-1, 2)
-    emission = None if skin.emission is None else skin.emission[has_area]
+    kept = has_area(positions, faces)
+    uv = skin.uv.reshape(-1, 3, 2)[kept].reshape(-1, 2)
+    emission = None if skin.emission is None else skin.emission[kept]
     return with_skin(piece, dataclasses.replace(skin, uv=uv, emission=emission))
 
 
@@ -138,21 +131,19 @@ def lamp_piece(
     return ScenePiece(entry=entry, mesh=mesh, materials=materials, material_index=index.ravel())
 
 
-def _shade_mesh(
+def _shaded_piece(
+    entry: SceneObject,
     positions: NDArray[np.float32],
     faces: NDArray[np.uint32],
     surface: SurfaceLook,
+    rng: np.random.Generator,
     smooth_angle_deg: float,
-) -> ShadedMesh:
-    if surface.smooth:
-        return smooth_shaded(positions, faces, smooth_angle_deg)
-    return flat_shaded(positions, faces)
-
-
-def _apply_surface(
-    entry: SceneObject, mesh: ShadedMesh, surface: SurfaceLook, rng: np.random.Generator
 ) -> ScenePiece:
     """Return the piece of a mesh with materials: one row, or one per shading group or triangle."""
+    if surface.smooth:
+        mesh = smooth_shaded(positions, faces, smooth_angle_deg)
+    else:
+        mesh = flat_shaded(positions, faces)
     rows = {
         "one": np.zeros(len(mesh.faces), np.int64),
         "groups": mesh.groups,
@@ -170,18 +161,23 @@ def _apply_surface(
 
 def concatenate_pieces(pieces: Sequence[ScenePiece]) -> dict[str, Any]:
     """Return the geometry, materials and textures of a Scene, in the order of the pieces."""
-    vertex_start = _starts([len(piece.mesh.positions) for piece in pieces])
-    material_start = _starts([len(piece.materials) for piece in pieces])
-    rows = range(len(pieces))
+    vertex_starts = accumulate((len(piece.mesh.positions) for piece in pieces), initial=0)
+    material_starts = accumulate((len(piece.materials) for piece in pieces), initial=0)
     counts = [len(piece.mesh.faces) for piece in pieces]
     return {
         "vertex_positions": np.concatenate([piece.mesh.positions for piece in pieces]),
         "vertex_normals": np.concatenate([piece.mesh.normals for piece in pieces]),
         "faces": np.concatenate(
-            [pieces[row].mesh.faces + np.uint32(vertex_start[row]) for row in rows]
+            [
+                piece.mesh.faces + np.uint32(start)
+                for piece, start in zip(pieces, vertex_starts, strict=False)
+            ]
         ),
         "material_index": np.concatenate(
-            [pieces[row].material_index + material_start[row] for row in rows]
+            [
+                piece.material_index + start
+                for piece, start in zip(pieces, material_starts, strict=False)
+            ]
         ).astype(np.uint16),
         "materials": np.concatenate([piece.materials for piece in pieces]),
         "object_index": np.repeat(np.arange(len(pieces)), counts).astype(np.uint16),
@@ -195,34 +191,25 @@ def _skins(pieces: Sequence[ScenePiece]) -> dict[str, Any]:
         return {}
     textures = dict[str, Texture]()
     rows = []
-    normals = []
     corners = []
     for piece in pieces:
-        index = np.full((len(piece.materials), len(TEXTURED)), CONSTANT, np.int32)
+        index = np.full((len(piece.materials), len(TEXTURED) + 1), CONSTANT, np.int32)
         uv = np.zeros((3 * len(piece.mesh.faces), 2), np.float32)
-        if piece.skin is not None:
-            for texture in piece.skin.textures:
-                textures.setdefault(texture.sha256, texture)
-            index[:] = [list(textures).index(each.sha256) for each in piece.skin.textures]
-            uv = piece.skin.uv
-        normal = np.full(len(index), CONSTANT, np.int32)
-        if piece.skin is not None and piece.skin.normal is not None:
-            textures.setdefault(piece.skin.normal.sha256, piece.skin.normal)
-            normal[:] = list(textures).index(piece.skin.normal.sha256)
+        if (skin := piece.skin) is not None:
+            uv = skin.uv
+            for column, texture in enumerate((*skin.textures, skin.normal)):
+                if texture is not None:
+                    textures.setdefault(texture.sha256, texture)
+                    index[:, column] = list(textures).index(texture.sha256)
         rows.append(index)
-        normals.append(normal)
         corners.append(uv)
-    of_normals = np.concatenate(normals)
+    columns, normals = np.split(np.concatenate(rows), [len(TEXTURED)], axis=1)
     return {
         "uv": np.concatenate(corners),
         "textures": tuple(textures.values()),
-        "material_textures": np.concatenate(rows),
-        "normal_textures": of_normals if (of_normals != CONSTANT).any() else None,
+        "material_textures": np.ascontiguousarray(columns),
+        "normal_textures": normals.ravel() if (normals != CONSTANT).any() else None,
     }
-
-
-def _starts(counts: Sequence[int]) -> list[int]:
-    return [sum(counts[:row]) for row in range(len(counts))]
 
 
 def with_drawn_columns(materials: NDArray[np.float32], scene_key: SceneKey) -> NDArray[np.float32]:
@@ -278,13 +265,11 @@ def with_drawn_textures(
     if settings.share == 0:
         return list(pieces)
     licences = [piece.entry.licence for piece in pieces]
-    frames = [np.eye(3)] * len(layout.shell)
-    frames += [placement.pose.rotation for placement in layout.objects]
-    origins = [np.zeros(3)] * len(layout.shell)
-    origins += [placement.pose.centre for placement in layout.objects]
+    frames = [(np.eye(3), np.zeros(3))] * len(layout.shell)
+    frames += [(each.pose.rotation, each.pose.centre) for each in layout.objects]
     result = list(pieces)
     textured = 0
-    for row, (frame, origin) in enumerate(zip(frames, origins, strict=True)):
+    for row, (frame, origin) in enumerate(frames):
         rng = scene_key.rng("texture", row)
         look = (
             draw_look(rng, settings, user_textures, licences) if textured < MOST_TEXTURED else None
