@@ -126,7 +126,7 @@ def _by_split(manifest: Manifest, distributions: Distributions) -> list[Sequence
                 _three(floors, "median") + _probably(distributions, split) if num_views else "",
                 _three(floors, "p5") if num_views else "",
                 f"{reached.mean():.0%}" if reached is not None and num_views else "",
-                f"{distributions.views_at_cap.get(split, 0) / max(num_views, 1):.0%}",
+                f"{distributions.views_at_cap[split] / max(num_views, 1):.0%}",
             )
         )
     return rows

@@ -20,16 +20,16 @@ from numpy.typing import NDArray
 from pipeline.scenes.pieces import (
     ScenePiece,
     Skin,
-    apply_skin,
     concatenate_pieces,
     emitter_piece,
     object_piece,
     shell_piece,
+    source_skins,
     with_drawn_columns,
     with_drawn_textures,
+    with_source_emission,
 )
 from pipeline.scenes.shading_normals import ShadedMesh
-from pipeline.scenes.source_materials import source_skins, with_source_emission
 from pipeline.scenes.triangle_budget import PooledAsset, draw_rows, fits_of, levels_within
 from pipeline.scenes.views import require_valid, with_first_cameras
 from scene_templates.layout import Layout, Pose
@@ -245,8 +245,7 @@ def scene_pieces(
         taken.append(entry.name)
         positions = pose_points(shape.points, placement.pose)
         surface = placement.surface
-        piece = object_piece(entry, positions, shape.faces, surface, rng, angle_deg)
-        objects.append(piece if skin is None else apply_skin(piece, positions, shape.faces, skin))
+        objects.append(object_piece(entry, positions, shape.faces, surface, rng, angle_deg, skin))
     objects, lights = with_source_emission(objects, emitters, settings.materials.own_emission)
     pieces = [*shell, *objects, *emitters, *lights]
     return pieces if settings.fill_to is None else fill_triangles(pieces, settings.fill_to)

@@ -4,6 +4,12 @@ A piece with a drawn texture gets one material that replaces its drawn ones: 8-b
 along the six directions of a cube. Each triangle uses the side that it faces most, not mirrored, at
 the stated width, with v up on the sides. The cube of floors and walls has the axes of the world, so
 that each is one flat chart; the cube of an object rotates with it.
+
+Objects may keep the materials of their source, and what emits in them becomes lamps. Files state
+radiance in arbitrary units. All emitting components of a scene are scaled by one number, so that
+together they give the stated fraction of the power of the drawn lamps; by less if the brightest of
+them would outshine the brightest lamp. Like every emitter they have the reflectance of lamps, and
+the camera does not see them.
 """
 
 import dataclasses
@@ -15,16 +21,26 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from pipeline.scenes.shading_normals import ShadedMesh, flat_shaded, has_area, smooth_shaded
+from pipeline.scenes.shading_normals import (
+    ShadedMesh,
+    face_crosses,
+    flat_shaded,
+    has_area,
+    smooth_shaded,
+)
+from pipeline.scenes.triangle_budget import PooledAsset
 from scene_templates.layout import Emitter, Layout, ShellPart, SurfaceLook
+from scene_templates.sample_material import MaterialSettings
 from scene_templates.surfaces.maps import SurfaceMaps
 from scene_templates.textures import MOST_TEXTURED, TexturedLook, TextureSettings, draw_look
 from scene_templates.user_maps import UserMap, UserTexture
 from storage.conventions import linear_from_srgb8, srgb8
 from storage.errors import Rejected, TrilightError
+from storage.records.asset import Level, LevelSkin
 from storage.records.material import DIFFUSE, EMISSION, ROUGHNESS, SPECULAR, default_rows, laid_out
+from storage.records.objects import LockedObject
 from storage.records.scene import SceneObject
-from storage.records.texture import CONSTANT, TEXTURED, Texture
+from storage.records.texture import CONSTANT, NORMAL, TEXTURED, MapSource, Texture
 from storage.seeds import SceneKey
 
 
@@ -42,6 +58,12 @@ class Skin:
     """uid of a user's texture, as objects.lock.jsonl names it; empty for others."""
     emission: NDArray[np.float32] | None = None
     """[T, 3] stated radiance of an object's triangles, until they become emitters."""
+
+    def of_triangles(self, chosen: NDArray[np.bool_]) -> "Skin":
+        """Return the skin of some triangles, a mask [T]."""
+        uv = self.uv.reshape(-1, 3, 2)[chosen].reshape(-1, 2)
+        emission = None if self.emission is None else self.emission[chosen]
+        return dataclasses.replace(self, uv=uv, emission=emission)
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -74,26 +96,21 @@ def object_piece(
     surface: SurfaceLook,
     rng: np.random.Generator,
     smooth_angle_deg: float,
+    skin: Skin | None = None,
 ) -> ScenePiece:
     """Return an object of posed vertices [V, 3] in world space, and faces [F, 3].
+
+    Args:
+        skin: textures that replace the material; it covers all faces, slivers included.
 
     Raises:
         Rejected: "no_faces" if no triangle has an area.
     """
-    faces = faces[has_area(positions, faces)]
-    if len(faces) == 0:
-        raise Rejected("no_faces", f"{entry.uid}: no triangle of the level has an area")
-    return _shaded_piece(entry, positions, faces, surface, rng, smooth_angle_deg)
-
-
-def apply_skin(
-    piece: ScenePiece, positions: NDArray[np.float32], faces: NDArray[np.uint32], skin: Skin
-) -> ScenePiece:
-    """Return the piece of `object_piece` with a skin that covers all faces, slivers included."""
     kept = has_area(positions, faces)
-    uv = skin.uv.reshape(-1, 3, 2)[kept].reshape(-1, 2)
-    emission = None if skin.emission is None else skin.emission[kept]
-    return with_skin(piece, dataclasses.replace(skin, uv=uv, emission=emission))
+    if not kept.any():
+        raise Rejected("no_faces", f"{entry.uid}: no triangle of the level has an area")
+    piece = _shaded_piece(entry, positions, faces[kept], surface, rng, smooth_angle_deg)
+    return with_skin(piece, skin.of_triangles(kept)) if skin else piece
 
 
 def with_skin(piece: ScenePiece, skin: Skin) -> ScenePiece:
@@ -328,3 +345,148 @@ def _textures(maps: SurfaceMaps) -> tuple[Texture, Texture, Texture]:
         texture(specular, "specular"),
         texture(roughness, "roughness"),
     )
+
+
+def source_skins(
+    chosen: Sequence[PooledAsset],
+    levels: Sequence[Level],
+    settings: MaterialSettings,
+    scene_key: SceneKey,
+) -> list[Skin | None]:
+    """Return the skin of each object, or None if its materials are drawn.
+
+    Each object has a random stream of its own, so that skins change no other draw of the scene, and
+    another `own_share` changes none of the skins that stay.
+
+    Args:
+        settings: source of the materials, and the fraction of objects that keep theirs.
+
+    Raises:
+        Rejected: law_broken, which names the object.
+    """
+    if settings.source != "object":
+        return [None] * len(chosen)
+    skins: list[Skin | None] = []
+    for row, (entry, level) in enumerate(zip(chosen, levels, strict=True)):
+        rng = scene_key.rng("own materials", row)
+        keeps = rng.random() < settings.own_share and level.skin is not None
+        skins.append(_skin(level.skin, entry.locked) if keeps and level.skin else None)
+    return skins
+
+
+def _skin(skin: LevelSkin, locked: LockedObject) -> Skin:
+    """Return a skin whose textures carry the rights of their object.
+
+    Raises:
+        Rejected: law_broken if the textures are invalid: an old version may have prepared them.
+    """
+    try:
+        textures = [*skin.textures, *(() if skin.normal is None else (skin.normal,))]
+    except TrilightError as error:
+        raise Rejected("law_broken", f"object {locked.uid}: {error}") from error
+    first, second, third, *normal = (
+        dataclasses.replace(
+            texture,
+            source=MapSource(
+                name=f"{locked.uid} {column}",
+                licence=locked.licence,
+                attribution=locked.attribution,
+                source_url=locked.source_url,
+            ),
+        )
+        for texture, column in zip(textures, (*TEXTURED, NORMAL), strict=False)
+    )
+    return Skin(
+        uv=skin.uv.reshape(-1, 2),
+        textures=(first, second, third),
+        normal=normal[0] if normal else None,
+        emission=skin.emission,
+    )
+
+
+def with_source_emission(
+    objects: Sequence[ScenePiece], lamps: Sequence[ScenePiece], share: float
+) -> tuple[list[ScenePiece], list[ScenePiece]]:
+    """Return objects without their emitting triangles, and these as emitters.
+
+    An object whose triangles all emit becomes an emitter in its place.
+
+    Args:
+        objects: pieces, some with skins that state the emission of their triangles.
+        share: fraction of the lamps' power for all emitting triangles; 0 without lamps.
+    """
+    scale = _scale(objects, lamps, share)
+    plain = [
+        dataclasses.replace(piece, skin=dataclasses.replace(piece.skin, emission=None))
+        if piece.skin
+        else piece
+        for piece in objects
+    ]
+    if scale == 0:
+        return plain, []
+    taken = {piece.entry.name for piece in [*objects, *lamps]}
+    reflected = lamps[0].materials[0, DIFFUSE]
+    emitters = []
+    for row, piece in enumerate(objects):
+        emission = _emission(piece)
+        emits: NDArray[np.bool_] = np.asarray(emission.any(axis=1))
+        if not emits.any():
+            continue
+        entry = _entry(piece.entry, taken)
+        taken.add(entry.name)
+        mesh = _part(plain[row], emits).mesh
+        emitter = lamp_piece(entry, mesh, scale * emission[emits], reflected)
+        if emits.all():
+            plain[row] = emitter
+        else:
+            plain[row] = _part(plain[row], ~emits)
+            emitters.append(emitter)
+    return plain, emitters
+
+
+def _scale(objects: Sequence[ScenePiece], lamps: Sequence[ScenePiece], share: float) -> float:
+    emissions = [(_emission(piece).astype(np.float64), _areas(piece)) for piece in objects]
+    power = sum(float(areas @ emission.mean(axis=1)) for emission, areas in emissions)
+    brightest = max((float(emission.max(initial=0)) for emission, _ in emissions), default=0.0)
+    if not (share and lamps and power > 0):
+        return 0.0
+    lit = [
+        (lamp.materials[lamp.material_index, EMISSION].astype(np.float64), _areas(lamp))
+        for lamp in lamps
+    ]
+    drawn = sum(float(areas @ radiance.mean(axis=1)) for radiance, areas in lit)
+    greatest = max(float(radiance.max()) for radiance, _ in lit)
+    return min(share * drawn / power, greatest / brightest)
+
+
+def _part(piece: ScenePiece, chosen: NDArray[np.bool_]) -> ScenePiece:
+    """Return some triangles of a piece, without vertices that they do not use."""
+    used, faces = np.unique(piece.mesh.faces[chosen], return_inverse=True)
+    mesh = dataclasses.replace(
+        piece.mesh,
+        positions=piece.mesh.positions[used],
+        normals=piece.mesh.normals[used],
+        faces=faces.reshape(-1, 3).astype(np.uint32),
+        groups=piece.mesh.groups[chosen],
+    )
+    skin = piece.skin.of_triangles(chosen) if piece.skin else None
+    return dataclasses.replace(
+        piece, mesh=mesh, material_index=piece.material_index[chosen], skin=skin
+    )
+
+
+def _emission(piece: ScenePiece) -> NDArray[np.float32]:
+    """Return the stated radiance of an object's triangles, [T, 3]."""
+    stated = None if piece.skin is None else piece.skin.emission
+    return np.zeros((len(piece.mesh.faces), 3), np.float32) if stated is None else stated
+
+
+def _areas(piece: ScenePiece) -> NDArray[np.float64]:
+    cross = face_crosses(piece.mesh.positions, piece.mesh.faces)
+    return np.asarray(np.linalg.norm(cross, axis=1) / 2)
+
+
+def _entry(of: SceneObject, taken: set[str]) -> SceneObject:
+    names = (f"{of.name}_light{number or ''}" for number in range(len(taken) + 1))
+    name = next(name for name in names if name not in taken)
+    return dataclasses.replace(of, name=name, kind="emitter")

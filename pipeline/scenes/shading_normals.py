@@ -129,5 +129,5 @@ def _sum_by_key(keys: NDArray[np.int64], values: NDArray[np.float64]) -> NDArray
     """Return, for every corner, the sum of `values` [T, 3, 3] over all corners of the same key."""
     _, row = np.unique(keys.ravel(), return_inverse=True)
     flat = values.reshape(-1, 3)
-    sums = np.stack([np.bincount(row, weights=column) for column in flat.T], axis=1)
-    return sums[row].reshape(values.shape)
+    sums = np.array([np.bincount(row, weights=column) for column in flat.T], np.float64)
+    return sums.T[row].reshape(values.shape)
