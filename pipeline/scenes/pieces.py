@@ -416,11 +416,9 @@ def with_source_emission(
         share: fraction of the lamps' power for all emitting triangles; 0 without lamps.
     """
     scale = _scale(objects, lamps, share)
+    skins = [each.skin and dataclasses.replace(each.skin, emission=None) for each in objects]
     plain = [
-        dataclasses.replace(piece, skin=dataclasses.replace(piece.skin, emission=None))
-        if piece.skin
-        else piece
-        for piece in objects
+        dataclasses.replace(piece, skin=skin) for piece, skin in zip(objects, skins, strict=True)
     ]
     if scale == 0:
         return plain, []
@@ -445,18 +443,18 @@ def with_source_emission(
 
 
 def _scale(objects: Sequence[ScenePiece], lamps: Sequence[ScenePiece], share: float) -> float:
-    emissions = [(_emission(piece).astype(np.float64), _areas(piece)) for piece in objects]
-    power = sum(float(areas @ emission.mean(axis=1)) for emission, areas in emissions)
-    brightest = max((float(emission.max(initial=0)) for emission, _ in emissions), default=0.0)
+    stated = [(_emission(piece), _areas(piece)) for piece in objects]
+    drawn = [(lamp.materials[lamp.material_index, EMISSION], _areas(lamp)) for lamp in lamps]
+    (power, brightest), (drawn_power, greatest) = (
+        (
+            sum(float(areas @ rgb.astype(np.float64).mean(axis=1)) for rgb, areas in emitters),
+            max((float(rgb.max(initial=0)) for rgb, _ in emitters), default=0.0),
+        )
+        for emitters in (stated, drawn)
+    )
     if not (share and lamps and power > 0):
         return 0.0
-    lit = [
-        (lamp.materials[lamp.material_index, EMISSION].astype(np.float64), _areas(lamp))
-        for lamp in lamps
-    ]
-    drawn = sum(float(areas @ radiance.mean(axis=1)) for radiance, areas in lit)
-    greatest = max(float(radiance.max()) for radiance, _ in lit)
-    return min(share * drawn / power, greatest / brightest)
+    return min(share * drawn_power / power, greatest / brightest)
 
 
 def _part(piece: ScenePiece, chosen: NDArray[np.bool_]) -> ScenePiece:

@@ -242,15 +242,13 @@ def with_cameras(scene: Scene, cameras: Sequence[ViewCamera]) -> Scene:
 
 def visibility_problem(facts: ViewFacts, settings: ViewLaws, *, has_objects: bool) -> str | None:
     """Return why a view is rejected, or None; a camera inside an object is too near."""
-    if facts.depth < settings.min_depth:
-        return "too near"
-    if has_objects and facts.coverage < settings.min_coverage:
-        return "sees too little of the objects"
-    if facts.shell_back > settings.max_shell_back:
-        return "sees the back of the shell"
-    if facts.lit < settings.min_lit:
-        return "sees too little light"
-    return None
+    problems = {
+        "too near": facts.depth < settings.min_depth,
+        "sees too little of the objects": has_objects and facts.coverage < settings.min_coverage,
+        "sees the back of the shell": facts.shell_back > settings.max_shell_back,
+        "sees too little light": facts.lit < settings.min_lit,
+    }
+    return next((problem for problem, is_met in problems.items() if is_met), None)
 
 
 def _accepted_proposals(
