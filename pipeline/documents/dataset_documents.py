@@ -10,7 +10,7 @@ from markupsafe import Markup
 
 from pipeline.documents.checksums import renew_sums
 from pipeline.documents.croissant import encode_croissant
-from pipeline.documents.distributions import MEASURED, Distributions, dataset_distributions, setting
+from pipeline.documents.distributions import MEASURED, Distributions, dataset_distributions
 from pipeline.documents.pages import render_markdown
 from pipeline.documents.report import write_report
 from pipeline.documents.rights import Rights, encode_attribution, hub_licence, rights_of
@@ -57,7 +57,7 @@ def encode_card(
     layouts = Counter[str]()
     for (template, _), count in sorted(distributions.scenes.items()):
         layouts[template] += count
-    settings = [(label, setting(manifest.settings, name)) for label, name in _SETTINGS]
+    settings = [(label, manifest.setting(name)) for label, name in _SETTINGS]
     settings += [(label, manifest.environment.get(name)) for label, name in _ENVIRONMENT]
     return render_markdown(
         "card.jinja",
@@ -66,7 +66,7 @@ def encode_card(
         folder=folder,
         manifest=manifest,
         found=distributions,
-        resolution=setting(manifest.settings, "renders.resolution"),
+        resolution=manifest.setting("renders.resolution"),
         splits=_by_split(manifest, distributions),
         states_expected=summary(distributions.all("expected_error_db"))["count"] > 0,
         layouts=layouts,

@@ -206,10 +206,9 @@ def _most_used(
 
 def _drawn_materials(dataset: Dataset) -> tuple[dict[str, str], str]:
     """Return why materials of an object are drawn, by uid, and what the others have."""
-    settings = dataset.manifest.settings
-    if "derived" in settings:  # of several datasets, perhaps
+    if "derived" in dataset.manifest.settings:  # of several datasets, perhaps
         return {}, ""
-    if settings.get("scenes", {}).get("materials", {}).get("source") != "object":
+    if dataset.manifest.setting("scenes.materials.source") != "object":
         return {}, "drawn"
     lost = json.loads(dataset.store.get("logs/drawn_materials.json") or "{}")
     return {uid: f"drawn: {', '.join(whys)}" for uid, whys in lost.items()}, "own"
@@ -339,18 +338,14 @@ def _bars(names: Sequence[str], parts: Mapping[str, Sequence[int]], label: str) 
 
 
 def _scenes(distributions: Distributions) -> ReportPart:
-    names = distributions.templates
+    names = sorted({template for template, _ in distributions.scenes})
     counts = {
         split: [distributions.scenes[name, split] for name in names]
         for split in distributions.splits
     }
-    columns = {split: [*lengths, sum(lengths)] for split, lengths in counts.items()}
-    columns["all"] = [sum(row) for row in zip(*columns.values(), strict=True)]
-    rows = [
-        [name, *(column[row] for column in columns.values())]
-        for row, name in enumerate([*names, "all"])
-    ]
-    table = Table(["template"], [*columns], rows)
+    columns = [*counts.values(), [sum(row) for row in zip(*counts.values(), strict=True)]]
+    rows = [*zip(names, *columns, strict=True), ("all", *map(sum, columns))]
+    table = Table(["template"], [*counts, "all"], rows)
     return ReportPart(_bars(names, counts, "scenes"), "scenes by template and split", [table])
 
 
@@ -445,9 +440,10 @@ def _rejections(distributions: Distributions) -> ReportPart:
         for label, (low, high) in _ATTEMPTS.items()
     }
     figure = _bars([f"{stage}: {reason}" for stage, reason in rejections], parts, "rejections")
+    totals = [counts.total() for counts in rejections.values()]
     rows = [
-        [stage, reason, counts.total(), *(lengths[row] for lengths in parts.values())]
-        for row, ((stage, reason), counts) in enumerate(rejections.items())
+        [*where, *numbers]
+        for where, *numbers in zip(rejections, totals, *parts.values(), strict=True)
     ]
     table = Table(["stage", "reason"], ["all", *parts], rows)
     return ReportPart(figure, "rejections by stage and reason", [table])

@@ -85,9 +85,7 @@ class RequestGuard:
     def _is_ours(self, host: str) -> bool:
         with contextlib.suppress(ValueError):
             name = urlsplit(f"//{host}").hostname or ""
-            if name in self._names:
-                return True
-            return bool(ipaddress.ip_address(name))
+            return name in self._names or bool(ipaddress.ip_address(name))
         return False
 
 

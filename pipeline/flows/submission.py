@@ -86,8 +86,7 @@ def parameters(options: Any) -> dict[str, Any]:
         value = getattr(options, field.name)
         if field.name == "build" or value not in (field.default, {}):
             values[field.name] = _nest_groups(value) if isinstance(value, Mapping) else value
-    plain: dict[str, Any] = json.loads(json.dumps(values))
-    return plain
+    return dict(json.loads(json.dumps(values)))
 
 
 def submit(

@@ -51,7 +51,6 @@ def found(tmp_path_factory: pytest.TempPathFactory) -> Distributions:
 def test_scenes_objects_surfaces_and_rejections_are_counted(found: Distributions) -> None:
     assert found.scenes == {("plane", "train"): 3, ("wall", "train"): 1, ("wall", "test"): 1}
     assert found.splits == ["train", "test"]
-    assert found.templates == ["plane", "wall"]
     assert found.placements == {"a": 4, "b": 1, "c": 1}
     assert found.uses_per_object() == [4, 1, 1, 0]
     assert found.licences == {"CC-BY-4.0": (1, 1, 1), "CC0-1.0": (3, 2, 5)}
