@@ -58,8 +58,9 @@ def _runner(
     """Provide a runner, and options of Prefect for its flow."""
     from pipeline.flows.prefect_runner import PrefectRunner
 
+    runner = PrefectRunner()
     if address is None:
-        yield PrefectRunner(), {}
+        yield runner, {}
         return
     try:
         from prefect_dask import DaskTaskRunner
@@ -76,8 +77,9 @@ def _runner(
                 "`dask worker ADDRESS --nthreads 1 --no-nanny`."
             )
         threads = [int(worker["nthreads"]) for worker in workers.values()]
+        runner.window = _AHEAD * sum(threads)
+        runner.num_at_once = max(threads)
         _require_shared(client, options)
-    runner = PrefectRunner(window=_AHEAD * sum(threads), num_at_once=max(threads))
     try:
         yield runner, {"task_runner": DaskTaskRunner(address=address)}
     finally:

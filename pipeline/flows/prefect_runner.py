@@ -90,16 +90,6 @@ def write_documents_task(write: Callable[[], Statistics]) -> Statistics:
 class PrefectRunner(Runner[PrefectFuture[TaskResult]]):
     """Submits tasks to the task runner of the current flow run."""
 
-    def __init__(self, *, window: int | None = None, num_at_once: int | None = None) -> None:
-        """Set how many tasks run at the same time.
-
-        Args:
-            window: most submitted and unfinished task runs; by default as many as run at once here.
-            num_at_once: parallel tasks of one process; by default the options' number.
-        """
-        self.window = window
-        self.num_at_once = num_at_once
-
     def submit(self, task: tuple[Piece, ...], job: ShardJob) -> PrefectFuture[TaskResult]:
         label = f"{task[0].shard_index} from scene {task[0].first}"
         return make_scenes.submit(label, partial(make_task, job, task), on_gpu=job.device != "cpu")
