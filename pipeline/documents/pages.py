@@ -61,9 +61,9 @@ def png_uri(pixels: NDArray[np.uint8]) -> str:
     return data_uri(encode_png(pixels))
 
 
-def data_uri(png: bytes) -> str:
-    """Return the bytes of a PNG file as a data URI."""
-    return "data:image/png;base64," + base64.b64encode(png).decode()
+def data_uri(picture: bytes, kind: str = "png") -> str:
+    """Return the bytes of a picture file as a data URI."""
+    return f"data:image/{kind};base64,{base64.b64encode(picture).decode()}"
 
 
 def _make_environment(**options: Any) -> Environment:

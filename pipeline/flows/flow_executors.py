@@ -88,19 +88,16 @@ def _runner(
             client.run(close_idle_children, on_error="ignore")
 
 
-@contextlib.contextmanager
-def _client(address: str) -> Iterator["Client"]:
+def _client(address: str) -> "Client":
     from distributed import Client
 
     try:
-        client = Client(address, timeout=20, set_as_default=False)
+        return Client(address, timeout=20, set_as_default=False)
     except (OSError, ValueError) as error:  # ValueError: a malformed address
         raise TrilightError(
             f"--address {address}: no Dask scheduler answers there ({type(error).__name__}); "
             "expected the address of one, such as tcp://host:8786, as `dask scheduler` starts it."
         ) from error
-    with client:
-        yield client
 
 
 def _require_shared(client: "Client", options: GenerateOptions) -> None:

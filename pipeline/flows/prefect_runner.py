@@ -9,7 +9,6 @@ dataset's files (`trilight status` shows the same). The artifacts decide nothing
 continues if they cannot be written.
 """
 
-import base64
 import dataclasses
 import io
 import logging
@@ -38,6 +37,7 @@ from prefect.futures import PrefectFuture, as_completed
 from prefect.logging import get_run_logger
 from prefect.tasks import Task, exponential_backoff
 
+from pipeline.documents.pages import data_uri
 from pipeline.flows.prefect_server import DISK_LIMIT, GPU_LIMIT
 from pipeline.generation.generate_options import PRICES, USD_PER_CORE_HOUR, GenerateOptions
 from pipeline.generation.generation_run import Outcome, Piece, Run, Runner, ShardJob, TaskResult
@@ -295,4 +295,4 @@ def small_picture(path: Path) -> str:
         small = picture.convert("RGB")
     small.thumbnail((_SHEET_PX, _SHEET_PX))
     small.save(stream, "JPEG", quality=85)
-    return f"data:image/jpeg;base64,{base64.b64encode(stream.getvalue()).decode()}"
+    return data_uri(stream.getvalue(), "jpeg")

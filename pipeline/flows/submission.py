@@ -7,7 +7,7 @@ only states; the progress of a run is in its artifacts (pipeline.flows.prefect_r
 import json
 import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from contextlib import contextmanager
+from contextlib import AbstractContextManager
 from dataclasses import dataclass
 from typing import Any
 from uuid import UUID
@@ -62,9 +62,8 @@ class RunStatus:
     """True if the run ended without an error."""
 
 
-@contextmanager
-def server() -> Iterator[SyncPrefectClient]:
-    """Provide a client of the configured Prefect server.
+def server() -> AbstractContextManager[SyncPrefectClient]:
+    """Return a block with a client of the configured Prefect server.
 
     Raises:
         TrilightError: none is configured, or it refuses, or does not answer.
@@ -74,8 +73,7 @@ def server() -> Iterator[SyncPrefectClient]:
             "submit: no Prefect server is set; expected one that serves Trilight's flows. Run make "
             "serve in the checkout, or set PREFECT_API_URL (and PREFECT_API_AUTH_STRING)."
         )
-    with prefect_client() as client:
-        yield client
+    return prefect_client()
 
 
 def parameters(options: Any) -> dict[str, Any]:
