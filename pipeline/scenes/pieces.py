@@ -106,11 +106,11 @@ def object_piece(
     Raises:
         Rejected: "no_faces" if no triangle has an area.
     """
-    kept = has_area(positions, faces)
-    if not kept.any():
+    solid = has_area(positions, faces)
+    if not solid.any():
         raise Rejected("no_faces", f"{entry.uid}: no triangle of the level has an area")
-    piece = _shaded_piece(entry, positions, faces[kept], surface, rng, smooth_angle_deg)
-    return with_skin(piece, skin.of_triangles(kept)) if skin else piece
+    piece = _shaded_piece(entry, positions, faces[solid], surface, rng, smooth_angle_deg)
+    return with_skin(piece, skin.of_triangles(solid)) if skin else piece
 
 
 def with_skin(piece: ScenePiece, skin: Skin) -> ScenePiece:

@@ -266,10 +266,8 @@ def _check_pictures(sample: Sample, manifest: Manifest) -> Iterator[str]:
     if not (np.isfinite(sample.radiance_rgb).all() and (sample.radiance_rgb >= 0).all()):
         yield "a picture holds a value that is not finite or negative"
     yield from _check_lights(sample, per_light=bool(manifest.setting("renders.per_light", int)))
-    bounces, lobes = (
-        bool(manifest.setting(f"renders.{name}", int)) for name in ("split", "split_lobes")
-    )
-    yield from _check_parts(sample, part_names(bounces=bounces, lobes=lobes))
+    split, lobes = (manifest.setting(f"renders.{name}", int) for name in ("split", "split_lobes"))
+    yield from _check_parts(sample, part_names(bounces=bool(split), lobes=bool(lobes)))
     yield from _check_passes(sample, manifest.passes)
 
 
