@@ -35,9 +35,9 @@ def write_sums(folder: Path, known: Mapping[str, str] = MappingProxyType({})) ->
     Args:
         known: sums by name, which are not computed again.
     """
-    sums = {name: known.get(name) or sha256_of_file(path) for name, path in _summed(folder).items()}
-    text = "".join(f"{sha256}  {name}\n" for name, sha256 in sums.items())
-    write_atomically(folder / SUMS, text.encode())
+    files = _files_by_name(folder)
+    lines = [f"{known.get(name) or sha256_of_file(files[name])}  {name}\n" for name in files]
+    write_atomically(folder / SUMS, "".join(lines).encode())
 
 
 def renew_sums(folder: Path) -> None:
@@ -60,7 +60,7 @@ def stale_sums(folder: Path) -> list[str]:
     if not (folder / SUMS).is_file():
         return []
     known = _read(folder)
-    files = _summed(folder)
+    files = _files_by_name(folder)
     return sorted(
         name
         for name in known.keys() | files.keys()
@@ -70,7 +70,7 @@ def stale_sums(folder: Path) -> list[str]:
     )
 
 
-def _summed(folder: Path) -> dict[str, Path]:
+def _files_by_name(folder: Path) -> dict[str, Path]:
     """Return the files that have a sum, by name."""
     files = {path.relative_to(folder).as_posix(): path for path in published_files(folder)}
     files.pop(SUMS, None)
