@@ -4,9 +4,10 @@ Code that rewrites documents renews their lines. Lines of shards stay: a shard t
 must not get a new sum.
 """
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from fnmatch import fnmatch
 from pathlib import Path
+from types import MappingProxyType
 
 from storage.atomic import write_atomically
 from storage.digests import sha256_of_file
@@ -28,9 +29,15 @@ def published_files(folder: Path) -> Iterator[Path]:
             yield path
 
 
-def write_sums(folder: Path) -> None:
-    """Write the sums of all published files; raises TrilightError if they cannot be written."""
-    _write(folder, known={})
+def write_sums(folder: Path, known: Mapping[str, str] = MappingProxyType({})) -> None:
+    """Write the sums of all published files; raises TrilightError if they cannot be written.
+
+    Args:
+        known: sums by name, which are not computed again.
+    """
+    files = _files_by_name(folder)
+    lines = [f"{known.get(name) or sha256_of_file(files[name])}  {name}\n" for name in files]
+    write_atomically(folder / SUMS, "".join(lines).encode())
 
 
 def renew_sums(folder: Path) -> None:
@@ -41,7 +48,7 @@ def renew_sums(folder: Path) -> None:
     """
     if (folder / SUMS).is_file():
         known = _read(folder)
-        _write(folder, {name: sha256 for name, sha256 in known.items() if name.endswith(_SHARD)})
+        write_sums(folder, {name: known[name] for name in known if name.endswith(_SHARD)})
 
 
 def stale_sums(folder: Path) -> list[str]:
@@ -53,8 +60,7 @@ def stale_sums(folder: Path) -> list[str]:
     if not (folder / SUMS).is_file():
         return []
     known = _read(folder)
-    files = {path.relative_to(folder).as_posix(): path for path in published_files(folder)}
-    del files[SUMS]
+    files = _files_by_name(folder)
     return sorted(
         name
         for name in known.keys() | files.keys()
@@ -64,13 +70,11 @@ def stale_sums(folder: Path) -> list[str]:
     )
 
 
-def _write(folder: Path, known: dict[str, str]) -> None:
-    lines = []
-    for path in published_files(folder):
-        name = path.relative_to(folder).as_posix()
-        if name != SUMS:
-            lines.append(f"{known.get(name) or sha256_of_file(path)}  {name}\n")
-    write_atomically(folder / SUMS, "".join(lines).encode())
+def _files_by_name(folder: Path) -> dict[str, Path]:
+    """Return the files that have a sum, by name."""
+    files = {path.relative_to(folder).as_posix(): path for path in published_files(folder)}
+    files.pop(SUMS, None)
+    return files
 
 
 def _read(folder: Path) -> dict[str, str]:

@@ -6,7 +6,7 @@ datasets give equal bytes.
 """
 
 import json
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from typing import Any
 
 from pipeline.documents.rights import Rights
@@ -77,6 +77,7 @@ MOST_LISTED = 10_000
 
 
 def _distribution(shards: list[ShardEntry]) -> list[dict[str, Any]]:
+    """Return the shards, and the kinds of members in all of them."""
     if len(shards) > MOST_LISTED:
         files = [
             _node(
@@ -99,15 +100,6 @@ def _distribution(shards: list[ShardEntry]) -> list[dict[str, Any]]:
             )
             for shard in shards
         ]
-    return [*files, *_file_sets([file["name"] for file in files])]
-
-
-def _node(kind: str, name: str, **fields: Any) -> dict[str, Any]:
-    return {"@type": kind, "@id": name, "name": name, **fields}
-
-
-def _file_sets(archives: Sequence[str]) -> list[dict[str, Any]]:
-    """Return the kinds of members in all shards; `archives` are the names of the shards."""
     kinds = (
         (_RECORDS, "objects, provenance and the record of each view", "application/json", "*.json"),
         (
@@ -118,18 +110,23 @@ def _file_sets(archives: Sequence[str]) -> list[dict[str, Any]]:
         ),
         ("pictures", "linear radiance of each view, half floats", "image/x-exr", "*.exr"),
     )
-    return [
+    archives = [{"@id": file["name"]} for file in files]
+    members = [
         _node(
             "cr:FileSet",
             name,
             description=description,
-            containedIn=[{"@id": archive} for archive in archives],
+            containedIn=archives,
             encodingFormat=encoding,
             includes=pattern,
         )
         for name, description, encoding, pattern in kinds
-        if archives
     ]
+    return [*files, *members] if files else []
+
+
+def _node(kind: str, name: str, **fields: Any) -> dict[str, Any]:
+    return {"@type": kind, "@id": name, "name": name, **fields}
 
 
 def _splits(shards: list[ShardEntry]) -> dict[str, Any]:

@@ -10,17 +10,10 @@ from markupsafe import Markup
 
 from pipeline.documents.checksums import renew_sums
 from pipeline.documents.croissant import encode_croissant
-from pipeline.documents.distributions import MEASURED, Distributions, dataset_distributions, setting
+from pipeline.documents.distributions import MEASURED, Distributions, dataset_distributions
 from pipeline.documents.pages import render_markdown
 from pipeline.documents.report import write_report
-from pipeline.documents.rights import (
-    Rights,
-    attribution_of,
-    encode_licences,
-    hub_licence,
-    licence_facts,
-    rights_of,
-)
+from pipeline.documents.rights import Rights, encode_attribution, hub_licence, rights_of
 from pipeline.documents.sheets import write_contact_sheet
 from storage.atomic import write_atomically
 from storage.dataset.dataset import Dataset
@@ -64,7 +57,7 @@ def encode_card(
     layouts = Counter[str]()
     for (template, _), count in sorted(distributions.scenes.items()):
         layouts[template] += count
-    settings = [(label, setting(manifest.settings, name)) for label, name in _SETTINGS]
+    settings = [(label, manifest.setting(name)) for label, name in _SETTINGS]
     settings += [(label, manifest.environment.get(name)) for label, name in _ENVIRONMENT]
     return render_markdown(
         "card.jinja",
@@ -73,7 +66,7 @@ def encode_card(
         folder=folder,
         manifest=manifest,
         found=distributions,
-        resolution=setting(manifest.settings, "renders.resolution"),
+        resolution=manifest.setting("renders.resolution"),
         splits=_by_split(manifest, distributions),
         states_expected=summary(distributions.all("expected_error_db"))["count"] > 0,
         layouts=layouts,
@@ -84,7 +77,7 @@ def encode_card(
         derivation=derivation_of(manifest.settings),
         settings=[(label, value) for label, value in settings if value is not None],
         arrays=" or ".join(_arrays(distributions.packings)),
-        **licence_facts(rights),
+        rights=rights,
     )
 
 
@@ -133,7 +126,7 @@ def _by_split(manifest: Manifest, distributions: Distributions) -> list[Sequence
                 _three(floors, "median") + _probably(distributions, split) if num_views else "",
                 _three(floors, "p5") if num_views else "",
                 f"{reached.mean():.0%}" if reached is not None and num_views else "",
-                f"{distributions.views_at_cap.get(split, 0) / max(num_views, 1):.0%}",
+                f"{distributions.views_at_cap[split] / max(num_views, 1):.0%}",
             )
         )
     return rows
@@ -182,8 +175,8 @@ def write_documents(dataset: Dataset, out: DatasetFolder | None = None) -> Stati
     statistics = dataset_statistics(dataset)
     distributions = dataset_distributions(dataset)
     rights = rights_of(distributions.locked)
-    write_atomically(out.attribution, attribution_of(distributions.locked, manifest.settings))
-    write_atomically(out.licences, encode_licences(rights))
+    write_atomically(out.attribution, encode_attribution(distributions.locked, manifest.settings))
+    write_atomically(out.licences, render_markdown("license.jinja", rights=rights))
     write_contact_sheet(dataset, statistics, out=out)
     write_report(dataset, distributions, out=out)
     write_atomically(out.croissant, encode_croissant(manifest, rights))

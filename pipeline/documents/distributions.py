@@ -95,10 +95,6 @@ class Distributions:
         }
 
     @property
-    def templates(self) -> list[str]:
-        return sorted({template for template, _ in self.scenes})
-
-    @property
     def rejections(self) -> Mapping[tuple[str, str], Counter[int]]:
         """Rejections per attempt, by (stage, reason), the most frequent first."""
         counts: dict[tuple[str, str], Counter[int]] = {}
@@ -198,9 +194,8 @@ def dataset_distributions(
         user_maps=[entry for entry in locked if entry.kind != OBJECT],
         failures=dataset.failures(),
         targets={
-            name: value if isinstance(value, int | float) else None
+            name: dataset.manifest.setting(f"{group}.{name}", int | float)
             for name, group in _TARGETS.items()
-            for value in [setting(dataset.manifest.settings, f"{group}.{name}")]
         },
     )
     chunks: dict[str, list[Mapping[str, Values]]] = {}
@@ -224,11 +219,3 @@ def dataset_distributions(
 
 def _concatenate(rows: Sequence[Mapping[str, Values]]) -> Mapping[str, Values]:
     return {name: np.concatenate([row[name] for row in rows]) for name in QUANTITIES}
-
-
-def setting(settings: Mapping[str, Any], name: str) -> Any:
-    """Return a setting of a manifest by its dotted name; None if the manifest lacks it."""
-    value: Any = settings
-    for part in name.split("."):
-        value = value.get(part) if isinstance(value, Mapping) else None
-    return value

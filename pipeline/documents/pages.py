@@ -16,6 +16,7 @@ from markupsafe import Markup  # of jinja2
 from numpy.typing import NDArray
 
 from pipeline.documents.png import encode_png
+from storage.licences import DUTIES, duties_of, licence_url
 from storage.markdown import code, text
 
 
@@ -60,9 +61,9 @@ def png_uri(pixels: NDArray[np.uint8]) -> str:
     return data_uri(encode_png(pixels))
 
 
-def data_uri(png: bytes) -> str:
-    """Return the bytes of a PNG file as a data URI."""
-    return "data:image/png;base64," + base64.b64encode(png).decode()
+def data_uri(picture: bytes, kind: str = "png") -> str:
+    """Return the bytes of a picture file as a data URI."""
+    return f"data:image/{kind};base64,{base64.b64encode(picture).decode()}"
 
 
 def _make_environment(**options: Any) -> Environment:
@@ -88,4 +89,9 @@ _MARKDOWN = _make_environment(
     keep_trailing_newline=True,
     finalize=lambda value: value if isinstance(value, Markup) else Markup(text(value)),
 )
+_MARKDOWN.globals |= {
+    "licence_url": licence_url,
+    "duties_of": duties_of,
+    "duty_texts": DUTIES,
+}
 _MARKDOWN.filters["code"] = lambda value: Markup(code(value))

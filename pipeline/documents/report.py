@@ -8,7 +8,7 @@ the filters; without it a page shows all thumbnails and no button.
 import json
 import math
 import shlex
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import NamedTuple
@@ -44,13 +44,18 @@ _AT_CAP = "at the cap"
 _WHERE = {_WITHIN: "not any(at_cap)", _AT_CAP: "any(at_cap)"}
 _OPTIONS = {"split": "--split", "layout": "--template", "views": "--where"}
 """Option that selects the scenes of a choice, by the name of its filter."""
-_ORDERS = (
-    "least stated error",
-    "fewest triangles",
-    "most triangles",
-    "most lights",
-    "least coverage",
-)
+_ORDERS: Mapping[str, Callable[[Sample], float]] = {
+    "least stated error": lambda sample: min(*_of_views(sample, "noise_floor_db"), _MOST_DB),
+    "fewest triangles": lambda sample: sample.scene.num_triangles,
+    "most triangles": lambda sample: -sample.scene.num_triangles,
+    "most lights": lambda sample: -num_lights(sample.scene),
+    "least coverage": lambda sample: min(_of_views(sample, "coverage")),
+}
+"""Value that scenes are sorted by, the least first, by the name of the order."""
+
+
+def _of_views(sample: Sample, name: str) -> list[float]:
+    return [float(getattr(record, name)) for record in sample.views]
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -112,7 +117,6 @@ def make_card(sample: Sample, split: str, link: str) -> Card:
     """Return the thumbnail of a scene."""
     scene = sample.scene
     exposed = sample.radiance_rgb[0] * preview_gain(sample.radiance_rgb)
-    floor_db = min(float(record.noise_floor_db) for record in sample.views)
     return Card(
         key=sample.key,
         link=link,
@@ -121,13 +125,7 @@ def make_card(sample: Sample, split: str, link: str) -> Card:
         split=split,
         layout=str(scene.provenance.get("template", "")),
         views=_AT_CAP if any(record.at_cap for record in sample.views) else _WITHIN,
-        orders=(
-            min(floor_db, _MOST_DB),
-            scene.num_triangles,
-            -scene.num_triangles,
-            -num_lights(scene),
-            min(float(record.coverage) for record in sample.views),
-        ),
+        orders=[order(sample) for order in _ORDERS.values()],
     )
 
 
@@ -208,10 +206,9 @@ def _most_used(
 
 def _drawn_materials(dataset: Dataset) -> tuple[dict[str, str], str]:
     """Return why materials of an object are drawn, by uid, and what the others have."""
-    settings = dataset.manifest.settings
-    if "derived" in settings:  # of several datasets, perhaps
+    if "derived" in dataset.manifest.settings:  # of several datasets, perhaps
         return {}, ""
-    if settings.get("scenes", {}).get("materials", {}).get("source") != "object":
+    if dataset.manifest.setting("scenes.materials.source") != "object":
         return {}, "drawn"
     lost = json.loads(dataset.store.get("logs/drawn_materials.json") or "{}")
     return {uid: f"drawn: {', '.join(whys)}" for uid, whys in lost.items()}, "own"
@@ -341,18 +338,14 @@ def _bars(names: Sequence[str], parts: Mapping[str, Sequence[int]], label: str) 
 
 
 def _scenes(distributions: Distributions) -> ReportPart:
-    names = distributions.templates
+    names = sorted({template for template, _ in distributions.scenes})
     counts = {
-        split: [distributions.scenes.get((name, split), 0) for name in names]
+        split: [distributions.scenes[name, split] for name in names]
         for split in distributions.splits
     }
-    columns = {split: [*lengths, sum(lengths)] for split, lengths in counts.items()}
-    columns["all"] = [sum(row) for row in zip(*columns.values(), strict=True)]
-    rows = [
-        [name, *(column[row] for column in columns.values())]
-        for row, name in enumerate([*names, "all"])
-    ]
-    table = Table(["template"], [*columns], rows)
+    columns = [*counts.values(), [sum(row) for row in zip(*counts.values(), strict=True)]]
+    rows = [*zip(names, *columns, strict=True), ("all", *map(sum, columns))]
+    table = Table(["template"], [*counts, "all"], rows)
     return ReportPart(_bars(names, counts, "scenes"), "scenes by template and split", [table])
 
 
@@ -366,7 +359,7 @@ def _objects(distributions: Distributions) -> ReportPart:
 def _materials(distributions: Distributions) -> ReportPart:
     rows = []
     for kind, name in _KINDS.items():
-        count, *those = (distributions.surfaces.get((kind, key), 0) for key in SURFACE_COUNTS)
+        count, *those = (distributions.surfaces[kind, key] for key in SURFACE_COUNTS)
         rows.append([name, count, *(_share(of_them, count) for of_them in those)])
     shares = Table(["surfaces"], ["count", "smooth", "many colors", "textured"], rows)
     note = (
@@ -394,9 +387,7 @@ def _maps(distributions: Distributions) -> ReportPart:
         count = int((values > 0).sum())
         shares.append([f"scenes {name}", count, _share(count, len(values))])
     for kind, name in _KINDS.items():
-        textured, count = (
-            distributions.surfaces.get((kind, key), 0) for key in ("textured", "all")
-        )
+        textured, count = (distributions.surfaces[kind, key] for key in ("textured", "all"))
         shares.append([f"{name} textured", textured, _share(textured, count)])
     families = [[kind, name, count] for (kind, name), count in ordered]
     tables = [
@@ -430,7 +421,7 @@ def _floors_by_split(distributions: Distributions) -> Table:
                 *(_statistic(numbers, name, 1) for name in ("median", "p5")),
                 _statistic(expected, "median", 1) if expected["count"] else "",
                 "" if reached is None else _share(int(reached.sum()), len(floors)),
-                _share(distributions.views_at_cap.get(split, 0), len(floors)),
+                _share(distributions.views_at_cap[split], len(floors)),
             ]
         )
     head = ["views", "median dB", "p5 dB", "expected, median dB", "reach the target", "at the cap"]
@@ -449,9 +440,10 @@ def _rejections(distributions: Distributions) -> ReportPart:
         for label, (low, high) in _ATTEMPTS.items()
     }
     figure = _bars([f"{stage}: {reason}" for stage, reason in rejections], parts, "rejections")
+    totals = [counts.total() for counts in rejections.values()]
     rows = [
-        [stage, reason, counts.total(), *(lengths[row] for lengths in parts.values())]
-        for row, ((stage, reason), counts) in enumerate(rejections.items())
+        [*where, *numbers]
+        for where, *numbers in zip(rejections, totals, *parts.values(), strict=True)
     ]
     table = Table(["stage", "reason"], ["all", *parts], rows)
     return ReportPart(figure, "rejections by stage and reason", [table])

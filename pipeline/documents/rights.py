@@ -9,11 +9,11 @@ import re
 from collections import Counter
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
+from types import MappingProxyType
 from typing import Any
 
-from pipeline.documents.pages import render_markdown
 from storage.dataset.derived import derivation_of
-from storage.licences import DUTIES, duties_of, licence_url, union_of_duties
+from storage.licences import duties_of, union_of_duties
 from storage.markdown import inert
 from storage.records.asset import AssetRow
 from storage.records.objects import OBJECT, SKY, TEXTURE, LockedObject
@@ -92,25 +92,16 @@ def hub_licence(rights: Rights, *, link: str) -> dict[str, str]:
     return {"license": "other", "license_name": slug or "unnamed", "license_link": link}
 
 
-def licence_facts(rights: Rights) -> dict[str, object]:
-    """Return what `licences.jinja` shows."""
-    return {
-        "rights": rights,
-        "licence_url": licence_url,
-        "duties_of": duties_of,
-        "duty_texts": DUTIES,
-    }
-
-
-def encode_licences(rights: Rights) -> bytes:
-    """Return the file LICENSE.md."""
-    return render_markdown("license.jinja", **licence_facts(rights))
-
-
 def encode_attribution(
-    objects: Iterable[LockedObject | AssetRow], *, changes: str = _REMESHED
+    objects: Iterable[LockedObject | AssetRow],
+    settings: Mapping[str, Any] = MappingProxyType({}),
 ) -> bytes:
-    """Return the file: one row per object, sorted by uid, with the changes made to it."""
+    """Return the file: one row per object, sorted by uid, with the changes made to it.
+
+    Args:
+        settings: settings of the dataset, which decide the changes.
+    """
+    changes = " or ".join(sorted(_changes(settings)))
     stream = io.StringIO(newline="")
     writer = csv.writer(stream, lineterminator="\n")
     writer.writerow(_COLUMNS)
@@ -120,11 +111,6 @@ def encode_attribution(
         writer.writerow([inert(cell) for cell in (entry.uid, entry.title, *rights, done)])
     # a lone surrogate, which JSON from outside may hold, has no UTF-8
     return stream.getvalue().encode(errors="replace")
-
-
-def attribution_of(objects: Iterable[LockedObject], settings: Mapping[str, Any]) -> bytes:
-    """Return the file of a dataset; its settings decide the changes made to objects."""
-    return encode_attribution(objects, changes=" or ".join(sorted(_changes(settings))))
 
 
 def _changes(settings: Mapping[str, Any]) -> set[str]:

@@ -9,6 +9,7 @@ measurement. Black marks pixels that meet no surface; every other gray and every
 import json
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
+from itertools import compress
 from typing import NamedTuple
 
 import numpy as np
@@ -265,8 +266,7 @@ def shown_maps(scene: Scene) -> list[ShownMap]:
         assert scene.material_textures is not None
         used = (scene.material_textures == row).any(axis=0).tolist()
         used.append(scene.normal_textures is not None and row in scene.normal_textures)
-        names = (*TEXTURED, NORMAL)
-        role = " and ".join(name for name, uses in zip(names, used, strict=True) if uses)
+        role = " and ".join(compress((*TEXTURED, NORMAL), used))
         name = texture.source.name
         caption = name if name.endswith(role) else f"{name} ({role})"
         picture = png_uri(_texture_pixels(texture)) if row < _MOST_MAPS else None

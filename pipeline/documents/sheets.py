@@ -1,5 +1,6 @@
 """Sheets: one picture with many pictures of a dataset, tone-mapped by `preview_srgb8`."""
 
+import functools
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 
@@ -47,18 +48,15 @@ def choose_scenes(
     shards = [dataset.shards_of(split) for split in splits]
     ends = [np.cumsum([shard.num_samples for shard in each], dtype=int) for each in shards]
     counts = [int(each[-1]) if len(each) else 0 for each in ends]
+    keys_of = functools.cache(dataset.keys)
     chosen = []
     for each, end, count, num_chosen in zip(
         shards, ends, counts, _scenes_per_split(counts, max_scenes), strict=True
     ):
         rows = np.linspace(0, count - 1, num_chosen).round().astype(int)
-        holding = np.searchsorted(end, rows, side="right")
-        for number in dict.fromkeys(holding.tolist()):
+        for row, number in zip(rows, np.searchsorted(end, rows, side="right"), strict=True):
             shard = each[number]
-            keys = dataset.keys(shard)
-            first = int(end[number]) - shard.num_samples
-            inside = rows[holding == number] - first
-            chosen += [ChosenScene(key=keys[row], shard=shard) for row in inside]
+            chosen.append(ChosenScene(key=keys_of(shard)[row - end[number]], shard=shard))
     return chosen
 
 

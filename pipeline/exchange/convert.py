@@ -34,8 +34,8 @@ from pipeline.scenes.shading_normals import (
     ShadedMesh,
     face_normals,
     flat_shaded,
+    has_area,
     smooth_shaded,
-    without_slivers,
 )
 from storage.atomic import write_error
 from storage.errors import Rejected, TrilightError
@@ -222,7 +222,7 @@ def _reduce_piece(piece: ScenePiece, count: int) -> ScenePiece:
     if len(old.faces) <= count:
         return piece
     positions, faces = _decimate_mesh(piece, count)
-    faces = without_slivers(positions, faces)
+    faces = faces[has_area(positions, faces)]
     flat = face_normals(old.positions, old.faces)[:, None]
     smooth = bool((np.abs(old.normals[old.faces] - flat) > _FLAT).any())
     mesh = (

@@ -25,7 +25,7 @@ from numpy.typing import NDArray
 
 from pipeline.exchange.textured_triangles import MAX_ROWS, require_at_most
 from pipeline.scenes.pieces import ScenePiece, concatenate_pieces
-from pipeline.scenes.shading_normals import flat_shaded, smooth_shaded, without_slivers
+from pipeline.scenes.shading_normals import flat_shaded, has_area, smooth_shaded
 from scene_templates.rotations import rotate_points, rotation_xyz
 from storage.conventions import look_at_c2w
 from storage.errors import TrilightError, prefix_errors
@@ -220,7 +220,7 @@ def _pieces(
     positions = world.astype(np.float32)
     mirrored = np.prod(transform.scale) < 0
     faces = (mesh.faces[:, ::-1] if mirrored else mesh.faces).astype(np.uint32)
-    faces = without_slivers(positions, faces)
+    faces = faces[has_area(positions, faces)]
     if len(faces) == 0:
         raise TrilightError(
             f"no triangle of {mesh.uid} has an area after its transform; expected at least one."

@@ -35,7 +35,7 @@ from pipeline.exchange.textured_triangles import (
     unique_name,
 )
 from pipeline.foreign.numbers import Malformed
-from pipeline.scenes.shading_normals import face_normals, smooth_shaded, without_slivers
+from pipeline.scenes.shading_normals import face_normals, has_area, smooth_shaded
 from storage.conventions import HALF_FLOAT_MAX
 from storage.errors import TrilightError
 from storage.records.material import DIFFUSE, EMISSION, ROUGHNESS, SPECULAR
@@ -227,7 +227,7 @@ def describe_scene(scene: Scene, stem: str) -> DescribedFiles:
     objects: dict[str, Any] = {}
     taken: dict[str, int] = {}
     for row, material, faces in group_triangles(scene):
-        if len(without_slivers(scene.vertex_positions, scene.faces[faces])) == 0:
+        if not has_area(scene.vertex_positions, scene.faces[faces]).any():
             continue  # readers refuse a mesh without an area
         # it becomes the name of a file, whose case some systems ignore
         name = unique_name(_name(scene, row, material), taken, str.casefold)
@@ -330,7 +330,7 @@ def _is_reproduced(scene: Scene, faces: NDArray[np.intp], normals: NDArray[np.fl
     rows, corners = np.unique(scene.faces[faces], return_inverse=True)
     positions = scene.vertex_positions[rows]
     triangles = corners.reshape(-1, 3).astype(np.uint32)
-    if len(without_slivers(positions, triangles)) < len(triangles):
+    if not has_area(positions, triangles).all():
         return False
     made = smooth_shaded(positions, triangles, SMOOTH_ANGLE_DEG)
     return bool((np.abs(made.normals[made.faces] - normals) <= _CLOSE).all())
@@ -345,7 +345,7 @@ def _losses(scene: Scene) -> list[str]:
         losses.append(
             f"the grouping of {num_parts} objects that were {num_objects}, of several materials"
         )
-    solid = len(without_slivers(scene.vertex_positions, scene.faces))
+    solid = int(has_area(scene.vertex_positions, scene.faces).sum())
     if solid < scene.num_triangles:
         losses.append(
             f"{scene.num_triangles - solid} triangles without an area, which readers drop"

@@ -37,12 +37,7 @@ def _load_on_use(module: str, name: str = "make") -> Make:
 
     The import loads every stage, and for some executors packages that may not be installed.
     """
-
-    def make(options: GenerateOptions, address: str | None) -> "Outcome":
-        outcome: Outcome = getattr(import_module(module_name(module)), name)(options, address)
-        return outcome
-
-    return make
+    return lambda *args: getattr(import_module(module_name(module)), name)(*args)
 
 
 EXECUTORS: Registry[Executor] = Registry(

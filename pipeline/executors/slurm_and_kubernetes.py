@@ -317,15 +317,12 @@ def _require_bucket_alone(options: GenerateOptions) -> None:
             f"submit kubernetes: --out is {options.place}; expected a bucket such as "
             "s3://bucket/folder: the machines share nothing else."
         )
-    for option, value in (
-        ("--objects", options.objects),
-        ("--textures", options.textures),
-        ("--skies", options.skies),
-    ):
+    for option in ("objects", "textures", "skies"):
+        value = getattr(options, option)
         if value is not None and (":" not in value or value.startswith("file:")):
             raise TrilightError(
-                f"submit kubernetes: {option} is {value}, a folder of this machine; expected a URL "
-                "or a named source, which every machine can read. Bring it to a bucket."
+                f"submit kubernetes: --{option} is {value}, a folder of this machine; expected a "
+                "URL or a named source, which every machine can read. Bring it to a bucket."
             )
     if is_reference(options.build):
         raise TrilightError(

@@ -58,8 +58,9 @@ def _runner(
     """Provide a runner, and options of Prefect for its flow."""
     from pipeline.flows.prefect_runner import PrefectRunner
 
+    runner = PrefectRunner()
     if address is None:
-        yield PrefectRunner(), {}
+        yield runner, {}
         return
     try:
         from prefect_dask import DaskTaskRunner
@@ -76,8 +77,9 @@ def _runner(
                 "`dask worker ADDRESS --nthreads 1 --no-nanny`."
             )
         threads = [int(worker["nthreads"]) for worker in workers.values()]
+        runner.window = _AHEAD * sum(threads)
+        runner.num_at_once = max(threads)
         _require_shared(client, options)
-    runner = PrefectRunner(window=_AHEAD * sum(threads), num_at_once=max(threads))
     try:
         yield runner, {"task_runner": DaskTaskRunner(address=address)}
     finally:
@@ -86,19 +88,16 @@ def _runner(
             client.run(close_idle_children, on_error="ignore")
 
 
-@contextlib.contextmanager
-def _client(address: str) -> Iterator["Client"]:
+def _client(address: str) -> "Client":
     from distributed import Client
 
     try:
-        client = Client(address, timeout=20, set_as_default=False)
+        return Client(address, timeout=20, set_as_default=False)
     except (OSError, ValueError) as error:  # ValueError: a malformed address
         raise TrilightError(
             f"--address {address}: no Dask scheduler answers there ({type(error).__name__}); "
             "expected the address of one, such as tcp://host:8786, as `dask scheduler` starts it."
         ) from error
-    with client:
-        yield client
 
 
 def _require_shared(client: "Client", options: GenerateOptions) -> None:

@@ -20,9 +20,9 @@ import contextlib
 import ipaddress
 import os
 import sys
-from collections.abc import Awaitable, Callable, Collection, MutableMapping
+from collections.abc import Collection
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 from urllib.parse import urlsplit
 
 from pipeline.flows.prefect_server import PASSWORD, quiet_prefect
@@ -30,26 +30,20 @@ from pipeline.isolation import die_with_parent
 from storage.cache import private_folder
 from storage.errors import TrilightError
 
+if TYPE_CHECKING:
+    from starlette.types import ASGIApp, Message, Receive, Scope, Send
+
 NAMES = "TRILIGHT_HOST_NAMES"
 """Variable with further host names of the server beside localhost, separated by commas."""
 REQUEST_S = 15.0
 """Seconds in which the head of a request must arrive."""
 _UNFRAMED = (b"content-security-policy", b"frame-ancestors 'none'")
 
-Scope = MutableMapping[str, Any]
-Message = MutableMapping[str, Any]
-Receive = Callable[[], Awaitable[Message]]
-Send = Callable[[Message], Awaitable[None]]
-
-
-Application = Callable[[Scope, Receive, Send], Awaitable[None]]
-"""An ASGI application, which serves one connection."""
-
 
 class RequestGuard:
     """An ASGI application that passes on allowed requests, and refuses all others."""
 
-    def __init__(self, inner: Application, names: Collection[str]) -> None:
+    def __init__(self, inner: "ASGIApp", names: Collection[str]) -> None:
         """Guard an application.
 
         Args:
@@ -58,19 +52,23 @@ class RequestGuard:
         self._inner = inner
         self._names = {"localhost", *(name.lower() for name in names)}
 
-    async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
+    async def __call__(self, scope: "Scope", receive: "Receive", send: "Send") -> None:
         """Serve one connection, or refuse it."""
-        if scope["type"] == "lifespan":
-            return await self._inner(scope, receive, send)
-        if refusal := self._refusal(scope["headers"]):
-            return await _refuse(scope["type"], refusal, send)
+        from starlette.responses import PlainTextResponse
+        from starlette.websockets import WebSocketClose
 
-        async def send_unframed(message: Message) -> None:
+        async def send_unframed(message: "Message") -> None:
             if message["type"] == "http.response.start":
                 message["headers"] = [*message.get("headers", ()), _UNFRAMED]
             await send(message)
 
-        return await self._inner(scope, receive, send_unframed)
+        application = self._inner
+        if scope["type"] != "lifespan" and (refusal := self._refusal(scope["headers"])):
+            is_websocket = scope["type"] == "websocket"
+            application = (
+                WebSocketClose(1008, refusal) if is_websocket else PlainTextResponse(refusal, 403)
+            )
+        await application(scope, receive, send_unframed)
 
     def _refusal(self, headers: Collection[tuple[bytes, bytes]]) -> str | None:
         """Return why a request is refused, or None."""
@@ -87,19 +85,8 @@ class RequestGuard:
     def _is_ours(self, host: str) -> bool:
         with contextlib.suppress(ValueError):
             name = urlsplit(f"//{host}").hostname or ""
-            if name in self._names:
-                return True
-            return bool(ipaddress.ip_address(name))
+            return name in self._names or bool(ipaddress.ip_address(name))
         return False
-
-
-async def _refuse(kind: str, refusal: str, send: Send) -> None:
-    if kind == "websocket":
-        await send({"type": "websocket.close", "code": 1008, "reason": refusal})
-        return
-    headers = [(b"content-type", b"text/plain; charset=utf-8"), _UNFRAMED]
-    await send({"type": "http.response.start", "status": 403, "headers": headers})
-    await send({"type": "http.response.body", "body": refusal.encode()})
 
 
 def request_timeout_protocol() -> type[asyncio.Protocol]:

@@ -9,14 +9,13 @@ dataset's files (`trilight status` shows the same). The artifacts decide nothing
 continues if they cannot be written.
 """
 
-import base64
 import dataclasses
 import io
 import logging
 import os
 import time
-from collections.abc import Callable, Sequence
-from contextlib import nullcontext
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager, nullcontext
 from functools import partial
 from pathlib import Path
 from typing import Any, cast
@@ -38,6 +37,7 @@ from prefect.futures import PrefectFuture, as_completed
 from prefect.logging import get_run_logger
 from prefect.tasks import Task, exponential_backoff
 
+from pipeline.documents.pages import data_uri
 from pipeline.flows.prefect_server import DISK_LIMIT, GPU_LIMIT
 from pipeline.generation.generate_options import PRICES, USD_PER_CORE_HOUR, GenerateOptions
 from pipeline.generation.generation_run import Outcome, Piece, Run, Runner, ShardJob, TaskResult
@@ -54,10 +54,8 @@ def is_retryable(task_: Task[..., Any], run: TaskRun, state: State[Any]) -> bool
     """Return True if a failed task may succeed when it is tried again."""
     try:
         state.result()
-    except (EnvironmentFailure, OSError, MemoryError):
-        return True
-    except Exception:
-        return False
+    except Exception as error:
+        return isinstance(error, EnvironmentFailure | OSError | MemoryError)
     return False
 
 
@@ -71,61 +69,37 @@ _RETRIED: dict[str, Any] = {
 }
 
 
-class Opaque:
-    """A function without arguments, wrapped so that Prefect does not search it for futures.
-
-    Not a dataclass: Prefect would search its fields.
-    """
-
-    def __init__(self, call: Callable[[], Any], *, on_gpu: bool = False) -> None:
-        self.call = call
-        self.on_gpu = on_gpu
-
-
 @task(name="make-scenes", task_run_name="shard {first}", **_RETRIED)
-def make_scenes(first: str, work: Opaque) -> TaskResult:
+def make_scenes(first: str, make: Callable[[], TaskResult], *, on_gpu: bool) -> TaskResult:
     """Make some pieces; `first` names their first scene on Prefect's page.
 
     If pictures are rendered on a GPU, GPU_LIMIT limits the tasks that run at the same time.
+    `make` is a `partial`, in which Prefect searches for no futures.
     """
-    slot = concurrency(GPU_LIMIT, occupy=1, strict=False) if work.on_gpu else nullcontext()
-    with slot:
-        result: TaskResult = work.call()
-        return result
+    with concurrency(GPU_LIMIT, occupy=1, strict=False) if on_gpu else nullcontext():
+        return make()
 
 
 @task(name="write-documents", **_RETRIED)
-def write_documents_task(write: Opaque) -> Statistics:
+def write_documents_task(write: Callable[[], Statistics]) -> Statistics:
     """Write the documents of a dataset; DISK_LIMIT limits how many run at the same time."""
     with concurrency(DISK_LIMIT, occupy=1, strict=False):
-        statistics: Statistics = write.call()
-        return statistics
+        return write()
 
 
 class PrefectRunner(Runner[PrefectFuture[TaskResult]]):
     """Submits tasks to the task runner of the current flow run."""
 
-    def __init__(self, *, window: int | None = None, num_at_once: int | None = None) -> None:
-        """Set how many tasks run at the same time.
-
-        Args:
-            window: most submitted and unfinished task runs; by default as many as run at once here.
-            num_at_once: parallel tasks of one process; by default the options' number.
-        """
-        self.window = window
-        self.num_at_once = num_at_once
-
     def submit(self, task: tuple[Piece, ...], job: ShardJob) -> PrefectFuture[TaskResult]:
         label = f"{task[0].shard_index} from scene {task[0].first}"
-        work = Opaque(partial(make_task, job, task), on_gpu=job.device != "cpu")
-        return make_scenes.submit(label, work)
+        return make_scenes.submit(label, partial(make_task, job, task), on_gpu=job.device != "cpu")
 
     def wait_any(self, running: list[PrefectFuture[TaskResult]]) -> PrefectFuture[TaskResult]:
         return next(iter(as_completed(running)))
 
     def finish(self, write_documents: Callable[[], Statistics]) -> Statistics:
         """Call `write_documents` as a task run of its own."""
-        return write_documents_task(Opaque(write_documents))
+        return write_documents_task(write_documents)
 
 
 _EVERY_S = 15.0
@@ -167,9 +141,11 @@ class RunPage:
         self._shown_s = -_EVERY_S
         self._log = get_run_logger()
         self._warned = False
-        # Prefect's functions return coroutines only where an event loop runs
-        begin = partial(create_progress_artifact, 0.0, key="shards", description=place)
-        self._progress = cast(UUID | None, self._show(begin))
+        self._progress: UUID | None = None
+        with self._showing():
+            # Prefect's functions return coroutines only where an event loop runs
+            artifact = create_progress_artifact(0.0, key="shards", description=place)
+            self._progress = cast(UUID, artifact)
 
     def record_task(self, run: Run, outcome: TaskResult) -> None:
         """Log the shards of a finished task, and show the progress if it was shown long ago."""
@@ -183,7 +159,8 @@ class RunPage:
             self._log.info("shard %s: %d scenes", shard.name, shard.num_samples)
         if now_s - self._shown_s >= _EVERY_S:
             self._shown_s = now_s
-            self._show(lambda: self.show_status(self._read_status()))
+            with self._showing():
+                self.show_status(self._read_status())
 
     def _read_status(self) -> DatasetStatus:
         """Return the status of the dataset; of a run of a range, that of its shards and tasks."""
@@ -223,7 +200,8 @@ class RunPage:
         ]
         if rows != self._rows:
             self._rows = rows
-            self._show(lambda: self._tell(status, "progress", rows))
+            with self._showing():
+                self._tell(status, "progress", rows)
 
     def show_result(self, statistics: Statistics | None = None) -> None:
         """Show the final counts, and the pictures of a finished dataset that are on this machine.
@@ -231,25 +209,39 @@ class RunPage:
         Args:
             statistics: of the dataset, if this run has finished it.
         """
-        self._show(lambda: self._sum_up(statistics))
+        with self._showing():
+            status = self._read_status()
+            rows = [("dataset digest", status.digest), *(statistics.lines() if statistics else ())]
+            if status.finished:  # Prefect's page cannot show files of the worker, only their path
+                rows.append(("report", f"{self._place}/report.html"))
+            self._tell(status, "summary", rows)
+            done = f"{status.shards_done} of {status.shards_planned}"
+            self._log.info("%s shards are there; digest %s", done, status.digest)
+            if status.finished and (url := report_url(self._place)):
+                create_link_artifact(url, key="report", link_text="report")
+            sheet = dataset_folder(self._place).contact_sheet
+            if sheet.exists():
+                picture = small_picture(sheet)
+                create_image_artifact(picture, key="contact-sheet", description=self._place)
 
     def show_failure(self, error: Exception) -> None:
         """Show why the run ended early; finished scenes stay on disk."""
         what = safe_text(f"{type(error).__name__}: {error}".partition("\n")[0])
         made = ("scenes of this run", str(self._scenes))
         cost = ("cost of this run", self._cost(self._core_s / 3600))
-        self._show(lambda: self._tell_table("summary", [("failed", what), made, cost]))
+        with self._showing():
+            self._tell_table("summary", [("failed", what), made, cost])
 
-    def _show(self, show: Callable[[], object]) -> object:
-        """Show something and return what that returns; log the first error, and never raise."""
+    @contextmanager
+    def _showing(self) -> Iterator[None]:
+        """Log the first error within all such blocks, and never raise one."""
         try:
-            return show()
+            yield
         except Exception as error:  # a server that is down for a moment must not cost hours of work
             if not self._warned:
                 self._warned = True
                 why = safe_text(str(error).partition("\n")[0])
                 self._log.warning("what this page shows is not complete (%s)", why)
-        return None
 
     def _tell(self, status: DatasetStatus, key: str, more: Sequence[tuple[str, str]] = ()) -> None:
         over = status.scenes_done + status.scenes_given_up
@@ -270,21 +262,6 @@ class RunPage:
     def _tell_table(self, key: str, rows: Sequence[tuple[str, str]]) -> None:
         table = [{"what": name, "value": value} for name, value in rows]
         create_table_artifact(table, key, description=self._place)
-
-    def _sum_up(self, statistics: Statistics | None) -> None:
-        status = self._read_status()
-        rows = [("dataset digest", status.digest), *(statistics.lines() if statistics else ())]
-        # Prefect's page cannot show files of the worker, only their path
-        report = [("report", f"{self._place}/report.html")] if status.finished else []
-        self._tell(status, "summary", [*rows, *report])
-        done = f"{status.shards_done} of {status.shards_planned}"
-        self._log.info("%s shards are there; digest %s", done, status.digest)
-        if status.finished and (url := report_url(self._place)):
-            create_link_artifact(url, key="report", link_text="report")
-        sheet = dataset_folder(self._place).contact_sheet
-        if sheet.exists():
-            picture = small_picture(sheet)
-            create_image_artifact(picture, key="contact-sheet", description=self._place)
 
 
 def usd_per_core_hour() -> float:
@@ -318,4 +295,4 @@ def small_picture(path: Path) -> str:
         small = picture.convert("RGB")
     small.thumbnail((_SHEET_PX, _SHEET_PX))
     small.save(stream, "JPEG", quality=85)
-    return f"data:image/jpeg;base64,{base64.b64encode(stream.getvalue()).decode()}"
+    return data_uri(stream.getvalue(), "jpeg")

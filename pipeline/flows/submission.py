@@ -7,7 +7,7 @@ only states; the progress of a run is in its artifacts (pipeline.flows.prefect_r
 import json
 import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from contextlib import contextmanager
+from contextlib import AbstractContextManager
 from dataclasses import dataclass
 from typing import Any
 from uuid import UUID
@@ -62,9 +62,8 @@ class RunStatus:
     """True if the run ended without an error."""
 
 
-@contextmanager
-def server() -> Iterator[SyncPrefectClient]:
-    """Provide a client of the configured Prefect server.
+def server() -> AbstractContextManager[SyncPrefectClient]:
+    """Return a block with a client of the configured Prefect server.
 
     Raises:
         TrilightError: none is configured, or it refuses, or does not answer.
@@ -74,8 +73,7 @@ def server() -> Iterator[SyncPrefectClient]:
             "submit: no Prefect server is set; expected one that serves Trilight's flows. Run make "
             "serve in the checkout, or set PREFECT_API_URL (and PREFECT_API_AUTH_STRING)."
         )
-    with prefect_client() as client:
-        yield client
+    return prefect_client()
 
 
 def parameters(options: Any) -> dict[str, Any]:
@@ -86,8 +84,7 @@ def parameters(options: Any) -> dict[str, Any]:
         value = getattr(options, field.name)
         if field.name == "build" or value not in (field.default, {}):
             values[field.name] = _nest_groups(value) if isinstance(value, Mapping) else value
-    plain: dict[str, Any] = json.loads(json.dumps(values))
-    return plain
+    return dict(json.loads(json.dumps(values)))
 
 
 def submit(
@@ -146,10 +143,11 @@ def poll_run(
                 percent = float(str(data))
             elif artifact.type == "table" and artifact.key:
                 rows = json.loads(data) if isinstance(data, str) else data or []
-                named = [
-                    row for row in rows if {"what", "value"} <= set(row)
-                ]  # others are not ours
-                tables[artifact.key] = [(str(row["what"]), str(row["value"])) for row in named]
+                tables[artifact.key] = [
+                    (str(row["what"]), str(row["value"]))
+                    for row in rows
+                    if {"what", "value"} <= set(row)  # others are not ours
+                ]
         yield RunStatus(
             state=state.name or state.type.value,
             message=safe_text(state.message or ""),

@@ -10,6 +10,7 @@ bowl.
 
 import dataclasses
 import heapq
+import itertools
 from collections.abc import Iterator, Sequence
 from typing import Any, Literal
 
@@ -20,16 +21,16 @@ from numpy.typing import NDArray
 from pipeline.scenes.pieces import (
     ScenePiece,
     Skin,
-    apply_skin,
     concatenate_pieces,
     emitter_piece,
     object_piece,
     shell_piece,
+    source_skins,
     with_drawn_columns,
     with_drawn_textures,
+    with_source_emission,
 )
 from pipeline.scenes.shading_normals import ShadedMesh
-from pipeline.scenes.source_materials import source_skins, with_source_emission
 from pipeline.scenes.triangle_budget import PooledAsset, draw_rows, fits_of, levels_within
 from pipeline.scenes.views import require_valid, with_first_cameras
 from scene_templates.layout import Layout, Pose
@@ -245,8 +246,7 @@ def scene_pieces(
         taken.append(entry.name)
         positions = pose_points(shape.points, placement.pose)
         surface = placement.surface
-        piece = object_piece(entry, positions, shape.faces, surface, rng, angle_deg)
-        objects.append(piece if skin is None else apply_skin(piece, positions, shape.faces, skin))
+        objects.append(object_piece(entry, positions, shape.faces, surface, rng, angle_deg, skin))
     objects, lights = with_source_emission(objects, emitters, settings.materials.own_emission)
     pieces = [*shell, *objects, *emitters, *lights]
     return pieces if settings.fill_to is None else fill_triangles(pieces, settings.fill_to)
@@ -295,8 +295,7 @@ def subdivide(piece: ScenePiece, num_faces: int) -> ScenePiece:
     already is returned as it is.
     """
     work = _Work(piece.mesh)
-    while work.halve_longest(num_faces):
-        pass
+    work.halve_longest(num_faces)
     mesh = work.mesh()
     origin = np.array(work.origin)
     skin = piece.skin
@@ -331,7 +330,7 @@ class _Work:
         self._normals = list(mesh.normals.astype(np.float64))
         _, ids = np.unique(mesh.positions, axis=0, return_inverse=True)
         self._position_ids: list[int] = ids.ravel().tolist()
-        self._num_positions = 1 + max(self._position_ids)
+        self._new_positions = itertools.count(1 + max(self._position_ids))
         self._groups = mesh.groups
         self._faces: list[list[int]] = mesh.faces.tolist()
         self.origin = list(range(len(self._faces)))
@@ -350,20 +349,20 @@ class _Work:
             groups=self._groups[np.array(self.origin)],
         )
 
-    def halve_longest(self, num_faces: int) -> bool:
-        """Halve the longest edge, if its faces leave the mesh within `num_faces`."""
-        while not self._rows[self._longest[0][1]]:
-            del self._rows[heapq.heappop(self._longest)[1]]
-        edge = self._longest[0][1]
-        if len(self._faces) + len(self._rows[edge]) > num_faces:
-            return False
-        heapq.heappop(self._longest)
-        middle = self._num_positions
-        self._num_positions = self._num_positions + 1
-        made: dict[Edge, int] = {}
-        for row in sorted(self._rows.pop(edge)):
-            self._halve(row, edge, middle, made)
-        return True
+    def halve_longest(self, num_faces: int) -> None:
+        """Halve the longest edge, as long as its faces leave the mesh within `num_faces`.
+
+        An edge that no face has any more is only taken off.
+        """
+        while True:
+            edge = self._longest[0][1]
+            if len(self._faces) + len(self._rows[edge]) > num_faces:
+                return
+            heapq.heappop(self._longest)
+            middle = next(self._new_positions)
+            made: dict[Edge, int] = {}
+            for row in sorted(self._rows.pop(edge)):
+                self._halve(row, edge, middle, made)
 
     def _halve(self, row: int, edge: Edge, position_id: int, made: dict[Edge, int]) -> None:
         face = self._faces[row]

@@ -4,11 +4,18 @@ A piece with a drawn texture gets one material that replaces its drawn ones: 8-b
 along the six directions of a cube. Each triangle uses the side that it faces most, not mirrored, at
 the stated width, with v up on the sides. The cube of floors and walls has the axes of the world, so
 that each is one flat chart; the cube of an object rotates with it.
+
+Objects may keep the materials of their source, and what emits in them becomes lamps. Files state
+radiance in arbitrary units. All emitting components of a scene are scaled by one number, so that
+together they give the stated fraction of the power of the drawn lamps; by less if the brightest of
+them would outshine the brightest lamp. Like every emitter they have the reflectance of lamps, and
+the camera does not see them.
 """
 
 import dataclasses
 from collections.abc import Sequence
 from dataclasses import dataclass
+from itertools import accumulate
 from typing import Any
 
 import numpy as np
@@ -16,20 +23,24 @@ from numpy.typing import NDArray
 
 from pipeline.scenes.shading_normals import (
     ShadedMesh,
+    face_crosses,
     flat_shaded,
-    not_slivers,
+    has_area,
     smooth_shaded,
-    without_slivers,
 )
+from pipeline.scenes.triangle_budget import PooledAsset
 from scene_templates.layout import Emitter, Layout, ShellPart, SurfaceLook
+from scene_templates.sample_material import MaterialSettings
 from scene_templates.surfaces.maps import SurfaceMaps
 from scene_templates.textures import MOST_TEXTURED, TexturedLook, TextureSettings, draw_look
 from scene_templates.user_maps import UserMap, UserTexture
 from storage.conventions import linear_from_srgb8, srgb8
 from storage.errors import Rejected, TrilightError
+from storage.records.asset import Level, LevelSkin
 from storage.records.material import DIFFUSE, EMISSION, ROUGHNESS, SPECULAR, default_rows, laid_out
+from storage.records.objects import LockedObject
 from storage.records.scene import SceneObject
-from storage.records.texture import CONSTANT, TEXTURED, Texture
+from storage.records.texture import CONSTANT, NORMAL, TEXTURED, MapSource, Texture
 from storage.seeds import SceneKey
 
 
@@ -47,6 +58,12 @@ class Skin:
     """uid of a user's texture, as objects.lock.jsonl names it; empty for others."""
     emission: NDArray[np.float32] | None = None
     """[T, 3] stated radiance of an object's triangles, until they become emitters."""
+
+    def of_triangles(self, chosen: NDArray[np.bool_]) -> "Skin":
+        """Return the skin of some triangles, a mask [T]."""
+        uv = self.uv.reshape(-1, 3, 2)[chosen].reshape(-1, 2)
+        emission = None if self.emission is None else self.emission[chosen]
+        return dataclasses.replace(self, uv=uv, emission=emission)
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -67,9 +84,9 @@ class ScenePiece:
 
 def shell_piece(part: ShellPart, rng: np.random.Generator, smooth_angle_deg: float) -> ScenePiece:
     """Return a floor or wall; if it has many colors, `rng` draws one per triangle."""
+    entry = SceneObject(name=part.name, kind="shell")
     positions = part.positions.astype(np.float32)
-    mesh = _shade_mesh(positions, part.faces, part.surface, smooth_angle_deg)
-    return _apply_surface(SceneObject(name=part.name, kind="shell"), mesh, part.surface, rng)
+    return _shaded_piece(entry, positions, part.faces, part.surface, rng, smooth_angle_deg)
 
 
 def object_piece(
@@ -79,28 +96,21 @@ def object_piece(
     surface: SurfaceLook,
     rng: np.random.Generator,
     smooth_angle_deg: float,
+    skin: Skin | None = None,
 ) -> ScenePiece:
     """Return an object of posed vertices [V, 3] in world space, and faces [F, 3].
+
+    Args:
+        skin: textures that replace the material; it covers all faces, slivers included.
 
     Raises:
         Rejected: "no_faces" if no triangle has an area.
     """
-    faces = without_slivers(positions, faces)
-    if len(faces) == 0:
+    solid = has_area(positions, faces)
+    if not solid.any():
         raise Rejected("no_faces", f"{entry.uid}: no triangle of the level has an area")
-    return _apply_surface(
-        entry, _shade_mesh(positions, faces, surface, smooth_angle_deg), surface, rng
-    )
-
-
-def apply_skin(
-    piece: ScenePiece, positions: NDArray[np.float32], faces: NDArray[np.uint32], skin: Skin
-) -> ScenePiece:
-    """Return the piece of `object_piece` with a skin that covers all faces, slivers included."""
-    has_area = not_slivers(positions, faces)
-    uv = skin.uv.reshape(-1, 3, 2)[has_area].reshape(-1, 2)
-    emission = None if skin.emission is None else skin.emission[has_area]
-    return with_skin(piece, dataclasses.replace(skin, uv=uv, emission=emission))
+    piece = _shaded_piece(entry, positions, faces[solid], surface, rng, smooth_angle_deg)
+    return with_skin(piece, skin.of_triangles(solid)) if skin else piece
 
 
 def with_skin(piece: ScenePiece, skin: Skin) -> ScenePiece:
@@ -138,21 +148,19 @@ def lamp_piece(
     return ScenePiece(entry=entry, mesh=mesh, materials=materials, material_index=index.ravel())
 
 
-def _shade_mesh(
+def _shaded_piece(
+    entry: SceneObject,
     positions: NDArray[np.float32],
     faces: NDArray[np.uint32],
     surface: SurfaceLook,
+    rng: np.random.Generator,
     smooth_angle_deg: float,
-) -> ShadedMesh:
-    if surface.smooth:
-        return smooth_shaded(positions, faces, smooth_angle_deg)
-    return flat_shaded(positions, faces)
-
-
-def _apply_surface(
-    entry: SceneObject, mesh: ShadedMesh, surface: SurfaceLook, rng: np.random.Generator
 ) -> ScenePiece:
     """Return the piece of a mesh with materials: one row, or one per shading group or triangle."""
+    if surface.smooth:
+        mesh = smooth_shaded(positions, faces, smooth_angle_deg)
+    else:
+        mesh = flat_shaded(positions, faces)
     rows = {
         "one": np.zeros(len(mesh.faces), np.int64),
         "groups": mesh.groups,
@@ -170,18 +178,23 @@ def _apply_surface(
 
 def concatenate_pieces(pieces: Sequence[ScenePiece]) -> dict[str, Any]:
     """Return the geometry, materials and textures of a Scene, in the order of the pieces."""
-    vertex_start = _starts([len(piece.mesh.positions) for piece in pieces])
-    material_start = _starts([len(piece.materials) for piece in pieces])
-    rows = range(len(pieces))
+    vertex_starts = accumulate((len(piece.mesh.positions) for piece in pieces), initial=0)
+    material_starts = accumulate((len(piece.materials) for piece in pieces), initial=0)
     counts = [len(piece.mesh.faces) for piece in pieces]
     return {
         "vertex_positions": np.concatenate([piece.mesh.positions for piece in pieces]),
         "vertex_normals": np.concatenate([piece.mesh.normals for piece in pieces]),
         "faces": np.concatenate(
-            [pieces[row].mesh.faces + np.uint32(vertex_start[row]) for row in rows]
+            [
+                piece.mesh.faces + np.uint32(start)
+                for piece, start in zip(pieces, vertex_starts, strict=False)
+            ]
         ),
         "material_index": np.concatenate(
-            [pieces[row].material_index + material_start[row] for row in rows]
+            [
+                piece.material_index + start
+                for piece, start in zip(pieces, material_starts, strict=False)
+            ]
         ).astype(np.uint16),
         "materials": np.concatenate([piece.materials for piece in pieces]),
         "object_index": np.repeat(np.arange(len(pieces)), counts).astype(np.uint16),
@@ -195,34 +208,25 @@ def _skins(pieces: Sequence[ScenePiece]) -> dict[str, Any]:
         return {}
     textures = dict[str, Texture]()
     rows = []
-    normals = []
     corners = []
     for piece in pieces:
-        index = np.full((len(piece.materials), len(TEXTURED)), CONSTANT, np.int32)
+        index = np.full((len(piece.materials), len(TEXTURED) + 1), CONSTANT, np.int32)
         uv = np.zeros((3 * len(piece.mesh.faces), 2), np.float32)
-        if piece.skin is not None:
-            for texture in piece.skin.textures:
-                textures.setdefault(texture.sha256, texture)
-            index[:] = [list(textures).index(each.sha256) for each in piece.skin.textures]
-            uv = piece.skin.uv
-        normal = np.full(len(index), CONSTANT, np.int32)
-        if piece.skin is not None and piece.skin.normal is not None:
-            textures.setdefault(piece.skin.normal.sha256, piece.skin.normal)
-            normal[:] = list(textures).index(piece.skin.normal.sha256)
+        if (skin := piece.skin) is not None:
+            uv = skin.uv
+            for column, texture in enumerate((*skin.textures, skin.normal)):
+                if texture is not None:
+                    textures.setdefault(texture.sha256, texture)
+                    index[:, column] = list(textures).index(texture.sha256)
         rows.append(index)
-        normals.append(normal)
         corners.append(uv)
-    of_normals = np.concatenate(normals)
+    columns, normals = np.split(np.concatenate(rows), [len(TEXTURED)], axis=1)
     return {
         "uv": np.concatenate(corners),
         "textures": tuple(textures.values()),
-        "material_textures": np.concatenate(rows),
-        "normal_textures": of_normals if (of_normals != CONSTANT).any() else None,
+        "material_textures": np.ascontiguousarray(columns),
+        "normal_textures": normals.ravel() if (normals != CONSTANT).any() else None,
     }
-
-
-def _starts(counts: Sequence[int]) -> list[int]:
-    return [sum(counts[:row]) for row in range(len(counts))]
 
 
 def with_drawn_columns(materials: NDArray[np.float32], scene_key: SceneKey) -> NDArray[np.float32]:
@@ -278,13 +282,11 @@ def with_drawn_textures(
     if settings.share == 0:
         return list(pieces)
     licences = [piece.entry.licence for piece in pieces]
-    frames = [np.eye(3)] * len(layout.shell)
-    frames += [placement.pose.rotation for placement in layout.objects]
-    origins = [np.zeros(3)] * len(layout.shell)
-    origins += [placement.pose.centre for placement in layout.objects]
+    frames = [(np.eye(3), np.zeros(3))] * len(layout.shell)
+    frames += [(each.pose.rotation, each.pose.centre) for each in layout.objects]
     result = list(pieces)
     textured = 0
-    for row, (frame, origin) in enumerate(zip(frames, origins, strict=True)):
+    for row, (frame, origin) in enumerate(frames):
         rng = scene_key.rng("texture", row)
         look = (
             draw_look(rng, settings, user_textures, licences) if textured < MOST_TEXTURED else None
@@ -343,3 +345,146 @@ def _textures(maps: SurfaceMaps) -> tuple[Texture, Texture, Texture]:
         texture(specular, "specular"),
         texture(roughness, "roughness"),
     )
+
+
+def source_skins(
+    chosen: Sequence[PooledAsset],
+    levels: Sequence[Level],
+    settings: MaterialSettings,
+    scene_key: SceneKey,
+) -> list[Skin | None]:
+    """Return the skin of each object, or None if its materials are drawn.
+
+    Each object has a random stream of its own, so that skins change no other draw of the scene, and
+    another `own_share` changes none of the skins that stay.
+
+    Args:
+        settings: source of the materials, and the fraction of objects that keep theirs.
+
+    Raises:
+        Rejected: law_broken, which names the object.
+    """
+    if settings.source != "object":
+        return [None] * len(chosen)
+    skins: list[Skin | None] = []
+    for row, (entry, level) in enumerate(zip(chosen, levels, strict=True)):
+        rng = scene_key.rng("own materials", row)
+        keeps = rng.random() < settings.own_share and level.skin is not None
+        skins.append(_skin(level.skin, entry.locked) if keeps and level.skin else None)
+    return skins
+
+
+def _skin(skin: LevelSkin, locked: LockedObject) -> Skin:
+    """Return a skin whose textures carry the rights of their object.
+
+    Raises:
+        Rejected: law_broken if the textures are invalid: an old version may have prepared them.
+    """
+    try:
+        textures = [*skin.textures, *(() if skin.normal is None else (skin.normal,))]
+    except TrilightError as error:
+        raise Rejected("law_broken", f"object {locked.uid}: {error}") from error
+    first, second, third, *normal = (
+        dataclasses.replace(
+            texture,
+            source=MapSource(
+                name=f"{locked.uid} {column}",
+                licence=locked.licence,
+                attribution=locked.attribution,
+                source_url=locked.source_url,
+            ),
+        )
+        for texture, column in zip(textures, (*TEXTURED, NORMAL), strict=False)
+    )
+    return Skin(
+        uv=skin.uv.reshape(-1, 2),
+        textures=(first, second, third),
+        normal=normal[0] if normal else None,
+        emission=skin.emission,
+    )
+
+
+def with_source_emission(
+    objects: Sequence[ScenePiece], lamps: Sequence[ScenePiece], share: float
+) -> tuple[list[ScenePiece], list[ScenePiece]]:
+    """Return objects without their emitting triangles, and these as emitters.
+
+    An object whose triangles all emit becomes an emitter in its place.
+
+    Args:
+        objects: pieces, some with skins that state the emission of their triangles.
+        share: fraction of the lamps' power for all emitting triangles; 0 without lamps.
+    """
+    scale = _scale(objects, lamps, share)
+    skins = [each.skin and dataclasses.replace(each.skin, emission=None) for each in objects]
+    plain = [
+        dataclasses.replace(piece, skin=skin) for piece, skin in zip(objects, skins, strict=True)
+    ]
+    if scale == 0:
+        return plain, []
+    taken = {piece.entry.name for piece in [*objects, *lamps]}
+    reflected = lamps[0].materials[0, DIFFUSE]
+    emitters = []
+    for row, piece in enumerate(objects):
+        emission = _emission(piece)
+        emits: NDArray[np.bool_] = np.asarray(emission.any(axis=1))
+        if not emits.any():
+            continue
+        entry = _entry(piece.entry, taken)
+        taken.add(entry.name)
+        mesh = _part(plain[row], emits).mesh
+        emitter = lamp_piece(entry, mesh, scale * emission[emits], reflected)
+        if emits.all():
+            plain[row] = emitter
+        else:
+            plain[row] = _part(plain[row], ~emits)
+            emitters.append(emitter)
+    return plain, emitters
+
+
+def _scale(objects: Sequence[ScenePiece], lamps: Sequence[ScenePiece], share: float) -> float:
+    stated = [(_emission(piece), _areas(piece)) for piece in objects]
+    drawn = [(lamp.materials[lamp.material_index, EMISSION], _areas(lamp)) for lamp in lamps]
+    (power, brightest), (drawn_power, greatest) = (
+        (
+            sum(float(areas @ rgb.astype(np.float64).mean(axis=1)) for rgb, areas in emitters),
+            max((float(rgb.max(initial=0)) for rgb, _ in emitters), default=0.0),
+        )
+        for emitters in (stated, drawn)
+    )
+    if not (share and lamps and power > 0):
+        return 0.0
+    return min(share * drawn_power / power, greatest / brightest)
+
+
+def _part(piece: ScenePiece, chosen: NDArray[np.bool_]) -> ScenePiece:
+    """Return some triangles of a piece, without vertices that they do not use."""
+    used, faces = np.unique(piece.mesh.faces[chosen], return_inverse=True)
+    mesh = dataclasses.replace(
+        piece.mesh,
+        positions=piece.mesh.positions[used],
+        normals=piece.mesh.normals[used],
+        faces=faces.reshape(-1, 3).astype(np.uint32),
+        groups=piece.mesh.groups[chosen],
+    )
+    skin = piece.skin.of_triangles(chosen) if piece.skin else None
+    return dataclasses.replace(
+        piece, mesh=mesh, material_index=piece.material_index[chosen], skin=skin
+    )
+
+
+def _emission(piece: ScenePiece) -> NDArray[np.float32]:
+    """Return the stated radiance of an object's triangles, [T, 3]."""
+    stated = None if piece.skin is None else piece.skin.emission
+    return np.zeros((len(piece.mesh.faces), 3), np.float32) if stated is None else stated
+
+
+def _areas(piece: ScenePiece) -> NDArray[np.float64]:
+    cross = face_crosses(piece.mesh.positions, piece.mesh.faces)
+    return np.asarray(np.linalg.norm(cross, axis=1) / 2)
+
+
+def _entry(of: SceneObject, taken: set[str]) -> SceneObject:
+    names = (f"{of.name}_light{number or ''}" for number in range(len(taken) + 1))
+    name = next(name for name in names if name not in taken)
+    return dataclasses.replace(of, name=name, kind="emitter")

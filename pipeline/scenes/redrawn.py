@@ -33,15 +33,13 @@ def with_new_materials(scene: Scene, settings: MaterialSettings, scene_key: Scen
     rng = scene_key.rng("new materials")
     rows = [scene.materials[:0]]
     material_index = scene.material_index.astype(np.int64)
-    lit = {row for row, entry in enumerate(scene.objects) if entry.kind == "emitter"}
     facts = {surface.row: surface for surface in surfaces(scene)}
     for row in range(len(scene.objects)):
         mine = scene.object_index == row
         used, within = np.unique(scene.material_index[mine], return_inverse=True)
         start = sum(map(len, rows))
         new = scene.materials[used].copy()
-        if row not in lit and row in facts:
-            surface = facts[row]
+        if surface := facts.get(row):
             look = sample_material(
                 rng,
                 settings,

@@ -87,17 +87,10 @@ def face_normals(positions: NDArray[np.float32], faces: NDArray[np.uint32]) -> N
     return cross / np.sqrt(np.sum(np.square(cross), axis=1, keepdims=True))
 
 
-def not_slivers(positions: NDArray[np.float32], faces: NDArray[np.uint32]) -> NDArray[np.bool_]:
+def has_area(positions: NDArray[np.float32], faces: NDArray[np.uint32]) -> NDArray[np.bool_]:
     """Return a mask [F] of the faces that have an area after rounding to float32."""
     double_area = np.sqrt(np.sum(np.square(face_crosses(positions, faces)), axis=1))
     return np.asarray(double_area > SMALLEST_DOUBLE_AREA)
-
-
-def without_slivers(
-    positions: NDArray[np.float32], faces: NDArray[np.uint32]
-) -> NDArray[np.uint32]:
-    """Return the faces that have an area after rounding to float32."""
-    return faces[not_slivers(positions, faces)]
 
 
 def shading_groups(
@@ -136,7 +129,5 @@ def _sum_by_key(keys: NDArray[np.int64], values: NDArray[np.float64]) -> NDArray
     """Return, for every corner, the sum of `values` [T, 3, 3] over all corners of the same key."""
     _, row = np.unique(keys.ravel(), return_inverse=True)
     flat = values.reshape(-1, 3)
-    sums = np.zeros((int(row.max()) + 1, 3))
-    for axis in range(3):
-        sums[:, axis] = np.bincount(row, weights=flat[:, axis])
-    return sums[row].reshape(values.shape)
+    sums = np.array([np.bincount(row, weights=column) for column in flat.T], np.float64)
+    return sums.T[row].reshape(values.shape)

@@ -26,24 +26,21 @@ _CHUNK = 1 << 16
 """Rows of a column that are read together: half a megabyte."""
 
 
+@dataclass(frozen=True, eq=False)
 class FitTable:
-    """Triangles and camp of every object of a split, in the order of their uids."""
+    """Triangles and camp of every object of a split, in the order of their uids.
 
-    def __init__(
-        self, least: Any, camp: Any, camps: Sequence[str], sizes: Mapping[str, CampSizes]
-    ) -> None:
-        """Make a table of columns, arrays in memory or in a file that are read by slices.
+    The columns are arrays in memory, or in a file, that are read by slices.
+    """
 
-        Args:
-            least: triangles of the coarsest level of each row.
-            camp: number of each row's camp.
-            camps: name of each camp by number; "" is for objects without a camp.
-            sizes: number and sizes of the objects of each camp that occurs.
-        """
-        self._least = least
-        self._camp = camp
-        self._camps = tuple(camps)
-        self.sizes = sizes
+    least: Any
+    """Triangles of the coarsest level of each row."""
+    camp_numbers: Any
+    """Number of each row's camp."""
+    camps: Sequence[str]
+    """Name of each camp by number; "" is for objects without a camp."""
+    sizes: Mapping[str, CampSizes]
+    """Number and sizes of the objects of each camp that occurs."""
 
     @classmethod
     def of(cls, least: Sequence[int], camps: Sequence[str] = ()) -> "FitTable":
@@ -54,10 +51,10 @@ class FitTable:
         return cls(sizes, numbers, names, camp_sizes(sizes, numbers, names))
 
     def size(self, row: int) -> int:
-        return int(self._least[row : row + 1][0])
+        return int(self.least[row : row + 1][0])
 
     def camp(self, row: int) -> str:
-        return self._camps[int(self._camp[row : row + 1][0])]
+        return self.camps[int(self.camp_numbers[row : row + 1][0])]
 
     def draw_row(self, rng: np.random.Generator, rooms: Mapping[str, int]) -> int | None:
         """Draw a row uniformly among those that fit; None if none does.
@@ -68,11 +65,9 @@ class FitTable:
         if rooms.keys() == self.sizes.keys() and all(
             self.sizes[camp].most <= room for camp, room in rooms.items()
         ):
-            return int(rng.integers(len(self._least)))
-        limits = np.full(len(self._camps), -1, np.int64)
-        for camp, room in rooms.items():
-            limits[self._camps.index(camp)] = room
-        starts = range(0, len(self._least), _CHUNK)
+            return int(rng.integers(len(self.least)))
+        limits = np.array([rooms.get(camp, -1) for camp in self.camps], np.int64)
+        starts = range(0, len(self.least), _CHUNK)
         counts = np.cumsum([np.count_nonzero(self._fits(start, limits)) for start in starts])
         if not counts[-1]:
             return None
@@ -84,7 +79,7 @@ class FitTable:
 
     def _fits(self, start: int, limits: NDArray[np.int64]) -> NDArray[np.bool_]:
         chunk = slice(start, start + _CHUNK)
-        fits: NDArray[np.bool_] = self._least[chunk] <= limits[self._camp[chunk]]
+        fits: NDArray[np.bool_] = self.least[chunk] <= limits[self.camp_numbers[chunk]]
         return fits
 
 

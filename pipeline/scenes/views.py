@@ -10,7 +10,6 @@ smaller than a grid cell. Everything is computed in the single precision of stor
 the cameras of a dataset depend on each bit of it.
 """
 
-import dataclasses
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 
@@ -40,10 +39,8 @@ def require_valid(scene: Scene, settings: SceneSettings, *, in_budget: bool = Tr
     try:
         scene.check()
     except TrilightError as error:
-        uids = {entry.uid for entry in scene.objects if entry.uid} | {
-            *scene.provenance.get("maps", ())
-        }
-        named = ", ".join(sorted(uids)) or "none"
+        uids = {entry.uid for entry in scene.objects if entry.uid}
+        named = ", ".join(sorted(uids.union(scene.provenance.get("maps", ())))) or "none"
         raise Rejected("law_broken", f"{error} Its objects and maps are {named}.") from error
     if in_budget and scene.num_triangles > settings.max_triangles:
         message = f"{scene.num_triangles} triangles; at most {settings.max_triangles} were allowed"
@@ -221,10 +218,10 @@ def cameras_of_view(
     Raises:
         Rejected: "no_camera" when the sixteen proposals of the view are used up.
     """
-    attempt = int(scene.provenance["camera_attempts"][view])
-    yield ViewCamera(c2w=scene.c2w[view], fov_deg=scene.fov_deg[view], attempt=attempt)
+    camera = cameras_of(scene)[view]
+    yield camera
     of_scene = settings.of_scene(scene.provenance["scene_index"])
-    yield from _accepted_proposals(scene, visibility, of_scene, view, attempt + 1)
+    yield from _accepted_proposals(scene, visibility, of_scene, view, camera.attempt + 1)
 
 
 def cameras_of(scene: Scene) -> list[ViewCamera]:
@@ -240,21 +237,18 @@ def with_cameras(scene: Scene, cameras: Sequence[ViewCamera]) -> Scene:
         np.array([camera.fov_deg for camera in cameras]),
     )
     attempts = [camera.attempt for camera in cameras]
-    provenance = {**scene.provenance, "camera_attempts": attempts}
-    return dataclasses.replace(posed, provenance=provenance)
+    return posed.with_provenance({**scene.provenance, "camera_attempts": attempts})
 
 
 def visibility_problem(facts: ViewFacts, settings: ViewLaws, *, has_objects: bool) -> str | None:
     """Return why a view is rejected, or None; a camera inside an object is too near."""
-    if facts.depth < settings.min_depth:
-        return "too near"
-    if has_objects and facts.coverage < settings.min_coverage:
-        return "sees too little of the objects"
-    if facts.shell_back > settings.max_shell_back:
-        return "sees the back of the shell"
-    if facts.lit < settings.min_lit:
-        return "sees too little light"
-    return None
+    problems = {
+        "too near": facts.depth < settings.min_depth,
+        "sees too little of the objects": has_objects and facts.coverage < settings.min_coverage,
+        "sees the back of the shell": facts.shell_back > settings.max_shell_back,
+        "sees too little light": facts.lit < settings.min_lit,
+    }
+    return next((problem for problem, is_met in problems.items() if is_met), None)
 
 
 def _accepted_proposals(

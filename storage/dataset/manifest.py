@@ -125,16 +125,17 @@ class Manifest(_Fields):
     def num_bytes(self) -> int:
         return sum(shard.num_bytes for shard in self.shards)
 
-    def setting(self, group: str, name: str, kind: Any) -> Any:
-        """Return one of its settings of a kind; None where they do not say it, or another kind."""
-        settings = self.settings.get(group)
-        value = settings.get(name) if isinstance(settings, Mapping) else None
+    def setting(self, name: str, kind: Any = object) -> Any:
+        """Return a setting of a kind by its dotted name; None if it is missing, or another kind."""
+        value: Any = self.settings
+        for part in name.split("."):
+            value = value.get(part) if isinstance(value, Mapping) else None
         return value if isinstance(value, kind) else None
 
     @property
     def passes(self) -> tuple[str, ...]:
         """Names of the passes of each picture; none where the settings do not name them."""
-        return tuple(map(str, self.setting("storage", "passes", list | tuple) or ()))
+        return tuple(map(str, self.setting("storage.passes", list | tuple) or ()))
 
     @property
     def identity(self) -> object:

@@ -137,7 +137,7 @@ def _of_datasets(datasets: Sequence[Dataset]) -> TrainingData:
             name=dataset.manifest.build,
             digest=dataset.digest,
             num_views=dataset.manifest.num_views,
-            max_triangles=dataset.manifest.setting("scenes", "max_triangles", int),
+            max_triangles=dataset.manifest.setting("scenes.max_triangles", int),
         )
         for dataset in datasets
     )

@@ -4,7 +4,6 @@ from collections import Counter, deque
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
 from dataclasses import dataclass, field
-from functools import partial
 from pathlib import Path
 from tempfile import TemporaryFile
 from typing import BinaryIO
@@ -260,16 +259,15 @@ def _check_pictures(sample: Sample, manifest: Manifest) -> Iterator[str]:
         sample.scene.check()
     except TrilightError as error:
         yield str(error)
-    renders = partial(manifest.setting, "renders", kind=int)
-    resolution = renders("resolution")
+    resolution = manifest.setting("renders.resolution", int)
     expected = (manifest.num_views, resolution, resolution, 3)
     if sample.radiance_rgb.shape != expected or sample.scene.num_views != manifest.num_views:
         yield f"pictures {sample.radiance_rgb.shape}; expected {expected}"
     if not (np.isfinite(sample.radiance_rgb).all() and (sample.radiance_rgb >= 0).all()):
         yield "a picture holds a value that is not finite or negative"
-    yield from _check_lights(sample, per_light=bool(renders("per_light")))
-    bounces, lobes = (bool(renders(name)) for name in ("split", "split_lobes"))
-    yield from _check_parts(sample, part_names(bounces=bounces, lobes=lobes))
+    yield from _check_lights(sample, per_light=bool(manifest.setting("renders.per_light", int)))
+    split, lobes = (manifest.setting(f"renders.{name}", int) for name in ("split", "split_lobes"))
+    yield from _check_parts(sample, part_names(bounces=bool(split), lobes=bool(lobes)))
     yield from _check_passes(sample, manifest.passes)
 
 

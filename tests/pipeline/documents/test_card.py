@@ -16,7 +16,8 @@ import yaml
 
 from pipeline.documents.dataset_documents import _size_category, encode_card, write_documents
 from pipeline.documents.distributions import Distributions, dataset_distributions
-from pipeline.documents.rights import encode_licences, rights_of
+from pipeline.documents.pages import render_markdown
+from pipeline.documents.rights import rights_of
 from storage.dataset.dataset import Dataset, open_dataset
 from storage.dataset.statistics import dataset_statistics
 from storage.errors import TrilightError
@@ -50,7 +51,6 @@ def found(tmp_path_factory: pytest.TempPathFactory) -> Distributions:
 def test_scenes_objects_surfaces_and_rejections_are_counted(found: Distributions) -> None:
     assert found.scenes == {("plane", "train"): 3, ("wall", "train"): 1, ("wall", "test"): 1}
     assert found.splits == ["train", "test"]
-    assert found.templates == ["plane", "wall"]
     assert found.placements == {"a": 4, "b": 1, "c": 1}
     assert found.uses_per_object() == [4, 1, 1, 0]
     assert found.licences == {"CC-BY-4.0": (1, 1, 1), "CC0-1.0": (3, 2, 5)}
@@ -256,7 +256,7 @@ def test_the_body_counts_by_split_and_licence(tmp_path: Path) -> None:
     assert "4, of which 3 stand in scenes" in body
     assert dataset.digest in body
     rights = rights_of(read_objects_lock(dataset.folder.objects_lock))
-    assert "attribution, changes" in encode_licences(rights).decode()
+    assert "attribution, changes" in render_markdown("license.jinja", rights=rights).decode()
 
 
 def test_expected_errors_stand_beside_the_promised_ones(tmp_path: Path) -> None:

@@ -15,17 +15,17 @@ from pipeline.scenes.compose import fill_triangles, subdivide
 from pipeline.scenes.pieces import (
     ScenePiece,
     Skin,
-    apply_skin,
     concatenate_pieces,
     cube_coordinates,
     emitter_piece,
     object_piece,
     shell_piece,
+    source_skins,
     with_drawn_textures,
+    with_source_emission,
 )
 from pipeline.scenes.redrawn import with_new_lights
 from pipeline.scenes.shading_normals import flat_shaded
-from pipeline.scenes.source_materials import source_skins, with_source_emission
 from pipeline.scenes.triangle_budget import PooledAsset
 from scene_templates.layout import Emitter, Layout, ObjectPlacement, Pose, ShellPart
 from scene_templates.rooms import PATCH_FACES, SIDES, patch
@@ -415,11 +415,10 @@ def test_subdivision_moves_no_colour() -> None:
     assert level.skin is not None
     positions = level.positions
     box, rng = SceneObject(name="box", kind="object"), np.random.default_rng(0)
-    piece = object_piece(box, positions, level.faces, LOOK, rng, 30.0)
     entries = [pooled("a", [trimesh.creation.box()])]
     (skin,) = source_skins(entries, [level], OWN.materials, SceneKey(0, 0))
     assert skin is not None
-    whole = apply_skin(piece, positions, level.faces, skin)
+    whole = object_piece(box, positions, level.faces, LOOK, rng, 30.0, skin)
     more = subdivide(whole, 100)
     assert more.skin is not None and len(more.mesh.faces) > 90
 
@@ -444,7 +443,7 @@ def test_a_picture_has_the_colours_of_a_file_in_their_corners(tmp_path: Path) ->
     assert skin is not None
     shape = level.positions, level.faces
     named, rng = SceneObject(name="square", kind="object"), np.random.default_rng(0)
-    square = apply_skin(object_piece(named, *shape, LOOK, rng, 30.0), *shape, skin)
+    square = object_piece(named, *shape, LOOK, rng, 30.0, skin)
     scene = Scene(
         **concatenate_pieces([square]),
         c2w=look_at_c2w(eye=[0, -2, 0], target=[0, 0, 0], up=[0, 0, 1])[None].astype(np.float32),
@@ -503,7 +502,6 @@ def _object(emission: list[list[float]], name: str = "screen") -> ScenePiece:
     """A square of two triangles that emit so much."""
     entry = SceneObject(name=name, kind="object", uid=f"made/{name}")
     rng = np.random.default_rng(0)
-    piece = object_piece(entry, QUAD, FACES, LOOK, rng, 30.0)
     first, second, third = (
         Texture(texels=np.full((1, 1, channels), 0.1, np.float32)) for channels in (3, 3, 1)
     )
@@ -512,7 +510,7 @@ def _object(emission: list[list[float]], name: str = "screen") -> ScenePiece:
         textures=(first, second, third),
         emission=np.array(emission, np.float32),
     )
-    return apply_skin(piece, QUAD, FACES, skin)
+    return object_piece(entry, QUAD, FACES, LOOK, rng, 30.0, skin)
 
 
 def _lamp(corners: np.ndarray, radiance: tuple[float, float, float]) -> ScenePiece:
