@@ -21,7 +21,6 @@ from numpy.typing import NDArray
 from pipeline.foreign.linear_picture import (
     REC709,
     LinearPicture,
-    are_rec709,
     as_rec709,
     luminance_weights,
     require_pixels,
@@ -95,7 +94,7 @@ def read_openexr(data: bytes, max_pixels: int, *, is_color: bool) -> LinearPictu
     primaries = _read_primaries(header)
     if set(_CHROMA) <= set(choice.letters):
         values = _from_chroma(values, primaries)
-    if is_color and values.shape[-1] >= 3 and not are_rec709(primaries):
+    if is_color and values.shape[-1] >= 3:
         values[..., :3] = as_rec709(values[..., :3], primaries)
     return LinearPicture(values=values, unread=tuple(_list_unread(headers, choice)))
 

@@ -114,17 +114,6 @@ _WORD = re.compile(r"\w{3,}")
 _DOWNLOAD_REASONS = ("download_failed", "too_large_bytes", "too_many_buffers", "unsafe_name")
 
 
-@dataclass(frozen=True, kw_only=True)
-class FoundObjects:
-    """The usable objects of a source, and the failures."""
-
-    records: tuple[ObjectRecord, ...]
-    """Objects with an allowed licence and their files on this machine, sorted by uid."""
-    failures: tuple[Failure, ...]
-    """Failures of the stage `objects`, sorted by uid: licence_refused, download_failed,
-    too_large_bytes, too_many_buffers, unsafe_name, unknown_uid, link_outside, name_clash."""
-
-
 @dataclass(frozen=True, kw_only=True, eq=False)
 class ListedObjects:
     """The listing of a source, split by licence; files are downloaded on demand."""
@@ -142,8 +131,8 @@ class ListedObjects:
         self,
         is_selected: Callable[[str], bool] = lambda uid: True,
         downloaded: CountDone = lambda done, total: None,
-    ) -> FoundObjects:
-        """Download the selected objects and return them with the failures.
+    ) -> Listing:
+        """Download the selected objects of allowed licences; return them with the failures.
 
         Downloads stay in the user's cache (`storage.cache`; Objaverse in the folder of its
         package) and are not repeated.
@@ -153,6 +142,11 @@ class ListedObjects:
             downloaded: called with the number of finished downloads, failed ones included, and the
                 total; from the calling thread.
 
+        Returns:
+            Objects whose files are on this machine, and failures of the stage `objects`, both
+            sorted by uid: licence_refused, download_failed, too_large_bytes, too_many_buffers,
+            unsafe_name, unknown_uid, link_outside, name_clash.
+
         Raises:
             TrilightError: none of the selected objects could be downloaded.
         """
@@ -160,9 +154,9 @@ class ListedObjects:
         failures = [failure for failure in self.refused if is_selected(failure.item)]
         fetched, lost = self.fetch(records, downloaded)
         self.require_some(len(fetched), [*failures, *lost])
-        return FoundObjects(
-            records=tuple(sorted(fetched, key=attrgetter("uid"))),
-            failures=tuple(sorted([*failures, *lost], key=attrgetter("item"))),
+        return Listing(
+            records=sorted(fetched, key=attrgetter("uid")),
+            failures=sorted([*failures, *lost], key=attrgetter("item")),
         )
 
     @property
@@ -229,7 +223,7 @@ def find_objects(
     allowed_licences: Sequence[str],
     licence: str | None = None,
     downloaded: CountDone = lambda done, total: None,
-) -> FoundObjects:
+) -> Listing:
     """List a source and download all its usable objects; raises as `list_objects`."""
     listed = list_objects(
         source, work_dir=work_dir, allowed_licences=allowed_licences, licence=licence

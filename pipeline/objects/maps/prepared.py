@@ -24,7 +24,7 @@ from safetensors.numpy import save
 from scipy.sparse import csr_array
 
 from pipeline.foreign.linear_picture import clip_to_unit
-from pipeline.foreign.picture import UNREADABLE_PICTURE, read_linear_picture
+from pipeline.foreign.picture import FORMATS, UNREADABLE_PICTURE, read_linear_picture
 from pipeline.objects.maps.texture_names import TEXTURE_PARTS, packed_channels
 from storage.conventions import linear_from_srgb
 from storage.digests import canonical_json, sha256_hex
@@ -100,7 +100,6 @@ MOST_NEGATIVE = 1e-3
 MAX_PIXELS = 1 << 26
 """Most pixels of a picture: 8192 x 8192."""
 
-_FORMATS = ("PNG", "JPEG", "TIFF", "BMP", "TGA", "WEBP")
 _MOST = {"I;16": 65535, "I;16L": 65535, "I;16B": 65535, "I": 65535}
 
 
@@ -304,7 +303,7 @@ def _plain_values(data: bytes) -> tuple[NDArray[np.float32], bool]:
     """Return a picture of another format, and True where its values are linear floats."""
     is_linear = False
     try:
-        with Image.open(io.BytesIO(data), formats=_FORMATS) as image:
+        with Image.open(io.BytesIO(data), formats=FORMATS) as image:
             if image.width * image.height > MAX_PIXELS or max(image.size) > MAX_SIDE:
                 raise _too_large(image.width, image.height)
             if image.mode in _MOST:

@@ -19,7 +19,6 @@ from pathlib import Path
 from typing import Any, BinaryIO, cast
 from urllib.parse import quote, unquote, urlsplit
 
-from pipeline.objects.licences import StatedLicence, require_unstated, stated_licence
 from pipeline.objects.listing import CountDone, Fetched, Listing, fetch_all
 from pipeline.objects.local.folder import (
     CATALOGUE_NAMES,
@@ -351,11 +350,10 @@ def list_remote(url: RemoteUrl, licence: str | None) -> Listing:
             its catalogue is wrong, or there are a catalogue and a `licence`.
     """
     folder = RemoteFolder(url)
-    catalogue = only_catalogue(folder.has)
+    catalogue = only_catalogue(folder.has, licence)
     if catalogue is None:
-        listing = _list_object_files(folder, stated_licence(licence))
+        listing = _list_object_files(folder, licence)
     else:
-        require_unstated(licence, catalogue)
         listing = Listing(records=_list_catalogue(folder, catalogue), failures=[])
     return dataclasses.replace(listing, fetch=partial(_fetch, folder))
 
@@ -375,7 +373,7 @@ def _list_catalogue(folder: RemoteFolder, catalogue: str) -> list[ObjectRecord]:
     ]
 
 
-def _list_object_files(folder: RemoteFolder, licence: StatedLicence) -> Listing:
+def _list_object_files(folder: RemoteFolder, licence: str | None) -> Listing:
     names = folder.names()
     for catalogue in set(CATALOGUE_NAMES) & set(names):
         # without the catalogue, the run could use objects that it forbids
