@@ -203,15 +203,12 @@ class Picture:
         """Return the linear values of texels [..., 4] of the picture or of a level."""
         if texels.dtype == np.float32:
             return texels
-        if texels.dtype in (np.uint16, np.float16):
-            most = 65535 if texels.dtype == np.uint16 else 1
-            deep: NDArray[np.float32] = np.divide(texels, most, dtype=np.float32)
-            if self.is_srgb:
-                deep[..., :3] = linear_from_srgb(deep[..., :3])
-            return deep
-        linear: NDArray[np.float32] = np.divide(texels, 255, dtype=np.float32)
-        if self.is_srgb:
+        most = 1 if texels.dtype == np.float16 else np.iinfo(texels.dtype).max
+        linear: NDArray[np.float32] = np.divide(texels, most, dtype=np.float32)
+        if self.is_srgb and texels.dtype == np.uint8:
             linear[..., :3] = linear_from_srgb8()[texels[..., :3]]
+        elif self.is_srgb:
+            linear[..., :3] = linear_from_srgb(linear[..., :3])
         return linear
 
     def sample(self, uv: NDArray[np.float64], halvings: NDArray[np.int64]) -> NDArray[np.float32]:

@@ -216,21 +216,6 @@ def list_objects(
     )
 
 
-def find_objects(
-    source: str,
-    *,
-    work_dir: Path,
-    allowed_licences: Sequence[str],
-    licence: str | None = None,
-    downloaded: CountDone = lambda done, total: None,
-) -> Listing:
-    """List a source and download all its usable objects; raises as `list_objects`."""
-    listed = list_objects(
-        source, work_dir=work_dir, allowed_licences=allowed_licences, licence=licence
-    )
-    return listed.fetch_selected(downloaded=downloaded)
-
-
 def check_source(source: str, *, allowed_licences: Sequence[str], licence: str | None) -> None:
     """Check that a source exists and holds an object, before a dataset of it begins.
 

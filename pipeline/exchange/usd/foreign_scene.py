@@ -38,10 +38,9 @@ from pipeline.exchange.usd.layout import (
 from pipeline.foreign.numbers import read_number
 from pipeline.foreign.usd.materials import MeshMaterials
 from pipeline.foreign.usd.object_source import UsdStage, read_stage_materials
-from pipeline.foreign.usd.placed import DOMES, PlacedPrim, placed_prims
+from pipeline.foreign.usd.placed import DOMES, SOLIDS, PlacedPrim, placed_prims
 from pipeline.foreign.usd.polygons import CutMesh, as_array, cut_mesh
 from pipeline.foreign.usd.shaders import StatedMaterial, read_material
-from pipeline.foreign.usd.solids import SOLIDS
 from pipeline.foreign.usd.stage import OpenedStage
 from pipeline.scenes.shading_normals import smooth_shaded
 from storage.errors import TrilightError

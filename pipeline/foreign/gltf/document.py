@@ -85,7 +85,7 @@ class GltfDocument:
         Raises:
             Rejected: cut_off, unsupported_accessor, load_error.
         """
-        accessor = self._accessor(index)
+        accessor = entry(self.tree, "accessors", index)
         elements = self._elements(index)
         if elements.shape[1] not in widths:
             raise Malformed(f"accessor {index} has {elements.shape[1]} components")
@@ -107,7 +107,7 @@ class GltfDocument:
 
     def count(self, index: Any) -> int:
         """Return the number of values of an accessor."""
-        return read_count(self._accessor(index), "count")
+        return read_count(entry(self.tree, "accessors", index), "count")
 
     def instances(self, placed: PlacedNode) -> NDArray[np.float64]:
         """Return the matrices [N, 4, 4] of all instances of a node's mesh."""
@@ -133,12 +133,9 @@ class GltfDocument:
         uri = image["uri"]
         return data_uri_bytes(uri) if is_data_uri(uri) else self.pictures.require(uri)
 
-    def _accessor(self, index: Any) -> dict[str, Any]:
-        return entry(self.tree, "accessors", index)
-
     def _elements(self, index: Any) -> NDArray:
         """Return the stored values [N, K] of an accessor; zeros without a buffer view."""
-        accessor = self._accessor(index)
+        accessor = entry(self.tree, "accessors", index)
         code = accessor["componentType"]
         kind = accessor["type"]
         count = read_count(accessor, "count")

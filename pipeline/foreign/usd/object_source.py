@@ -12,7 +12,7 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property, partial
 from pathlib import Path
-from typing import Any, TypeVar
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -20,15 +20,13 @@ from numpy.typing import NDArray
 from pipeline.foreign.limits import ReadLimits
 from pipeline.foreign.material_files import MaterialFiles
 from pipeline.foreign.mesh import TriangleMesh, join_meshes
-from pipeline.foreign.usd.placed import PlacedPrim, UnposedMesh, placed_prims
+from pipeline.foreign.usd.placed import SOLIDS, PlacedPrim, UnposedMesh, placed_prims
 from pipeline.foreign.usd.polygons import CutMesh, cut_mesh
 from pipeline.foreign.usd.shaders import StatedMaterial, read_bindings, read_material
-from pipeline.foreign.usd.solids import SOLIDS
-from pipeline.foreign.usd.stage import OpenedStage, OutsideFile, read_quietly
+from pipeline.foreign.usd.stage import OpenedStage, OutsideFile, Read, read_quietly
 from pipeline.foreign.usd.texture_nodes import TextureNode, asset_bytes
 from storage.errors import Rejected, TrilightError
 
-Read = TypeVar("Read")
 ReadMaterial = Callable[[Any], StatedMaterial | None]
 
 _LOST = {

@@ -62,7 +62,7 @@ _OTHER_LANGUAGES: Mapping[str, str] = {
 """The same in German, French, Spanish, Italian, Portuguese, Polish, Dutch, Russian, Chinese and
 Japanese, without accents."""
 
-_PACKED: Mapping[str, Mapping[str, int]] = {
+PACKED: Mapping[str, Mapping[str, int]] = {
     "orm": {"roughness": 1, "metallic": 2},
     "rma": {"roughness": 0, "metallic": 1},
     "mra": {"metallic": 0, "roughness": 1},
@@ -73,7 +73,7 @@ _PACKED: Mapping[str, Mapping[str, int]] = {
 TEXTURE_PARTS = ("base", "specular", "roughness", "metallic")
 """Components of a texture that are read."""
 
-_READ = (*TEXTURE_PARTS, "gloss", *_PACKED)
+_READ = (*TEXTURE_PARTS, "gloss", *PACKED)
 
 _LETTERS = {"b": "base", "c": "base", "d": "base", "n": "normal", "r": "roughness", "h": "height"}
 _UNCLEAR = ("a", "e", "g", "m", "o", "s")
@@ -134,11 +134,6 @@ class _ParsedName:
     part: str
     kind: str = ""
     """Color variant of the set that the file is, or belongs to."""
-
-
-def packed_channels(part: str) -> Mapping[str, int]:
-    """Return the channels of a packed picture by component; empty for other components."""
-    return _PACKED.get(part, {})
 
 
 def group_textures(
@@ -286,8 +281,8 @@ def _add_letters(stems: Mapping[str, str], named: dict[str, _ParsedName]) -> Non
 def _drop_packed(parts: Iterable[dict[str, str]], unused: dict[str, tuple[str, str]]) -> None:
     """Leave out packed pictures whose components exist as separate pictures."""
     for files in parts:
-        for part in [part for part in files if part in _PACKED]:
-            if all(other in files for other in _PACKED[part]):
+        for part in [part for part in files if part in PACKED]:
+            if all(other in files for other in PACKED[part]):
                 message = "its channels are here as pictures of their own"
                 unused[files.pop(part)] = ("map_not_used", message)
         if "roughness" in files and "gloss" in files:

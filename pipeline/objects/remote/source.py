@@ -49,7 +49,6 @@ _MAX_DEPTH = 32
 """Maximum depth of folders: a server may answer every address with the same page."""
 MAX_BYTES = 200_000_000
 """Largest downloaded object with its buffers, in bytes: the limit of the mesh stage."""
-THREADS = 8
 
 
 class RemoteFolder:
@@ -389,12 +388,12 @@ def _list_object_files(folder: RemoteFolder, licence: str | None) -> Listing:
 
 
 def _fetch(folder: RemoteFolder, records: list[ObjectRecord], downloaded: CountDone) -> Fetched:
-    def fetch(record: ObjectRecord) -> ObjectRecord:
+    def fetch(record: ObjectRecord) -> Path:
         name = folder.name_of(record)
         try:
-            return dataclasses.replace(record, path=str(folder.fetch_object(name)))
+            return folder.fetch_object(name)
         except TransferFailed as error:
             message = f"{folder.display_url(name)}: {error.message}"
             raise TransferFailed(error.reason, message) from error
 
-    return fetch_all(records, fetch, downloaded, threads=THREADS, stop=folder.stop)
+    return fetch_all(records, fetch, downloaded, folder.stop)

@@ -4,8 +4,8 @@ from pathlib import Path
 from typing import Any
 
 from pipeline.objects.licences import DEFAULT_ALLOWED
-from pipeline.objects.listing import Listing
-from pipeline.objects.sources import find_objects
+from pipeline.objects.listing import CountDone, Listing
+from pipeline.objects.sources import list_objects
 
 
 def touch(folder: Path, *names: str) -> None:
@@ -15,9 +15,13 @@ def touch(folder: Path, *names: str) -> None:
         path.write_text("v 0 0 0")
 
 
-def find(source: Path | str, **options: Any) -> Listing:
+def find(
+    source: Path | str,
+    downloaded: CountDone = lambda done, total: None,
+    **options: Any,
+) -> Listing:
     options = {"allowed_licences": DEFAULT_ALLOWED, "work_dir": Path("unused"), **options}
-    return find_objects(str(source), **options)
+    return list_objects(str(source), **options).fetch_selected(downloaded=downloaded)
 
 
 def reasons(found: Listing) -> dict[str, str]:
