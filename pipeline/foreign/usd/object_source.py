@@ -8,7 +8,8 @@ refused: a missing reference, surfaces other than polygons, bones without a pose
 
 import dataclasses
 import hashlib
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import contextmanager
 from dataclasses import dataclass
 from functools import cached_property, partial
 from pathlib import Path
@@ -23,7 +24,7 @@ from pipeline.foreign.mesh import TriangleMesh, join_meshes
 from pipeline.foreign.usd.placed import SOLIDS, PlacedPrim, UnposedMesh, placed_prims
 from pipeline.foreign.usd.polygons import CutMesh, cut_mesh
 from pipeline.foreign.usd.shaders import StatedMaterial, read_bindings, read_material
-from pipeline.foreign.usd.stage import OpenedStage, OutsideFile, Read, read_quietly
+from pipeline.foreign.usd.stage import OpenedStage, OutsideFile, read_quietly
 from pipeline.foreign.usd.texture_nodes import TextureNode, asset_bytes
 from storage.errors import Rejected, TrilightError
 
@@ -207,16 +208,16 @@ class UsdSource:
         """
         self._path = path
         self._limits = limits
-        self.stage = read_or_reject(path, lambda: _read_stage(path, limits))
+        with _reject_errors(path):
+            self.stage = _read_stage(path, limits)
         self._digest, bytes_left = _digest_files(self.stage.opened.files, limits.max_bytes)
         missing = Rejected("no_materials", "materials were not asked for")
         self._materials: StageMaterials | Rejected = missing
         if limits.with_materials:
             read = partial(_read_strictly, self.stage, normals=limits.with_normal_maps)
             try:
-                self._materials = read_or_reject(
-                    path, lambda: read_stage_materials(self.stage, bytes_left, read)
-                )
+                with _reject_errors(path):
+                    self._materials = read_stage_materials(self.stage, bytes_left, read)
             except Rejected as why:
                 self._materials = Rejected(why.reason, why.message)  # its traceback holds the stage
 
@@ -230,15 +231,11 @@ class UsdSource:
                 digest.update(pictures[place])
         return digest.hexdigest()
 
-    @property
-    def unread(self) -> tuple[str, ...]:
-        """Return sentences on contents of the file that are not read, each once."""
-        return self.stage.opened.notes
-
     @cached_property
     def meshes(self) -> Mapping[int, CutMesh]:
         """Return the meshes; raises Rejected as `cut_meshes`, or load_error."""
-        return read_or_reject(self._path, lambda: cut_meshes(self.stage, self._limits))
+        with _reject_errors(self._path):
+            return cut_meshes(self.stage, self._limits)
 
     @cached_property
     def mesh(self) -> TriangleMesh:
@@ -269,14 +266,16 @@ def _digest_files(files: Sequence[Path], bytes_left: int) -> "tuple[hashlib._Has
     return digest, bytes_left
 
 
-def read_or_reject(path: Path, read: Callable[[], Read]) -> Read:
-    """Return the result of `read` for a USD file; its errors become reasons of Rejected.
+@contextmanager
+def _reject_errors(path: Path) -> Iterator[None]:
+    """Turn the errors of reading a USD file into Rejected.
 
     Raises:
-        Rejected: external_uri, skinned_mesh, load_error, or as `read`.
+        Rejected: external_uri, skinned_mesh, load_error, or as the block.
     """
     try:
-        return read_quietly(path, read)
+        with read_quietly(path):
+            yield
     except TrilightError as error:
         reasons = {OutsideFile: "external_uri", UnposedMesh: "skinned_mesh"}
         raise Rejected(reasons.get(type(error), "load_error"), f"{error!s:.300}") from error

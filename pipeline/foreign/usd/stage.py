@@ -21,9 +21,10 @@ import re
 import time
 import zipfile
 from collections import Counter
-from collections.abc import Callable, Sequence
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
 from pathlib import Path
-from typing import Any, NoReturn, TypeVar
+from typing import Any, NoReturn
 
 from pipeline.foreign.numbers import Malformed
 from storage.errors import TrilightError
@@ -278,20 +279,18 @@ def _check_package(path: Path, size: int) -> None:
             raise TrilightError(f"{path.name}: member {member.filename!r:.80} leads outside.")
 
 
-Read = TypeVar("Read")
-
-
-def read_quietly(path: Path, read: Callable[[], Read]) -> Read:
-    """Return the result of `read` for a file, without USD's own warnings on standard error.
+@contextmanager
+def read_quietly(path: Path) -> Iterator[None]:
+    """Keep USD's own warnings on a file from standard error, and turn its errors into ours.
 
     Raises:
-        TrilightError: as `read`, or the file is broken or has a value of a wrong type.
+        TrilightError: as the block, or the file is broken or has a value of a wrong type.
     """
     from pxr import Tf, UsdUtils
 
     delegate = UsdUtils.CoalescingDiagnosticDelegate()
     try:
-        return read()
+        yield
     except Malformed as error:
         raise Malformed(f"{path.name}: {str(error).removeprefix(f'{path.name}: ')}.") from error
     except TrilightError:

@@ -117,7 +117,8 @@ def _with_files(kind: str, root: Path, records: Sequence[ObjectRecord]) -> list[
         if folder.is_dir():
             inner = folder.relative_to(root)
             names = [(inner / name).as_posix() for name in os.listdir(folder)]
-            for files in group_textures(_pictures(names))[0].values():
+            pictures = [n for n in names if n.lower().endswith(PICTURES) and not _is_hidden(n)]
+            for files in group_textures(pictures)[0].values():
                 textures[files["base"]] = files
     maps = []
     for row in records:
@@ -168,10 +169,6 @@ def _scan_pictures(
             title = printable(stem).rpartition("/")[2]
             records[uid] = file_record(uid, {**stated, "path": str(root / name), "title": title})
     return list(records.values())
-
-
-def _pictures(names: Sequence[str]) -> list[str]:
-    return [n for n in names if n.lower().endswith(PICTURES) and not _is_hidden(n)]
 
 
 def _is_hidden(name: str) -> bool:
