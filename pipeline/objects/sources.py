@@ -97,12 +97,6 @@ SOURCES: Registry[ObjectSource] = Registry(
 """Object sources by the word before the colon."""
 
 
-def source_of(text: str) -> ObjectSource:
-    """Return the source of the word before the colon, or else the folder source."""
-    name, colon, _ = text.partition(":")
-    return SOURCES.get(name, FOLDER_SOURCE) if colon else FOLDER_SOURCE
-
-
 ENVIRONMENT = "env:"
 """Prefix of a source that stands in an environment variable, for URLs with a secret."""
 VARIABLES = "TRILIGHT_SOURCE_"
@@ -283,9 +277,10 @@ def _choose_source(
     """Return a source with its query; raises TrilightError for licences that cannot be."""
     check_allowed(allowed_licences)
     stated_licence(licence)
-    kind = source_of(source)
+    name, colon, _ = source.partition(":")
+    kind = SOURCES.get(name, FOLDER_SOURCE) if colon else FOLDER_SOURCE
     if kind.states_licences:
-        require_unstated(licence, f"{source.partition(':')[0]}:")
+        require_unstated(licence, f"{name}:")
     return kind, SourceQuery(
         source=source, work_dir=work_dir, licence=licence, allowed_licences=allowed_licences
     )

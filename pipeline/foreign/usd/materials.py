@@ -58,7 +58,7 @@ def usd_textured_mesh(source: UsdSource, decode: Decode, *, emission: bool = Fal
             picture.
     """
     time = source.stage.time
-    looks = MeshMaterials(source.materials(), decode, time, emission=emission)
+    looks = MeshMaterials(source.materials, decode, time, emission=emission)
     if len(looks.primvars) > MOST_UV_SETS:
         count = len(looks.primvars)
         raise Rejected("no_texture_coordinates", f"textures lie on {count} sets of them")
