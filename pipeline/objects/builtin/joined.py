@@ -105,11 +105,10 @@ def _legs(params: _Furniture) -> list[Mesh]:
     y = params.depth / 2 - inset
     if params.kind == "round":
         x = y = 0.62 * params.width / 2
-    feet = [(-x, -y), (x, -y), (x, y), (-x, y)]
-    out = np.sign(np.array(feet)) * params.splay
+    feet = np.array([(-x, -y), (x, -y), (x, y), (-x, y)])
     high = params.height - 0.5 * params.board
-    tops = [np.array([*foot, high]) for foot in feet]
-    ends = [np.array([*(np.array(foot) + add), 0.0]) for foot, add in zip(feet, out, strict=True)]
+    tops = np.column_stack([feet, np.full(4, high)])
+    ends = np.column_stack([feet + np.sign(feet) * params.splay, np.zeros(4)])
     parts = [_leg(top, end, params) for top, end in zip(tops, ends, strict=True)]
     levels = [(params.height - params.board - 0.03, 0.01, 0.035)]
     if params.stretchers:

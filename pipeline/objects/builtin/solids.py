@@ -21,19 +21,10 @@ def torus_faces(rows: int, columns: int) -> NDArray[np.int64]:
 
     The faces point to the side from which rows run upwards and columns to the left.
     """
-    row, column = np.divmod(np.arange(rows * columns), columns)
-    next_row = (row + 1) % rows
-    next_column = (column + 1) % columns
-    corners = np.stack(
-        [
-            row * columns + column,
-            next_row * columns + column,
-            next_row * columns + next_column,
-            row * columns + next_column,
-        ],
-        axis=1,
-    )
-    return corners[:, [0, 1, 2, 0, 2, 3]].reshape(-1, 3)
+    grid = np.arange(rows * columns).reshape(rows, columns)
+    above = np.roll(grid, -1, axis=0)
+    corners = [grid, above, np.roll(above, -1, axis=1), np.roll(grid, -1, axis=1)]
+    return np.stack(corners, axis=-1)[..., [0, 1, 2, 0, 2, 3]].reshape(-1, 3)
 
 
 def sphere_faces(rings: int, columns: int) -> NDArray[np.int64]:
@@ -44,13 +35,12 @@ def sphere_faces(rings: int, columns: int) -> NDArray[np.int64]:
     from above.
     """
     body = torus_faces(rings, columns)[: 2 * (rings - 1) * columns]
-    column = np.arange(columns)
-    next_column = (column + 1) % columns
+    ring = np.arange(columns)
+    shifted = np.roll(ring, -1)
     first = rings * columns
-    last = rings * columns + 1
-    start = (rings - 1) * columns
-    bottom = np.stack([np.full(columns, first), column, next_column], axis=1)
-    top = np.stack([np.full(columns, last), start + next_column, start + column], axis=1)
+    start = first - columns
+    bottom = np.stack([np.full(columns, first), ring, shifted], axis=1)
+    top = np.stack([np.full(columns, first + 1), start + shifted, start + ring], axis=1)
     return np.concatenate([bottom, body, top])[:, ::-1]
 
 
@@ -59,10 +49,9 @@ def sheet_faces(rows: int, columns: int) -> NDArray[np.int64]:
 
     The faces point to the side from which rows run upwards and columns to the right.
     """
-    row, column = np.divmod(np.arange((rows - 1) * (columns - 1)), columns - 1)
-    start = row * columns + column
-    corners = np.stack([start, start + 1, start + columns + 1, start + columns], axis=1)
-    return corners[:, [0, 1, 2, 0, 2, 3]].reshape(-1, 3)
+    grid = np.arange(rows * columns).reshape(rows, columns)
+    corners = [grid[:-1, :-1], grid[:-1, 1:], grid[1:, 1:], grid[1:, :-1]]
+    return np.stack(corners, axis=-1)[..., [0, 1, 2, 0, 2, 3]].reshape(-1, 3)
 
 
 def join(parts: Sequence[Mesh]) -> Mesh:

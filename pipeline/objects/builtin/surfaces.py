@@ -475,12 +475,8 @@ def _surface(solid: NDArray[np.bool_]) -> tuple[NDArray[np.int64], NDArray[np.in
             # A cell begins where occupancy rises: its face looks down the axis.
             base = np.argwhere(change == sign)
             base[:, [b, c]] -= 1
-            steps = [np.zeros(3, np.int64) for _ in range(4)]
-            for number in (1, 2):
-                steps[number][c if sign > 0 else b] = 1
-            for number in (2, 3):
-                steps[number][b if sign > 0 else c] = 1
-            corners = base[:, None] + np.array(steps)[None]
+            first, second = np.eye(3, dtype=np.int64)[[c, b] if sign > 0 else [b, c]]
+            corners = base[:, None] + np.stack([0 * first, first, first + second, second])
             quads.append(np.ravel_multi_index(tuple(np.moveaxis(corners, -1, 0)), shape))
     used, flat = np.unique(np.concatenate(quads), return_inverse=True)
     points = np.stack(np.unravel_index(used, shape), axis=1)
