@@ -265,12 +265,9 @@ def _crop_to_window(
         return plane
     right = at[0] - x_min
     down = at[1] - y_min
-    rows = slice(max(0, down), min(height, down + at[3]))
-    columns = slice(max(0, right), min(width, right + at[2]))
+    inside = plane[max(-down, 0) : max(height - down, 0), max(-right, 0) : max(width - right, 0)]
     result = np.zeros((height, width), np.float32)
-    if rows.start < rows.stop and columns.start < columns.stop:
-        inside = plane[rows.start - down : rows.stop - down]
-        result[rows, columns] = inside[:, columns.start - right : columns.stop - right]
+    result[max(down, 0) :, max(right, 0) :][: inside.shape[0], : inside.shape[1]] = inside
     return result
 
 

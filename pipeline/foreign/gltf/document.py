@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 
 from pipeline.foreign.gltf.nodes import (
     INSTANCING,
+    TRS,
     PlacedNode,
     check_tree,
     entry,
@@ -115,15 +116,11 @@ class GltfDocument:
         if not attributes:
             return placed.to_world[None]
         count = self.count(next(iter(attributes.values())))
-        components = [
-            np.tile(row, (count, 1)) for row in ([0.0] * 3, [0.0, 0.0, 0.0, 1.0], [1.0] * 3)
-        ]
-        for row, name in enumerate(("TRANSLATION", "ROTATION", "SCALE")):
-            if name in attributes:
-                width = components[row].shape[1]
-                components[row] = self.values(
-                    attributes[name], (width,), slice(None), is_unit=name == "ROTATION" or None
-                )
+        components = [np.tile(np.array(default, np.float64), (count, 1)) for _, default in TRS]
+        for row, (name, default) in enumerate(TRS):
+            if (number := attributes.get(name.upper())) is not None:
+                is_unit = name == "rotation" or None
+                components[row] = self.values(number, (len(default),), slice(None), is_unit=is_unit)
         return np.einsum("ij,njk->nik", placed.to_world, transforms(*components))
 
     def picture_bytes(self, image: Mapping[str, Any]) -> bytes:

@@ -20,7 +20,7 @@ too many or they take too long. A composed prim holds at most 32,767 sites, whic
 import re
 import time
 import zipfile
-from collections import Counter
+from collections import defaultdict
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
@@ -94,16 +94,13 @@ class OpenedStage:
     @property
     def notes(self) -> tuple[str, ...]:
         """Return notes on unread contents, each kind once with the path of its first one."""
-        kinds = Counter[tuple[str, str]]()
-        first = dict[tuple[str, str], str]()
+        kinds: dict[tuple[str, str], list[str]] = defaultdict(list)
         for note in dict.fromkeys(self.lost):
             where, _, text = note.partition(": ")
-            kind = (where.partition(".")[2] if where.startswith("/") else where, text)
-            kinds[kind] += 1
-            first.setdefault(kind, note)
+            kinds[where.partition(".")[2] if where.startswith("/") else where, text].append(note)
         notes = [
-            first[kind] if count == 1 else f"{first[kind]} ({count} such)"
-            for kind, count in kinds.items()
+            first if not others else f"{first} ({1 + len(others)} such)"
+            for first, *others in kinds.values()
         ]
         more = len(notes) - MAX_NOTES
         return tuple(notes if more <= 0 else [*notes[:MAX_NOTES], f"and {more} more"])

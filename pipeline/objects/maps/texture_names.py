@@ -261,21 +261,20 @@ def _without_accents(name: str) -> str:
 
 def _add_letters(stems: Mapping[str, str], named: dict[str, _ParsedName]) -> None:
     """Add files whose names end in a letter, where their set or a color explains it."""
-    letters: dict[str, dict[str, tuple[str, str]]] = defaultdict(dict)
+    letters: dict[str, dict[str, str]] = defaultdict(dict)
     for name, stem in stems.items():
         match = _LETTER.fullmatch(stem) if name not in named else None
         if match is not None:
-            key = f"{match['set']}{match['tail']}"
-            letters[key][name] = match["letter"].lower(), f"{match['set']}{match['tail']}"
+            letters[f"{match['set']}{match['tail']}"][name] = match["letter"].lower()
     parsed_keys = {entry.key for entry in named.values()}
     bare = {stem for name, stem in stems.items() if name not in named}
     for key, files in letters.items():
-        said = {letter for letter, _ in files.values()}
+        said = {*files.values()}
         is_set = said <= {*_LETTERS, *_UNCLEAR} and len(said & {"b", "c", "d"}) == 1
         beside_color = key in bare and said <= {"n", "s", "r", "h", "e"}
         if beside_color or (is_set and ("n" in said or key in parsed_keys)):
-            for name, (letter, stem) in files.items():
-                named[name] = _ParsedName(key, stem, _LETTERS.get(letter, "other"))
+            for name, letter in files.items():
+                named[name] = _ParsedName(key, key, _LETTERS.get(letter, "other"))
 
 
 def _drop_packed(parts: Iterable[dict[str, str]], unused: dict[str, tuple[str, str]]) -> None:
