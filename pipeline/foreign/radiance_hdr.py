@@ -111,13 +111,10 @@ def _decode_texels(data: bytes, start: int, rows: int, columns: int) -> NDArray[
     at = start
     mark = bytes([2, 2, columns >> 8 & 255, columns & 255])
     for row in range(rows):
-        if _SHORTEST <= columns <= _LONGEST and data[at : at + 4] == mark:
+        head = data[at : at + 4] if _SHORTEST <= columns <= _LONGEST else b""
+        if head == mark:
             at = _decode_runs(data, at + 4, texels[row])
-        elif (
-            _SHORTEST <= columns <= _LONGEST
-            and data[at : at + 2] == mark[:2]
-            and data[at + 2 : at + 3] < b"\x80"
-        ):
+        elif head[:2] == mark[:2] and head[2:3] < b"\x80":
             raise _damage_error(f"row {row} is cut off or of another width")
         else:
             at = _decode_old_runs(data, at, texels[row])
