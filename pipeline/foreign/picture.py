@@ -218,14 +218,12 @@ class Picture:
         return values
 
     def _sample_level(self, uv: NDArray[np.float64], texels: NDArray) -> NDArray[np.float32]:
-        (left, right, along), (below, above, across) = (
+        (x0, x1, along), (y0, y1, across) = (
             _find_texels(uv[:, axis], texels.shape[1 - axis], self.wrap[axis], self.is_nearest)
             for axis in (0, 1)
         )
-        low = (1 - along) * self.linear(texels[below, left])
-        low = low + along * self.linear(texels[below, right])
-        high = (1 - along) * self.linear(texels[above, left])
-        high = high + along * self.linear(texels[above, right])
+        low = (1 - along) * self.linear(texels[y0, x0]) + along * self.linear(texels[y0, x1])
+        high = (1 - along) * self.linear(texels[y1, x0]) + along * self.linear(texels[y1, x1])
         values: NDArray[np.float32] = ((1 - across) * low + across * high).astype(np.float32)
         is_black = [wrap == "black" for wrap in self.wrap]
         values[(((uv < 0) | (uv > 1)) & is_black).any(axis=1)] = 0

@@ -112,8 +112,8 @@ def warn_unread_formats(names: Sequence[str], objects: Sequence[str]) -> None:
     """Warn of archives and files of other formats that have no object file of the same name."""
     stems = {_stem(name) for name in objects}
     stems |= {stem for name in names if (stem := _stem(name)).startswith(".")}  # hidden
-    others = [name for name in names if name.rpartition(".")[2].lower() in _UNREAD]
-    unread = sorted(name for name in others if _stem(name) not in stems)
+    candidates = [name for name in names if name.rpartition(".")[2].lower() in _UNREAD]
+    unread = sorted(name for name in candidates if _stem(name) not in stems)
     if unread:
         example = _name_first(unread)
         warn_once(f"left out as formats that are not read: {example}; convert or unpack them")

@@ -99,8 +99,8 @@ class OpenedStage:
             where, _, text = note.partition(": ")
             kinds[where.partition(".")[2] if where.startswith("/") else where, text].append(note)
         notes = [
-            first if not others else f"{first} ({1 + len(others)} such)"
-            for first, *others in kinds.values()
+            alike[0] if len(alike) == 1 else f"{alike[0]} ({len(alike)} such)"
+            for alike in kinds.values()
         ]
         more = len(notes) - MAX_NOTES
         return tuple(notes if more <= 0 else [*notes[:MAX_NOTES], f"and {more} more"])

@@ -4,7 +4,7 @@ from pathlib import Path
 from typing import Any
 
 from pipeline.objects.licences import DEFAULT_ALLOWED
-from pipeline.objects.listing import CountDone, Listing
+from pipeline.objects.listing import Listing
 from pipeline.objects.sources import list_objects
 
 
@@ -15,13 +15,10 @@ def touch(folder: Path, *names: str) -> None:
         path.write_text("v 0 0 0")
 
 
-def find(
-    source: Path | str,
-    downloaded: CountDone = lambda done, total: None,
-    **options: Any,
-) -> Listing:
+def find(source: Path | str, **options: Any) -> Listing:
     options = {"allowed_licences": DEFAULT_ALLOWED, "work_dir": Path("unused"), **options}
-    return list_objects(str(source), **options).fetch_selected(downloaded=downloaded)
+    selection = {name: options.pop(name) for name in {*options} & {"downloaded"}}
+    return list_objects(str(source), **options).fetch_selected(**selection)
 
 
 def reasons(found: Listing) -> dict[str, str]:
