@@ -17,7 +17,7 @@ REC709 = (0.64, 0.33, 0.30, 0.60, 0.15, 0.06, 0.3127, 0.3290)
 _BRADFORD = np.array(
     [[0.8951, 0.2664, -0.1614], [-0.7502, 1.7135, 0.0367], [0.0389, -0.0685, 1.0296]]
 )
-_SAME = 1e-3
+SAME = 1e-3
 """Primaries that differ by less count as equal: files round them to three or four digits."""
 
 
@@ -37,11 +37,6 @@ def require_pixels(width: int, height: int, most: int) -> None:
         raise Rejected(
             "too_many_pixels", f"{width} x {height}; expected at most {most} pixels: scale it down"
         )
-
-
-def are_rec709(primaries: Sequence[float]) -> bool:
-    """Return whether primaries [8] are those of Rec.709 within rounding."""
-    return bool(np.allclose(primaries, REC709, rtol=0, atol=_SAME))
 
 
 def luminance_weights(primaries: Sequence[float]) -> NDArray[np.float64]:
@@ -67,11 +62,14 @@ def rec709_from(primaries: Sequence[float]) -> NDArray[np.float64]:
 def as_rec709(rgb: NDArray[np.float32], primaries: Sequence[float]) -> NDArray[np.float32]:
     """Return colors [H, W, 3] in Rec.709, negative channels of colors outside of its gamut as 0.
 
-    Colors with a negative channel before the conversion keep theirs.
+    Colors with a negative channel before the conversion keep theirs. Primaries that are those of
+    Rec.709 within rounding change no color.
 
     Raises:
         Rejected: as `rec709_from`.
     """
+    if np.allclose(primaries, REC709, rtol=0, atol=SAME):
+        return rgb
     matrix = rec709_from(primaries).astype(np.float32)
     converted: NDArray[np.float32] = rgb @ matrix.T
     return np.where((rgb >= 0).all(axis=-1, keepdims=True), np.maximum(converted, 0), converted)

@@ -152,31 +152,27 @@ class _Reader:
         self._values: dict[str, NDArray] = {}
 
     def material(self, fields: Fields) -> SourceMaterial:
-        lost = _list_unsupported(fields)
         base = self._slot(fields.get("map_kd"), is_srgb=True)
         base_rgb = WHITE if base is not None and "kd" not in fields else _rgb(fields, "kd", 0.8)
+        plain = SourceMaterial(base_rgb=base_rgb, base=base, lost=_list_unsupported(fields))
         if _PHYSICAL & set(fields):
             metallic, roughness = (self._slot(fields.get(name)) for name in ("map_pm", "map_pr"))
-            return SourceMaterial(
-                base_rgb=base_rgb,
-                base=base,
+            return dataclasses.replace(
+                plain,
                 metallic=_number(fields, "pm", 0.0 if metallic is None else 1.0),
                 metallic_map=metallic,
                 roughness=_number(fields, "pr", 0.5 if roughness is None else 1.0),
                 roughness_map=roughness,
-                lost=lost,
             )
         shiny = _number(fields, "illum", 2.0) not in (0, 1)
         smooth = np.sqrt(np.clip(_number(fields, "ns", 250.0), 0, _MOST_NS) / _MOST_NS)
-        return SourceMaterial(
-            base_rgb=base_rgb,
-            base=base,
+        return dataclasses.replace(
+            plain,
             roughness=float(1 - smooth),
             f0=_F0_OF_KS,
             specular_rgb=_rgb(fields, "ks", 0.5),
             specular_colour=self._slot(fields.get("map_ks"), is_srgb=True),
             specular_strength=float(shiny),
-            lost=lost,
         )
 
     def add_emission(self, material: SourceMaterial, fields: Fields) -> SourceMaterial:

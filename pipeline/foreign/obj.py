@@ -1,6 +1,5 @@
 """Reader of OBJ meshes: a statement a line; indices count from 1, or back from their line."""
 
-import io
 import re
 from collections import Counter
 from collections.abc import Sequence
@@ -11,7 +10,9 @@ from numpy.typing import NDArray
 from pipeline.foreign.mesh import FileMesh, TriangleMesh, decode_colors
 from pipeline.foreign.polygons import check_indices, sort_by_size, triangulate
 from pipeline.foreign.text import (
+    IS_WORD,
     decode_name,
+    find_lines,
     find_words,
     join_continued,
     list_some,
@@ -21,10 +22,10 @@ from pipeline.foreign.text import (
 )
 from storage.errors import Rejected
 
-_KINDS = {b"v": "v", b"vt": "vt", b"vn": "vn", b"f": "f", b"fo": "f"}
+_KEYS = {"v": [b"v"], "vt": [b"vt"], "vn": [b"vn"], "f": [b"f", b"fo"]}
+"""Key words of the statements that are read here."""
 _SILENT = {b"g", b"o", b"s", b"mtllib"}
 """Statements that are read elsewhere, or that only group faces and smooth their normals."""
-_COMMENT = re.compile(rb"\s#.*")
 _END = b"\0\x1a"
 """Bytes that old programs write at the end of a text."""
 _MOST_LIBRARIES = 1000
@@ -95,58 +96,60 @@ class _Statements:
     """The statements of a text by their key words, which may be written in any case."""
 
     def __init__(self, text: bytes) -> None:
-        self._rows: dict[str, list[bytes]] = {kind: [] for kind in ("v", "vt", "vn", "f")}
-        self._before: list[int] = []  # three numbers of each face, flat since tuples cost a third
-        self._materials: list[int] = []  # of each face, or -1
-        self._names: dict[str, int] = {}
+        is_cut = not text.endswith(b"\n")
+        text = text.rstrip(_END).lstrip() + b"\n#\n "  # at least one line
+        words, first, self._num_words = find_lines(text)
+        self._last = len(first) - 2 if is_cut else -1  # the line without a line break
+        self._start = start = np.append(words[first], len(text))
+        self._codes = np.frombuffer(bytearray(text), np.uint8)
+        hashes = np.flatnonzero(self._codes[words] == ord("#"))
+        lines, nearest = np.unique(np.searchsorted(first, hashes, "right") - 1, return_index=True)
+        for line, comment in zip(lines, hashes[nearest], strict=True):
+            self._codes[words[comment] : start[line + 1]] = ord(" ")
+            self._num_words[line] = comment - first[line]
+        at = start[:-1, None] + np.arange(3)
+        is_key = np.logical_and.accumulate(IS_WORD[self._codes[at]], axis=1)
+        keys = np.where(is_key, self._codes[at] | 32, 0).view("S3")[:, 0]  # in lower case
+        self._lines = {kind: np.flatnonzero(np.isin(keys, forms)) for kind, forms in _KEYS.items()}
+        known = np.concatenate(list(self._lines.values()))
+        self._codes[at[known][is_key[known]]] = ord(" ")
         self.unread = Counter[str]()
-        self._open = ""  # kind of the last statement of a text without a last line break
-        vertices, coordinates, normals, _ = self._rows.values()
-        material = -1
-        kind: str | None = None
-        for line in io.BytesIO(text.rstrip(_END)):
-            words = line.split(None, 1)
-            if not words:
-                continue
-            kind = _KINDS.get(words[0].lower())
-            if kind is None:
-                material = self._read_other(words, material)
-                continue
-            rest = words[1] if len(words) > 1 else b""
-            self._rows[kind].append(_COMMENT.sub(b"", b" " + rest) if b"#" in rest else rest)
-            if kind == "f":
-                self._before += len(vertices), len(coordinates), len(normals)
-                self._materials.append(material)
-        if kind is not None and not text.endswith(b"\n"):
-            self._open = kind
-
-    def _read_other(self, words: Sequence[bytes], material: int) -> int:
-        """Count an unread statement, and return the material of the faces that follow."""
-        key = words[0].lower()
-        if key == b"usemtl":
-            name = unquote_name(decode_name(b"".join(words[1:])))
-            return self._names.setdefault(name, len(self._names)) if name else -1
-        if not key.startswith(b"#") and key not in _SILENT:
-            self.unread[f"statement {words[0].decode('latin-1')[:24]!r}"] += 1
-        return material
+        self._names: dict[str, int] = {}
+        self._materials = {-1: -1}  # of the faces after a line, or -1
+        for line in np.delete(np.arange(len(first)), known).tolist():
+            word, *rest = text[start[line] : start[line + 1]].split(None, 1)
+            key = word.lower()
+            if key == b"usemtl":
+                name = unquote_name(decode_name(b"".join(rest)))
+                row = self._names.setdefault(name, len(self._names)) if name else -1
+                self._materials[line] = row
+            elif not key.startswith(b"#") and key not in _SILENT:
+                self.unread[f"statement {word.decode('latin-1')[:24]!r}"] += 1
 
     def count_words(self, kind: str) -> NDArray[np.int64]:
         """Return the number of words [N] after the key word of each statement."""
-        return np.array([len(row.split()) for row in self._rows[kind]], np.int64)
+        return self._num_words[self._lines[kind]] - 1
+
+    def _join_rows(self, kind: str) -> bytes:
+        """Return the text of all statements of a kind without their key words."""
+        is_kind = np.isin(np.arange(len(self._num_words)), self._lines[kind])
+        mask = np.repeat(is_kind, np.diff(self._start))
+        return self._codes[: len(mask)][mask].tobytes()
 
     def read_rows(self, kind: str, least: int) -> tuple[NDArray[np.float64], NDArray[np.int64]]:
         """Return the numbers [N, W] of statements, padded with zeros, and their counts [N]."""
-        rows = self._rows[kind]
         counts = self.count_words(kind)
         if (is_short := counts < least).any():
             self.require_complete(kind, is_short, f"expected {least} numbers or more")
-            line = f"{kind} ".encode() + rows[int(is_short.argmax())].strip()
+            first = self._lines[kind][is_short.argmax()]
+            row = self._codes[self._start[first] : self._start[first + 1]].tobytes()
+            line = f"{kind} ".encode() + row.strip()
             raise Rejected("load_error", f"{line[:60]!r}: expected {least} numbers or more")
-        flat = parse_numbers(b" ".join(rows), int(counts.sum()), np.float64)
+        flat = parse_numbers(self._join_rows(kind), int(counts.sum()), np.float64)
         width = max(int(counts.max(initial=0)), max(least, 2))
-        if len(flat) == width * len(rows):
+        if len(flat) == width * len(counts):
             return flat.reshape(-1, width), counts
-        table = np.zeros((len(rows), min(width, 8)))
+        table = np.zeros((len(counts), min(width, 8)))
         start = np.cumsum(counts) - counts
         for column in range(table.shape[1]):
             has = counts > column
@@ -155,7 +158,7 @@ class _Statements:
 
     def require_complete(self, kind: str, is_short: NDArray[np.bool_], why: str) -> None:
         """Raise Rejected where the text ends within a statement of a kind, which is short."""
-        if self._open == kind and is_short[-1]:
+        if self._lines[kind][-1] == self._last and is_short[-1]:
             raise Rejected("cut_off", f"the file ends within a statement: {why}")
 
     def read_corners(self, counts: NDArray[np.int64]) -> NDArray[np.int64]:
@@ -163,7 +166,7 @@ class _Statements:
 
         `counts` has the number of corners of each face.
         """
-        text = re.sub(rb"/(?![-+0-9])", b"/0", b" ".join(self._rows["f"]))
+        text = re.sub(rb"/(?![-+0-9])", b"/0", self._join_rows("f"))
         words = find_words(text)
         if len(words) != counts.sum():
             raise Rejected("load_error", "a corner of a face is malformed")
@@ -174,18 +177,21 @@ class _Statements:
             raise Rejected("load_error", "a corner of a face has more than three indices")
         flat = parse_numbers(text.replace(b"/", b" "), int(num_indices.sum()), np.int64)
         start = np.cumsum(num_indices) - num_indices
-        before = np.repeat(np.reshape(self._before, (-1, 3)), counts, axis=0)
+        faces = self._lines["f"]
+        before = [np.searchsorted(self._lines[kind], faces) for kind in ("v", "vt", "vn")]
         corners = np.full((len(num_indices), 3), -1)
         for column in range(3):
             has = num_indices > column
             index = flat[start[has] + column]
-            from_end = np.where(index < 0, before[has, column] + index, -1)
+            from_end = np.where(index < 0, np.repeat(before[column], counts)[has] + index, -1)
             corners[has, column] = np.where(index > 0, index - 1, from_end)
         return corners
 
     def used_materials(self) -> tuple[NDArray[np.int64], tuple[str, ...]]:
         """Return the row [F] of each material among the used ones, or -1, and their names."""
-        used, flat = np.unique(np.array(self._materials), return_inverse=True)
+        before = np.searchsorted(list(self._materials), self._lines["f"]) - 1
+        material = np.array(list(self._materials.values()))[before]
+        used, flat = np.unique(material, return_inverse=True)
         names = list(self._names)
         return flat - int(used[0] < 0), tuple(names[row] for row in used if row >= 0)
 

@@ -47,7 +47,7 @@ class _Rows:
     """The rows of an OFF, one a line or separated by any white space, by their numbers."""
 
     def __init__(self, text: bytes, flags: bytes) -> None:
-        starts, widths = find_lines(text)
+        _, starts, widths = find_lines(text)
         self.numbers = numbers = parse_numbers(text, int(widths.sum()), np.float64)
         self.dims = dims = 3 + (b"4" in flags)
         """Coordinates of a vertex: 3, or 4 with a divisor."""

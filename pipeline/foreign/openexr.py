@@ -21,7 +21,6 @@ from numpy.typing import NDArray
 from pipeline.foreign.linear_picture import (
     REC709,
     LinearPicture,
-    are_rec709,
     as_rec709,
     luminance_weights,
     require_pixels,
@@ -70,6 +69,8 @@ class _Choice:
     """R, G and B; Y; or BY, RY and Y; A may follow."""
     names: tuple[str, ...]
     """Names of the channels in the file, one for each letter."""
+    layer: str
+    """Layer of the channels, else their view, else ""; the first view counts as none."""
 
 
 def read_openexr(data: bytes, max_pixels: int, *, is_color: bool) -> LinearPicture:
@@ -95,7 +96,7 @@ def read_openexr(data: bytes, max_pixels: int, *, is_color: bool) -> LinearPictu
     primaries = _read_primaries(header)
     if set(_CHROMA) <= set(choice.letters):
         values = _from_chroma(values, primaries)
-    if is_color and values.shape[-1] >= 3 and not are_rec709(primaries):
+    if is_color and values.shape[-1] >= 3:
         values[..., :3] = as_rec709(values[..., :3], primaries)
     return LinearPicture(values=values, unread=tuple(_list_unread(headers, choice)))
 
@@ -149,15 +150,19 @@ def _cut_off_error() -> Rejected:
 def _choose_channels(headers: Sequence[Mapping[str, Any]]) -> _Choice:
     """Return the channels of the picture, those without a layer or further view first."""
     choices = list(_list_choices(headers))
-    bare = [choice for choice in choices if _layer(headers, choice) == ""]
-    if bare:
+    if bare := [choice for choice in choices if not choice.layer]:
         return bare[0]
-    main = [choice for choice in choices if _is_main(headers, choice)]
+    main = [
+        choice
+        for choice in choices
+        if choice.layer.rpartition(".")[2].lower() in _MAIN_LAYERS
+        or choice.layer == (headers[choice.part].get("multiView") or [""])[0]
+    ]
     colors = [choice for choice in choices if choice.letters[0] != "Y"]
     for among in (main, colors, choices):
         if len(among) == 1:
             return among[0]
-    layers = _list_names(_layer(headers, choice) for choice in choices)
+    layers = _list_names(choice.layer for choice in choices)
     names = [str(channel.name) for header in headers for channel in header["channels"]]
     raise Rejected(
         "load_error",
@@ -170,6 +175,7 @@ def _choose_channels(headers: Sequence[Mapping[str, Any]]) -> _Choice:
 def _list_choices(headers: Sequence[Mapping[str, Any]]) -> Iterator[_Choice]:
     """Yield all candidates for the picture, colors before grays."""
     layers: dict[tuple[int, str], dict[str, str]] = defaultdict(dict)
+    first_view = next((header["view"] for header in headers if "view" in header), "")
     for part, header in enumerate(headers):
         for channel in header["channels"]:
             layer, _, letter = str(channel.name).rpartition(".")
@@ -184,21 +190,10 @@ def _list_choices(headers: Sequence[Mapping[str, Any]]) -> Iterator[_Choice]:
             if set(letters) <= set(names) and len(letters) == len(color_letters or _GREY):
                 alpha = ("A",) if "A" in names else ()
                 channel_names = tuple(names[letter] for letter in (*letters, *alpha))
-                yield _Choice(part, (*(color_letters or _GREY), *alpha), channel_names)
-
-
-def _layer(headers: Sequence[Mapping[str, Any]], choice: _Choice) -> str:
-    """Return the layer of channels, else their view, else ""."""
-    layer = choice.names[0].rpartition(".")[0]
-    header = headers[choice.part]
-    first_view = next((h["view"] for h in headers if "view" in h), "")
-    return layer or (header.get("view", "") if header.get("view") != first_view else "")
-
-
-def _is_main(headers: Sequence[Mapping[str, Any]], choice: _Choice) -> bool:
-    layer = _layer(headers, choice)
-    views = headers[choice.part].get("multiView") or [""]
-    return layer.rpartition(".")[2].lower() in _MAIN_LAYERS or layer == views[0]
+                shown_letters = (*(color_letters or _GREY), *alpha)
+                view = headers[part].get("view", first_view)
+                bare = "" if view == first_view else view
+                yield _Choice(part, shown_letters, channel_names, layer or bare)
 
 
 def _box(header: Mapping[str, Any], name: str) -> tuple[int, int, int, int]:
@@ -270,12 +265,9 @@ def _crop_to_window(
         return plane
     right = at[0] - x_min
     down = at[1] - y_min
-    rows = slice(max(0, down), min(height, down + at[3]))
-    columns = slice(max(0, right), min(width, right + at[2]))
+    inside = plane[max(-down, 0) : max(height - down, 0), max(-right, 0) : max(width - right, 0)]
     result = np.zeros((height, width), np.float32)
-    if rows.start < rows.stop and columns.start < columns.stop:
-        inside = plane[rows.start - down : rows.stop - down]
-        result[rows, columns] = inside[:, columns.start - right : columns.stop - right]
+    result[max(down, 0) :, max(right, 0) :][: inside.shape[0], : inside.shape[1]] = inside
     return result
 
 

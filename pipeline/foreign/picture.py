@@ -184,10 +184,8 @@ class Picture:
         """Return the picture halved `number` times, linear from the first halving on."""
         if number == 0:
             return self.values
-        if not self._levels:
-            rows = range(
-                0, len(self.values), _STRIP
-            )  # a whole large picture in floats takes too much memory
+        if not self._levels:  # strips: a whole large picture in floats takes too much memory
+            rows = range(0, len(self.values), _STRIP)
             strips = [_halve(self.linear(self.values[row : row + _STRIP])) for row in rows]
             self._levels.append(np.concatenate(strips))
         while len(self._levels) < number:
@@ -203,15 +201,12 @@ class Picture:
         """Return the linear values of texels [..., 4] of the picture or of a level."""
         if texels.dtype == np.float32:
             return texels
-        if texels.dtype in (np.uint16, np.float16):
-            most = 65535 if texels.dtype == np.uint16 else 1
-            deep: NDArray[np.float32] = np.divide(texels, most, dtype=np.float32)
-            if self.is_srgb:
-                deep[..., :3] = linear_from_srgb(deep[..., :3])
-            return deep
-        linear: NDArray[np.float32] = np.divide(texels, 255, dtype=np.float32)
-        if self.is_srgb:
+        most = 1 if texels.dtype == np.float16 else np.iinfo(texels.dtype).max
+        linear: NDArray[np.float32] = np.divide(texels, most, dtype=np.float32)
+        if self.is_srgb and texels.dtype == np.uint8:
             linear[..., :3] = linear_from_srgb8()[texels[..., :3]]
+        elif self.is_srgb:
+            linear[..., :3] = linear_from_srgb(linear[..., :3])
         return linear
 
     def sample(self, uv: NDArray[np.float64], halvings: NDArray[np.int64]) -> NDArray[np.float32]:
@@ -223,29 +218,15 @@ class Picture:
         return values
 
     def _sample_level(self, uv: NDArray[np.float64], texels: NDArray) -> NDArray[np.float32]:
-        height, width = texels.shape[:2]
-        beyond = np.zeros(len(uv), np.bool_)
-        x = _wrap_coordinates(uv[:, 0], self.wrap[0]) * width - 0.5
-        y = _wrap_coordinates(uv[:, 1], self.wrap[1]) * height - 0.5
-        if self.is_nearest:
-            x = np.floor(x + 0.5)
-            y = np.floor(y + 0.5)
-        column = np.floor(x).astype(np.int64)
-        row = np.floor(y).astype(np.int64)
-        along = (x - column)[:, None]
-        across = (y - row)[:, None]
-
-        def texel(up: int, right: int) -> NDArray[np.float32]:
-            rows = _wrap_index(row + up, height, self.wrap[1])
-            return self.linear(texels[rows, _wrap_index(column + right, width, self.wrap[0])])
-
-        for axis in range(2):
-            if self.wrap[axis] == "black":
-                beyond |= (uv[:, axis] < 0) | (uv[:, axis] > 1)
-        low = (1 - along) * texel(0, 0) + along * texel(0, 1)
-        high = (1 - along) * texel(1, 0) + along * texel(1, 1)
+        (x0, x1, along), (y0, y1, across) = (
+            _find_texels(uv[:, axis], texels.shape[1 - axis], self.wrap[axis], self.is_nearest)
+            for axis in (0, 1)
+        )
+        low = (1 - along) * self.linear(texels[y0, x0]) + along * self.linear(texels[y0, x1])
+        high = (1 - along) * self.linear(texels[y1, x0]) + along * self.linear(texels[y1, x1])
         values: NDArray[np.float32] = ((1 - across) * low + across * high).astype(np.float32)
-        values[beyond] = 0
+        is_black = [wrap == "black" for wrap in self.wrap]
+        values[(((uv < 0) | (uv > 1)) & is_black).any(axis=1)] = 0
         return values
 
 
@@ -268,14 +249,21 @@ def _halve(values: NDArray[np.float32]) -> NDArray[np.float32]:
     return values
 
 
-def _wrap_coordinates(at: NDArray[np.float64], wrap: Wrap) -> NDArray[np.float64]:
+def _find_texels(
+    at: NDArray[np.float64], count: int, wrap: Wrap, is_nearest: bool
+) -> tuple[NDArray[np.int64], NDArray[np.int64], NDArray[np.float64]]:
+    """Return the two texels [N] around coordinates [N] on an axis, and the second's weight [N, 1].
+
+    Both are the nearest one where texels are not interpolated.
+    """
     if wrap in ("clamp", "black"):
-        return np.clip(at, 0, 1)
-    if wrap == "mirror":
-        mirrored: NDArray[np.float64] = 1 - np.abs(np.mod(at, 2) - 1)
-        return mirrored
-    return at - np.floor(at)
-
-
-def _wrap_index(index: NDArray[np.int64], count: int, wrap: Wrap) -> NDArray[np.int64]:
-    return index % count if wrap == "repeat" else np.clip(index, 0, count - 1)
+        wrapped = np.clip(at, 0, 1)
+    else:
+        wrapped = 1 - np.abs(np.mod(at, 2) - 1) if wrap == "mirror" else at - np.floor(at)
+    position = wrapped * count - 0.5
+    if is_nearest:
+        position = np.floor(position + 0.5)
+    first = np.floor(position).astype(np.int64)
+    both = np.stack([first, first + 1])
+    low, high = both % count if wrap == "repeat" else np.clip(both, 0, count - 1)
+    return low, high, (position - first)[:, None]

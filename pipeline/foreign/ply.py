@@ -314,9 +314,7 @@ def _read_polygons(columns: Columns) -> _Lists:
     """Return the vertices of faces or strips."""
     names = [name for name, values in columns.items() if isinstance(values, _Lists)]
     lists = _take_lists(columns, *_INDICES, *(names if len(names) == 1 else ()))
-    if lists is None:
-        return _Lists(values=np.zeros(0, np.int64), counts=np.zeros(0, np.int64))
-    return lists
+    return lists or _Lists(values=np.zeros(0, np.int64), counts=np.zeros(0, np.int64))
 
 
 def _cut_strips(strips: _Lists) -> NDArray[np.int64]:

@@ -73,8 +73,8 @@ def triangulate(
         fewer than three corners give none.
     """
     starts = np.cumsum(counts) - counts
-    corners: list[NDArray[np.int64]] = []
-    owners: list[NDArray[np.int64]] = []
+    corners = [np.zeros((0, 3), np.int64)]
+    owners = [np.zeros(0, np.int64)]
     for count in np.unique(counts[counts >= 3]):
         faces = np.flatnonzero(counts == count)
         fan = np.array([[0, i, i + 1] for i in range(1, count - 1)])
@@ -85,8 +85,6 @@ def triangulate(
                 cut[row] = ring[_cut_ears(points[indices[ring]])]
         corners.append(cut.reshape(-1, 3))
         owners.append(np.repeat(faces, count - 2))
-    if not corners:
-        return np.zeros((0, 3), np.int64), np.zeros(0, np.int64)
     triangles = np.concatenate(corners)
     owner = np.concatenate(owners)
     order = np.argsort(owner, kind="stable")

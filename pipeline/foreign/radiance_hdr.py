@@ -6,13 +6,12 @@ by the product of all EXPOSURE and COLORCORR lines.
 """
 
 import re
-from collections.abc import Iterator, Sequence
-from dataclasses import dataclass
+from collections.abc import Sequence
 
 import numpy as np
 from numpy.typing import NDArray
 
-from pipeline.foreign.linear_picture import LinearPicture, are_rec709, as_rec709, require_pixels
+from pipeline.foreign.linear_picture import SAME, LinearPicture, as_rec709, require_pixels
 from pipeline.foreign.numbers import Malformed, parse_number
 from storage.errors import Rejected
 
@@ -33,53 +32,12 @@ _RADIANCE = (0.640, 0.330, 0.290, 0.600, 0.150, 0.060, 0.3333, 0.3333)
 _SAYS_NOTHING = frozenset("SOFTWARE OWNER CAPDATE GMT INSTRUMENT LATLONG DATE".split())
 
 
-@dataclass(frozen=True, kw_only=True)
-class _Header:
-    """The header, which precedes the pixels."""
-
-    rows: int
-    """Number of scanlines in the file."""
-    columns: int
-    is_column_major: bool
-    """True where a scanline is a column."""
-    flips: tuple[bool, bool]
-    """True for rows that go up, and for columns to the left, once scanlines are rows."""
-    start: int
-    """Offset of the first pixel in bytes."""
-    factors: NDArray[np.float64]
-    """[3] factors of the stored values, which are divided out."""
-    primaries: tuple[float, ...]
-    unread: tuple[str, ...]
-
-
 def read_radiance_hdr(data: bytes, max_pixels: int, *, is_color: bool) -> LinearPicture:
     """Return the picture of a file, RGB; arguments as for `read_linear_picture`.
 
     Raises:
         Rejected: not_hdr, too_many_pixels, load_error.
     """
-    header = _read_header(data)
-    rows = header.rows
-    columns = header.columns
-    require_pixels(columns, rows, max_pixels)
-    if len(data) - header.start < 4 * rows:  # no row is shorter, with or without runs
-        raise _damage_error("it is cut off")
-    texels = _decode_texels(data, header.start, rows, columns)
-    scale = np.ldexp(np.float32(1), texels[..., 3:].astype(np.int32) - 136)
-    values = np.where(texels[..., 3:] > 0, texels[..., :3] * scale, 0).astype(np.float32)
-    if (header.factors != 1).any():
-        values = (values / header.factors).astype(np.float32)
-    is_usual = np.allclose(header.primaries, _RADIANCE, rtol=0, atol=1e-3)
-    if is_color and not is_usual and not are_rec709(header.primaries):
-        values = as_rec709(values, header.primaries)
-    if header.is_column_major:
-        values = values.transpose(1, 0, 2)
-    up, leftwards = header.flips
-    values = values[:: -1 if up else 1, :: -1 if leftwards else 1]
-    return LinearPicture(values=np.ascontiguousarray(values), unread=header.unread)
-
-
-def _read_header(data: bytes) -> _Header:
     header = _HEADER.match(data[:_MOST_HEADER])
     if header is None:
         raise Rejected("not_hdr", "it is cut off within its header")
@@ -87,10 +45,39 @@ def _read_header(data: bytes) -> _Header:
     size = _SIZE.fullmatch(line)
     if size is None or size[2] == size[5]:
         raise Rejected("not_hdr", f"its size is {line[:40]!r}; expected one such as -Y 512 +X 1024")
+    factors, primaries, unread = _read_variables((header[1] or b"").split(b"\n"))
+    rows = int(size[3])
+    columns = int(size[6])
+    require_pixels(columns, rows, max_pixels)
+    if len(data) - header.end() < 4 * rows:  # no row is shorter, with or without runs
+        raise _damage_error("it is cut off")
+    texels = _decode_texels(data, header.end(), rows, columns)
+    scale = np.ldexp(np.float32(1), texels[..., 3:].astype(np.int32) - 136)
+    values = np.where(texels[..., 3:] > 0, texels[..., :3] * scale, 0).astype(np.float32)
+    if (factors != 1).any():
+        values = (values / factors).astype(np.float32)
+    if is_color and not np.allclose(primaries, _RADIANCE, rtol=0, atol=SAME):
+        values = as_rec709(values, primaries)
+    if size[2] == b"X":  # a scanline is a column
+        values = values.transpose(1, 0, 2)
+    signs = {size[2]: size[1], size[5]: size[4]}
+    values = values[:: -1 if signs[b"Y"] == b"+" else 1, :: -1 if signs[b"X"] == b"-" else 1]
+    return LinearPicture(values=np.ascontiguousarray(values), unread=unread)
+
+
+def _read_variables(
+    lines: Sequence[bytes],
+) -> tuple[NDArray[np.float64], tuple[float, ...], tuple[str, ...]]:
+    """Return factors [3] of the stored values, primaries [8], and notes on unread variables."""
     factors = np.ones(3)
-    primaries = _RADIANCE
+    primaries: tuple[float, ...] = _RADIANCE
     unread: dict[str, None] = {}
-    for name, value in _variables((header[1] or b"").split(b"\n")):
+    for line in lines:
+        variable = None if line.startswith(b"#") else _VARIABLE.fullmatch(line)
+        if variable is None:  # a comment, or a command that made the picture
+            continue
+        name = variable[1].decode()
+        value = variable[2].decode("latin-1")
         if name == "FORMAT":
             if value != "32-bit_rle_rgbe":
                 raise Rejected("not_hdr", f"its format is {value!r:.40}; expected 32-bit_rle_rgbe")
@@ -105,24 +92,7 @@ def _read_header(data: bytes) -> _Header:
             unread[f"header variable {name:.40}"] = None
     if not (np.isfinite(factors) & (factors > 0)).all():
         raise Rejected("not_hdr", f"its exposure is {factors.tolist()}; expected above 0")
-    signs = {size[2]: size[1], size[5]: size[4]}
-    return _Header(
-        rows=int(size[3]),
-        columns=int(size[6]),
-        is_column_major=size[2] == b"X",
-        flips=(signs[b"Y"] == b"+", signs[b"X"] == b"-"),
-        start=header.end(),
-        factors=factors,
-        primaries=primaries,
-        unread=tuple(unread),
-    )
-
-
-def _variables(lines: Sequence[bytes]) -> Iterator[tuple[str, str]]:
-    for line in lines:
-        match = None if line.startswith(b"#") else _VARIABLE.fullmatch(line)
-        if match is not None:  # other lines are comments, or commands that made the picture
-            yield match[1].decode(), match[2].decode("latin-1")
+    return factors, primaries, tuple(unread)
 
 
 def _parse_numbers(text: str, count: int, name: str) -> NDArray[np.float64]:
@@ -141,13 +111,10 @@ def _decode_texels(data: bytes, start: int, rows: int, columns: int) -> NDArray[
     at = start
     mark = bytes([2, 2, columns >> 8 & 255, columns & 255])
     for row in range(rows):
-        if _SHORTEST <= columns <= _LONGEST and data[at : at + 4] == mark:
+        head = data[at : at + 4] if _SHORTEST <= columns <= _LONGEST else b""
+        if head == mark:
             at = _decode_runs(data, at + 4, texels[row])
-        elif (
-            _SHORTEST <= columns <= _LONGEST
-            and data[at : at + 2] == mark[:2]
-            and data[at + 2 : at + 3] < b"\x80"
-        ):
+        elif head[:2] == mark[:2] and head[2:3] < b"\x80":
             raise _damage_error(f"row {row} is cut off or of another width")
         else:
             at = _decode_old_runs(data, at, texels[row])

@@ -96,7 +96,7 @@ class SourceFile:
     @property
     def unread(self) -> tuple[str, ...]:
         """Return sentences on contents of the file that were not read, each once."""
-        usd = () if self.usd is None else self.usd.unread
+        usd = () if self.usd is None else self.usd.stage.opened.notes
         gltf = () if self.gltf is None else self.gltf.unread
         return tuple(dict.fromkeys((*usd, *gltf, *self.notes)))
 

@@ -13,7 +13,8 @@ from storage.errors import Rejected
 _MARKS = {codecs.BOM_UTF16_LE: "utf-16", codecs.BOM_UTF16_BE: "utf-16", codecs.BOM_UTF8: ""}
 T = TypeVar("T", bound=np.generic)
 
-_IS_WORD = np.array([not bytes([code]).isspace() for code in range(256)])
+IS_WORD = np.array([not bytes([code]).isspace() for code in range(256)])
+"""Whether each byte belongs to a word, which white space ends."""
 _MOST_LISTED = 12
 
 
@@ -49,17 +50,20 @@ def join_continued(text: bytes) -> bytes:
 
 def find_words(text: bytes) -> NDArray[np.int64]:
     """Return the position [W] of the first byte of each word."""
-    is_word = _IS_WORD[np.frombuffer(text, np.uint8)]
+    is_word = IS_WORD[np.frombuffer(text, np.uint8)]
     return np.flatnonzero(is_word & ~np.append(False, is_word[:-1]))
 
 
-def find_lines(text: bytes) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
-    """Return the index of the first word, and the number of words, of each line with words."""
+def find_lines(text: bytes) -> tuple[NDArray[np.int64], NDArray[np.int64], NDArray[np.int64]]:
+    """Return `find_words`; the index of the first word [L], and the number of words [L], of lines.
+
+    Lines without words are left out.
+    """
     words = find_words(text)
     breaks = np.flatnonzero(np.frombuffer(text, np.uint8) == ord("\n"))
     first = np.searchsorted(words, np.append(0, breaks))
     counts = np.diff(np.append(first, len(words)))
-    return first[counts > 0], counts[counts > 0]
+    return words, first[counts > 0], counts[counts > 0]
 
 
 def parse_numbers(text: bytes, count: int, dtype: type[T]) -> NDArray[T]:

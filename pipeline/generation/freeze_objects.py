@@ -51,7 +51,7 @@ class ObjectLock:
     """The objects of a dataset: their source, and what freezes them."""
 
     source: str
-    """Source of the objects, as `find_objects` takes it; may hold a secret."""
+    """Source of the objects, as `list_objects` takes it; may hold a secret."""
     licence: str | None
     """Licence that the user states for files without one."""
     settings: DatasetSettings

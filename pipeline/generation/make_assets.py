@@ -30,7 +30,7 @@ from pipeline.generation.prepare_isolated import (
 )
 from pipeline.isolation import ChildFailed, call_with_retries, reach
 from pipeline.objects.generated import encode_ply
-from pipeline.objects.sources import find_objects
+from pipeline.objects.sources import list_objects
 from storage.atomic import write_atomically
 from storage.cache import cache_folder
 from storage.dataset.layout import Below
@@ -105,7 +105,7 @@ def make_assets(
     """Prepare the objects of a source and write the folder; a repeated call uses the asset store.
 
     Args:
-        source: source of objects, as `find_objects` takes it.
+        source: source of objects, as `list_objects` takes it.
         folder: an empty folder, or one of an earlier call, which is replaced.
         settings: settings of the mesh stage with one budget: the folder has one mesh per object.
         allowed_licences: objects under other licences are rejected.
@@ -122,13 +122,12 @@ def make_assets(
     if workers < 1:
         raise TrilightError(f"workers is {workers}; expected at least 1.")
     _require_ours(folder)
-    listed = find_objects(
+    listed = list_objects(
         source,
         work_dir=cache_folder("objects"),
         allowed_licences=allowed_licences,
         licence=licence,
-        downloaded=on_download,
-    )
+    ).fetch_selected(downloaded=on_download)
     write_atomically(folder.summary, b"{}")  # from here on the folder is ours
     on_plan(len(listed.records))
     with mesh_stage(settings, workers) as prepare:

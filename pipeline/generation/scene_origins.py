@@ -257,23 +257,23 @@ def accept_scene_files(
             not those that the dataset was begun with.
     """
     stated = stated_licence(licence)
-    if stated.licence.casefold() not in {name.casefold() for name in settings.allowed_licences}:
+    name = stated["licence"]
+    if name.casefold() not in {name.casefold() for name in settings.allowed_licences}:
         raise TrilightError(
-            f"--licence is {stated.licence}, which is not on the allow-list; if you may use the "
-            f"scenes, add --allow-licence '{stated.licence}'."
+            f"--licence is {name}, which is not on the allow-list; if you may use the "
+            f"scenes, add --allow-licence '{name}'."
         )
     with writer.hold_lock("objects"):
-        files = _build_all(folder, stated.licence, settings, writer.folder)
+        files = _build_all(folder, name, settings, writer.folder)
         locked = [
             LockedObject(
                 uid=uid,
                 asset_sha256=digest,
                 split=JUDGED_SPLIT,
-                licence=stated.licence,
-                licence_source=stated.licence_source,
                 title=uid,
                 attribution="",
                 source_url="",
+                **stated,
             )
             for uid, digest in sorted(files.sha256.items())
         ]

@@ -88,8 +88,7 @@ def drop_outputs(names: Iterable[str]) -> list[str]:
         name for name in names if outputs.isdisjoint(map(str, PurePosixPath(name).parents))
     ]
     if len(remaining) < len(names):
-        examples = ", ".join(printable(folder) for folder in sorted(outputs)[:3])
-        warn_once(f"left out as outputs of Trilight: {examples}{_and_more(len(outputs) - 3)}")
+        warn_once(f"left out as outputs of Trilight: {_name_first(sorted(outputs), 3)}")
     return remaining
 
 
@@ -113,9 +112,10 @@ def warn_unread_formats(names: Sequence[str], objects: Sequence[str]) -> None:
     """Warn of archives and files of other formats that have no object file of the same name."""
     stems = {_stem(name) for name in objects}
     stems |= {stem for name in names if (stem := _stem(name)).startswith(".")}  # hidden
-    unread = sorted(n for n in names if _suffix(n) in _UNREAD and _stem(n) not in stems)
+    candidates = [name for name in names if name.rpartition(".")[2].lower() in _UNREAD]
+    unread = sorted(name for name in candidates if _stem(name) not in stems)
     if unread:
-        example = f"{printable(unread[0])}{_and_more(len(unread) - 1)}"
+        example = _name_first(unread)
         warn_once(f"left out as formats that are not read: {example}; convert or unpack them")
 
 
@@ -127,8 +127,7 @@ def drop_scenes(root: Path, names: Sequence[str]) -> list[str]:
         if name.lower().endswith((*USD_SUFFIXES, ".glb")) and _is_scene(root / name)
     ]
     if scenes:
-        example = f"{printable(scenes[0])}{_and_more(len(scenes) - 1)}"
-        warn_once(f"left out as scenes that Trilight wrote: {example}")
+        warn_once(f"left out as scenes that Trilight wrote: {_name_first(scenes)}")
     return [name for name in names if name not in set(scenes)]
 
 
@@ -206,9 +205,6 @@ def _stem(name: str) -> str:
     return name.rpartition("/")[2].rpartition(".")[0]
 
 
-def _suffix(name: str) -> str:
-    return name.rpartition(".")[2].lower()
-
-
-def _and_more(count: int) -> str:
-    return f" and {count} more" if count > 0 else ""
+def _name_first(names: Sequence[str], count: int = 1) -> str:
+    more = len(names) - count
+    return ", ".join(map(printable, names[:count])) + (f" and {more} more" if more > 0 else "")

@@ -13,14 +13,17 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from pipeline.objects.builtin.furniture import sample_furniture
-from pipeline.objects.builtin.lattice import sample_lattice
-from pipeline.objects.builtin.plant import sample_plant
-from pipeline.objects.builtin.shell import sample_shell
-from pipeline.objects.builtin.solids import Mesh, sample_gear, sample_rock, sample_vase
-from pipeline.objects.builtin.superquadric import sample_superquadric
-from pipeline.objects.builtin.torus_knot import sample_torus_knot
-from pipeline.objects.builtin.tree import sample_tree
+from pipeline.objects.builtin.joined import sample_furniture, sample_plant, sample_tree
+from pipeline.objects.builtin.solids import Mesh
+from pipeline.objects.builtin.surfaces import (
+    sample_gear,
+    sample_lattice,
+    sample_rock,
+    sample_shell,
+    sample_superquadric,
+    sample_torus_knot,
+    sample_vase,
+)
 from storage.atomic import write_atomically
 from storage.dataset.layout import numbered_path
 from storage.errors import TrilightError, expected_one_of

@@ -2,7 +2,6 @@
 
 import re
 from collections.abc import Sequence
-from dataclasses import dataclass
 
 from pipeline.objects.listing import failure
 from storage.errors import TrilightError
@@ -48,27 +47,19 @@ _EXPECTED = (
 )
 
 
-@dataclass(frozen=True, kw_only=True)
-class StatedLicence:
-    """The licence of files without a licence statement."""
+def stated_licence(licence: str | None) -> dict[str, str]:
+    """Return the fields of an `ObjectRecord` for the licence of files without a statement.
 
-    licence: str
-    """SPDX identifier such as CC-BY-4.0, or `LicenseRef-...`."""
-    licence_source: str
-    """Origin of the licence, such as the user or a catalogue."""
-
-
-def stated_licence(licence: str | None) -> StatedLicence:
-    """Return the licence of files without a statement: the user's, or an assumed one.
+    `licence` is the user's; without one, it is assumed.
 
     Raises:
         TrilightError: `licence` does not have the form of an identifier.
     """
     if licence is None:
-        return StatedLicence(licence=USER_PROVIDED, licence_source="assumed: the user's own files")
+        return {"licence": USER_PROVIDED, "licence_source": "assumed: the user's own files"}
     if not _IDENTIFIER.fullmatch(licence):
         raise TrilightError(f"--licence is {printable(licence)!r}; {_EXPECTED}.")
-    return StatedLicence(licence=licence, licence_source=BY_USER)
+    return {"licence": licence, "licence_source": BY_USER}
 
 
 def require_unstated(licence: str | None, source: str) -> None:

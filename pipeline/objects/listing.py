@@ -3,7 +3,8 @@
 import threading
 from collections.abc import Callable, Iterable
 from concurrent.futures import ThreadPoolExecutor, as_completed
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
+from pathlib import Path
 
 from pipeline.foreign.limits import SUFFIXES
 from storage.records.objects import Failure, ObjectRecord
@@ -12,6 +13,7 @@ from storage.remote.safe_url import printable
 
 Fetched = tuple[list[ObjectRecord], list[Failure]]
 CountDone = Callable[[int, int], None]
+THREADS = 8
 
 
 def _already_local(records: list[ObjectRecord], downloaded: CountDone) -> Fetched:
@@ -81,20 +83,17 @@ def _without_suffixes(name: str) -> str:
 
 def fetch_all(
     records: list[ObjectRecord],
-    fetch: Callable[[ObjectRecord], ObjectRecord],
+    fetch: Callable[[ObjectRecord], Path],
     downloaded: CountDone,
-    *,
-    threads: int,
     stop: threading.Event,
 ) -> Fetched:
     """Fetch every object; a TransferFailed of `fetch` is a failure of that object alone.
 
     Args:
         records: what to fetch.
-        fetch: returns the record with its path; called in threads, at most `threads` at a time.
+        fetch: returns the local path of a record's file; called in THREADS threads.
         downloaded: called in this thread with the number of finished objects, failed ones
             included, and the total.
-        threads: number of threads, at least 1.
         stop: set where the run ends early, so that `fetch` may give up.
 
     Raises:
@@ -103,12 +102,12 @@ def fetch_all(
     fetched: list[ObjectRecord] = []
     failures: list[Failure] = []
     downloaded(0, len(records))
-    with ThreadPoolExecutor(threads) as pool:
+    with ThreadPoolExecutor(THREADS) as pool:
         waiting = {pool.submit(fetch, record): record for record in records}
         try:
             for done, future in enumerate(as_completed(waiting), start=1):
                 try:
-                    fetched.append(future.result())
+                    fetched.append(replace(waiting[future], path=str(future.result())))
                 except TransferFailed as error:
                     failures.append(failure(waiting[future].uid, error.reason, error.message))
                 downloaded(done, len(records))

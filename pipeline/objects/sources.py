@@ -97,12 +97,6 @@ SOURCES: Registry[ObjectSource] = Registry(
 """Object sources by the word before the colon."""
 
 
-def source_of(text: str) -> ObjectSource:
-    """Return the source of the word before the colon, or else the folder source."""
-    name, colon, _ = text.partition(":")
-    return SOURCES.get(name, FOLDER_SOURCE) if colon else FOLDER_SOURCE
-
-
 ENVIRONMENT = "env:"
 """Prefix of a source that stands in an environment variable, for URLs with a secret."""
 VARIABLES = "TRILIGHT_SOURCE_"
@@ -112,17 +106,6 @@ _QUOTED = re.compile(r"^objects (?:is )?(?:'[^']*'|\"[^\"]*\")")
 """Beginning of messages about a source."""
 _WORD = re.compile(r"\w{3,}")
 _DOWNLOAD_REASONS = ("download_failed", "too_large_bytes", "too_many_buffers", "unsafe_name")
-
-
-@dataclass(frozen=True, kw_only=True)
-class FoundObjects:
-    """The usable objects of a source, and the failures."""
-
-    records: tuple[ObjectRecord, ...]
-    """Objects with an allowed licence and their files on this machine, sorted by uid."""
-    failures: tuple[Failure, ...]
-    """Failures of the stage `objects`, sorted by uid: licence_refused, download_failed,
-    too_large_bytes, too_many_buffers, unsafe_name, unknown_uid, link_outside, name_clash."""
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -142,8 +125,8 @@ class ListedObjects:
         self,
         is_selected: Callable[[str], bool] = lambda uid: True,
         downloaded: CountDone = lambda done, total: None,
-    ) -> FoundObjects:
-        """Download the selected objects and return them with the failures.
+    ) -> Listing:
+        """Download the selected objects of allowed licences; return them with the failures.
 
         Downloads stay in the user's cache (`storage.cache`; Objaverse in the folder of its
         package) and are not repeated.
@@ -153,6 +136,11 @@ class ListedObjects:
             downloaded: called with the number of finished downloads, failed ones included, and the
                 total; from the calling thread.
 
+        Returns:
+            Objects whose files are on this machine, and failures of the stage `objects`, both
+            sorted by uid: licence_refused, download_failed, too_large_bytes, too_many_buffers,
+            unsafe_name, unknown_uid, link_outside, name_clash.
+
         Raises:
             TrilightError: none of the selected objects could be downloaded.
         """
@@ -160,9 +148,9 @@ class ListedObjects:
         failures = [failure for failure in self.refused if is_selected(failure.item)]
         fetched, lost = self.fetch(records, downloaded)
         self.require_some(len(fetched), [*failures, *lost])
-        return FoundObjects(
-            records=tuple(sorted(fetched, key=attrgetter("uid"))),
-            failures=tuple(sorted([*failures, *lost], key=attrgetter("item"))),
+        return Listing(
+            records=sorted(fetched, key=attrgetter("uid")),
+            failures=sorted([*failures, *lost], key=attrgetter("item")),
         )
 
     @property
@@ -220,21 +208,6 @@ def list_objects(
     return ListedObjects(
         source=source, listing=listing, allowed=allowed, refused=[*listing.failures, *refused]
     )
-
-
-def find_objects(
-    source: str,
-    *,
-    work_dir: Path,
-    allowed_licences: Sequence[str],
-    licence: str | None = None,
-    downloaded: CountDone = lambda done, total: None,
-) -> FoundObjects:
-    """List a source and download all its usable objects; raises as `list_objects`."""
-    listed = list_objects(
-        source, work_dir=work_dir, allowed_licences=allowed_licences, licence=licence
-    )
-    return listed.fetch_selected(downloaded=downloaded)
 
 
 def check_source(source: str, *, allowed_licences: Sequence[str], licence: str | None) -> None:
@@ -304,9 +277,10 @@ def _choose_source(
     """Return a source with its query; raises TrilightError for licences that cannot be."""
     check_allowed(allowed_licences)
     stated_licence(licence)
-    kind = source_of(source)
+    name, colon, _ = source.partition(":")
+    kind = SOURCES.get(name, FOLDER_SOURCE) if colon else FOLDER_SOURCE
     if kind.states_licences:
-        require_unstated(licence, f"{source.partition(':')[0]}:")
+        require_unstated(licence, f"{name}:")
     return kind, SourceQuery(
         source=source, work_dir=work_dir, licence=licence, allowed_licences=allowed_licences
     )

@@ -16,7 +16,7 @@ from model.config import SIZES, ModelConfig
 from pipeline.exchange.convert import write_scene
 from pipeline.exchange.open_scene import load_source, scene_source
 from pipeline.executors.registry import EXECUTORS
-from pipeline.objects.sources import check_source, find_objects
+from pipeline.objects.sources import check_source, list_objects
 from pipeline.presets.registry import DATASET_PRESETS, preset_settings, resolve_dataset_preset
 from scene_templates.skies.procedural_skies import draw_sky
 from scene_templates.textures import draw_look
@@ -121,10 +121,10 @@ def test_a_source_lists_objects(
     """And writes nothing into the folder that a person works in."""
     asked: dict[str, Any] = {"allowed_licences": ("CC0-1.0",)}
     with loaded(copied("object_source.py")):
-        found = find_objects("dice:3", work_dir=tmp_path, **asked)
+        found = list_objects("dice:3", work_dir=tmp_path, **asked).fetch_selected()
         assert [Path(record.path).is_file() for record in found.records] == [True] * 3
         with pytest.raises(TrilightError, match=r"dice:x'; expected dice:N with N from 1"):
-            find_objects("dice:x", work_dir=tmp_path, **asked)
+            list_objects("dice:x", work_dir=tmp_path, **asked)
         with pytest.raises(TrilightError, match="dice: states the licence of every object"):
             check_source("dice:3", licence="MIT", **asked)
         monkeypatch.chdir(tmp_path)

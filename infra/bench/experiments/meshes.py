@@ -28,7 +28,7 @@ from pipeline.foreign.limits import ReadLimits
 from pipeline.foreign.mesh import TriangleMesh
 from pipeline.foreign.source_file import load_mesh, read_source
 from pipeline.isolation import ChildFailed
-from pipeline.objects.sources import find_objects
+from pipeline.objects.sources import list_objects
 from pipeline.renders.renderer import SceneRenderer
 from pipeline.renders.settings import RenderSettings
 from pipeline.scenes.pieces import emitter_piece, object_piece, shell_piece
@@ -229,13 +229,13 @@ def _large_objects(context: BenchContext) -> list[Path]:
     """Return the files of usable objects of LARGE triangles after cleaning, largest first.
 
     Raises:
-        TrilightError: as `find_objects`.
+        TrilightError: as `list_objects`.
     """
-    objects = find_objects(
+    objects = list_objects(
         context.options.objects,
         work_dir=cache_folder("objects"),
         allowed_licences=context.options.allowed_licences,
-    )
+    ).fetch_selected()
     sizes = {}
     for record in objects.records:
         with contextlib.suppress(Rejected, ChildFailed):

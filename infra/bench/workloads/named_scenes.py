@@ -20,7 +20,7 @@ from infra.render.held_out_scenes import first_composed
 from pipeline.exchange.gltf.read_gltf import SUFFIXES as GLTF_SUFFIXES
 from pipeline.exchange.open_scene import load_source, scene_source
 from pipeline.isolation import IsolatedChild
-from pipeline.objects.builtin.superquadric import superquadric
+from pipeline.objects.builtin.surfaces import superquadric
 from pipeline.presets.settings import DatasetSettings
 from pipeline.presets.training import textured_256
 from pipeline.scenes.pieces import (

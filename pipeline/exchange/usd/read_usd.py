@@ -86,7 +86,8 @@ def read_usd(path: Path, key: str | None = None, folder: Path | None = None) -> 
 def _read_file(path: Path, read: Callable[[], Read]) -> Read:
     """Return the result of `read` for a file, whose name begins every message."""
     try:
-        return read_quietly(path, read)
+        with read_quietly(path):
+            return read()
     except (TrilightError, Rejected) as error:
         message = error.message if isinstance(error, Rejected) else str(error)
         if isinstance(error, TrilightError) and message.startswith(path.name):

@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 
 from pipeline.foreign.gltf.nodes import (
     INSTANCING,
+    TRS,
     PlacedNode,
     check_tree,
     entry,
@@ -85,7 +86,7 @@ class GltfDocument:
         Raises:
             Rejected: cut_off, unsupported_accessor, load_error.
         """
-        accessor = self._accessor(index)
+        accessor = entry(self.tree, "accessors", index)
         elements = self._elements(index)
         if elements.shape[1] not in widths:
             raise Malformed(f"accessor {index} has {elements.shape[1]} components")
@@ -107,7 +108,7 @@ class GltfDocument:
 
     def count(self, index: Any) -> int:
         """Return the number of values of an accessor."""
-        return read_count(self._accessor(index), "count")
+        return read_count(entry(self.tree, "accessors", index), "count")
 
     def instances(self, placed: PlacedNode) -> NDArray[np.float64]:
         """Return the matrices [N, 4, 4] of all instances of a node's mesh."""
@@ -115,15 +116,11 @@ class GltfDocument:
         if not attributes:
             return placed.to_world[None]
         count = self.count(next(iter(attributes.values())))
-        components = [
-            np.tile(row, (count, 1)) for row in ([0.0] * 3, [0.0, 0.0, 0.0, 1.0], [1.0] * 3)
-        ]
-        for row, name in enumerate(("TRANSLATION", "ROTATION", "SCALE")):
-            if name in attributes:
-                width = components[row].shape[1]
-                components[row] = self.values(
-                    attributes[name], (width,), slice(None), is_unit=name == "ROTATION" or None
-                )
+        components = [np.tile(np.array(default, np.float64), (count, 1)) for _, default in TRS]
+        for row, (name, default) in enumerate(TRS):
+            if (number := attributes.get(name.upper())) is not None:
+                is_unit = name == "rotation" or None
+                components[row] = self.values(number, (len(default),), slice(None), is_unit=is_unit)
         return np.einsum("ij,njk->nik", placed.to_world, transforms(*components))
 
     def picture_bytes(self, image: Mapping[str, Any]) -> bytes:
@@ -133,12 +130,9 @@ class GltfDocument:
         uri = image["uri"]
         return data_uri_bytes(uri) if is_data_uri(uri) else self.pictures.require(uri)
 
-    def _accessor(self, index: Any) -> dict[str, Any]:
-        return entry(self.tree, "accessors", index)
-
     def _elements(self, index: Any) -> NDArray:
         """Return the stored values [N, K] of an accessor; zeros without a buffer view."""
-        accessor = self._accessor(index)
+        accessor = entry(self.tree, "accessors", index)
         code = accessor["componentType"]
         kind = accessor["type"]
         count = read_count(accessor, "count")

@@ -6,6 +6,7 @@ slots are linear.
 
 import dataclasses
 from collections.abc import Mapping
+from dataclasses import KW_ONLY, dataclass, field
 from typing import Any
 
 import numpy as np
@@ -26,35 +27,22 @@ _NEAREST = 9728
 _MOST_EMISSION = 1e9
 
 
+@dataclass(eq=False)
 class GltfMaterials:
-    """Reads the materials of one glTF, decoding each picture once."""
+    """Reads the materials of one glTF on demand, decoding each picture once."""
 
-    def __init__(
-        self,
-        document: GltfDocument,
-        decode: Decode,
-        *,
-        emission: bool = False,
-        normals: bool = False,
-        notes: list[str] | None = None,
-    ) -> None:
-        """Store the arguments; materials are read on demand.
-
-        Args:
-            document: the file.
-            decode: returns the values of a picture's bytes.
-            emission: whether emission is read, too.
-            normals: whether normal maps are read, too.
-            notes: receives sentences on parts that are left out; None refuses the file for these.
-        """
-        self._document = document
-        self._tree = document.tree
-        self._decode = decode
-        self._emission = emission
-        self._normals = normals
-        self._notes = notes
-        self._values: dict[int, NDArray] = {}
-        self._known: dict[int, SourceMaterial] = {}
+    document: GltfDocument
+    decode: Decode
+    """Function that returns the values of a picture's bytes."""
+    _: KW_ONLY
+    emission: bool = False
+    """True to read emission, too."""
+    normals: bool = False
+    """True to read normal maps, too."""
+    notes: list[str] | None = None
+    """Receives sentences on parts that are left out; None refuses the file for these."""
+    _values: dict[int, NDArray] = field(default_factory=dict, init=False)
+    _known: dict[int, SourceMaterial] = field(default_factory=dict, init=False)
 
     def used_materials(self) -> dict[int, SourceMaterial]:
         """Return the materials that meshes use, by index.
@@ -62,7 +50,8 @@ class GltfMaterials:
         Raises:
             Rejected: as reading a picture.
         """
-        primitives = [row for mesh in self._tree.get("meshes", ()) for row in mesh["primitives"]]
+        meshes = self.document.tree.get("meshes", ())
+        primitives = [row for mesh in meshes for row in mesh["primitives"]]
         named = {row["material"] for row in primitives if "material" in row}
         return {number: self.material(number) for number in sorted(named)}
 
@@ -73,7 +62,7 @@ class GltfMaterials:
         return self._known[number]
 
     def _read(self, number: int) -> SourceMaterial:
-        row = entry(self._tree, "materials", number)
+        row = entry(self.document.tree, "materials", number)
         glossy = row.get("extensions", {}).get("KHR_materials_pbrSpecularGlossiness")
         if "KHR_materials_unlit" in row.get("extensions", {}):
             return self._unlit(row)
@@ -123,7 +112,7 @@ class GltfMaterials:
 
     def _with_normals(self, material: SourceMaterial, row: Mapping[str, Any]) -> SourceMaterial:
         """Return a material with its normal map, where normal maps are read."""
-        slot = self._slot(row, "normalTexture") if self._normals else None
+        slot = self._slot(row, "normalTexture") if self.normals else None
         if slot is None:
             return material
         strength = read_number(row["normalTexture"].get("scale", 1), "normalTexture.scale")
@@ -131,7 +120,7 @@ class GltfMaterials:
 
     def _with_emission(self, material: SourceMaterial, row: Mapping[str, Any]) -> SourceMaterial:
         """Return a material with its emission, where emission is read."""
-        if not self._emission:
+        if not self.emission:
             return material
         strength = extension(row, "KHR_materials_emissive_strength")
         times = self._number(strength, "emissiveStrength", 1, _MOST_EMISSION)
@@ -151,18 +140,19 @@ class GltfMaterials:
         try:
             return self._texture(info, is_srgb=is_srgb)
         except Rejected as why:
-            if self._notes is None or why.reason in ("texture_outside", "texture_too_large"):
+            if self.notes is None or why.reason in ("texture_outside", "texture_too_large"):
                 raise
-            self._notes.append(f"a texture is left out: {why.message}")
+            self.notes.append(f"a texture is left out: {why.message}")
             return None
 
     def _texture(self, info: Mapping[str, Any], *, is_srgb: bool) -> Slot:
-        texture = entry(self._tree, "textures", info["index"])
+        tree = self.document.tree
+        texture = entry(tree, "textures", info["index"])
         source = extension(texture, "EXT_texture_webp").get("source", texture.get("source"))
         if source is None:
             forms = ", ".join(texture.get("extensions", ())) or "nothing"
             raise Rejected("texture_unreadable", f"its picture is in no form read here: {forms}")
-        sampler = entry(self._tree, "samplers", texture["sampler"]) if "sampler" in texture else {}
+        sampler = entry(tree, "samplers", texture["sampler"]) if "sampler" in texture else {}
         wrap = _WRAPS[sampler.get("wrapS", 10497)], _WRAPS[sampler.get("wrapT", 10497)]
         transform = extension(info, "KHR_texture_transform")
         uv_matrix, uv_offset = _uv_transform(transform)
@@ -184,10 +174,10 @@ class GltfMaterials:
 
     def _picture(self, number: int) -> NDArray:
         if number not in self._values:
-            image = entry(self._tree, "images", number)
+            image = entry(self.document.tree, "images", number)
             name = str(image.get("uri", image.get("name", f"picture {number}")))
             name = "an embedded picture" if name.startswith("data:") else name
-            self._values[number] = self._decode(self._document.picture_bytes(image), name)
+            self._values[number] = self.decode(self.document.picture_bytes(image), name)
         return self._values[number]
 
     def _rgb(self, row: Mapping[str, Any], name: str, count: int, most: float = 1.0) -> RGB:
@@ -206,16 +196,16 @@ class GltfMaterials:
         """Return factors clamped to [0, `most`]; malformed ones become the default, with a note."""
         try:
             factors = [*read_numbers(row.get(name, default), len(default), name)]
-            if most > 1 and max(factors) > most and self._notes is None:
+            if most > 1 and max(factors) > most and self.notes is None:
                 raise Malformed(f"{name} is {max(factors):g}; expected at most {most:g}")
         except Malformed as error:
-            if self._notes is None:
+            if self.notes is None:
                 raise
-            self._notes.append(f"{error}; {[*default]} taken")
+            self.notes.append(f"{error}; {[*default]} taken")
             return list(default)
         clamped = [min(max(value, 0.0), most) for value in factors]
-        if self._notes is not None and clamped != factors:
-            self._notes.append(f"{name}: clamped to [0, {most:g}]")
+        if self.notes is not None and clamped != factors:
+            self.notes.append(f"{name}: clamped to [0, {most:g}]")
         return clamped
 
 

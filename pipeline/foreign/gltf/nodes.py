@@ -277,12 +277,13 @@ def _local(node: Mapping[str, Any]) -> NDArray[np.float64]:
     return transforms(
         *(
             np.array(node.get(name, default), np.float64).reshape(1, len(default))
-            for name, default in _TRS
+            for name, default in TRS
         )
     )[0]
 
 
-_TRS = (("translation", (0, 0, 0)), ("rotation", (0, 0, 0, 1)), ("scale", (1, 1, 1)))
+TRS = (("translation", (0, 0, 0)), ("rotation", (0, 0, 0, 1)), ("scale", (1, 1, 1)))
+"""Components of a transform with their defaults."""
 
 
 def transforms(

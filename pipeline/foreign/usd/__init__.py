@@ -5,7 +5,7 @@ Native code parses the bytes, so only processes with limits import this (pipelin
 
 - `stage`: a file and the files that it names, bounded before it is composed.
 - `placed`: the visible prims with their transforms and poses; names of unread contents.
-- `polygons`, `solids`: a mesh as triangles.
+- `polygons`: a mesh or solid as triangles.
 - `shaders`, `texture_nodes`: the inputs of a material.
 - `object_source`: a stage as an object, and all of its materials; `materials`: those of a mesh's
   triangles.

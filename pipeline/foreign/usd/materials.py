@@ -6,6 +6,7 @@ defines, and metadata of the picture are ignored.
 
 import dataclasses
 from collections.abc import Mapping
+from dataclasses import KW_ONLY, dataclass, field
 from typing import Any
 
 import numpy as np
@@ -57,7 +58,7 @@ def usd_textured_mesh(source: UsdSource, decode: Decode, *, emission: bool = Fal
             picture.
     """
     time = source.stage.time
-    looks = MeshMaterials(source.materials(), decode, time, emission=emission)
+    looks = MeshMaterials(source.materials, decode, time, emission=emission)
     if len(looks.primvars) > MOST_UV_SETS:
         count = len(looks.primvars)
         raise Rejected("no_texture_coordinates", f"textures lie on {count} sets of them")
@@ -77,43 +78,35 @@ def usd_textured_mesh(source: UsdSource, decode: Decode, *, emission: bool = Fal
     )
 
 
+@dataclass(eq=False)
 class MeshMaterials:
     """The materials of a stage's meshes; primvars tint corners, or make further materials."""
 
-    def __init__(
-        self,
-        stage_materials: StageMaterials,
-        decode: Decode,
-        time: object,
-        *,
-        emission: bool = False,
-        notes: list[str] | None = None,
-    ) -> None:
-        """Convert all materials, decoding each picture once.
+    stage: StageMaterials
+    """Materials as the stage states them."""
+    decode: Decode
+    """Function that returns the values of a picture's bytes."""
+    time: Any
+    """The Usd.TimeCode of the values."""
+    _: KW_ONLY
+    emission: bool = False
+    """True to read emission, too."""
+    notes: list[str] | None = None
+    """Receives sentences on pictures that are left out; None refuses the file."""
+    _values: dict[str, NDArray] = field(default_factory=dict, init=False)
+    _known: dict[tuple[int, bytes], int] = field(default_factory=dict, init=False)
 
-        Args:
-            stage_materials: the materials as the stage states them.
-            decode: returns the values of a picture's bytes.
-            time: time of the values.
-            emission: whether emission is read, too.
-            notes: receives sentences on pictures that are left out; None refuses the file.
+    def __post_init__(self) -> None:
+        """Convert all materials, decoding each picture once.
 
         Raises:
             Rejected: materials_unreadable, or as reading a picture.
         """
-        self._stated = stage_materials.materials
-        self._bindings = stage_materials.bindings
-        self._time = time
-        self._emission = emission
-        self._files = stage_materials.pictures
-        self._decode = decode
-        self._notes = notes
-        self._values: dict[str, NDArray] = {}
-        self._known: dict[tuple[int, bytes], int] = {}
-        nodes = [node for stated in self._stated for node in stated.textures.values()]
+        stated_materials = self.stage.materials
+        nodes = [node for stated in stated_materials for node in stated.textures.values()]
         self.primvars = list(dict.fromkeys(node.chart.primvar for node in nodes))
         """Names of the sets of texture coordinates, by the numbers in slots."""
-        self.materials = [self._convert(stated) for stated in self._stated]
+        self.materials = [self._convert(stated) for stated in stated_materials]
         """Materials by row; those of primvars are added when they are met."""
         self.plain = len(self.materials)
         """Row of triangles without a material."""
@@ -129,18 +122,18 @@ class MeshMaterials:
             cut: its triangles.
         """
         rows = np.full(len(cut.corners), self.plain)
-        for row, polygons in self._bindings[number]:
+        for row, polygons in self.stage.bindings[number]:
             chosen = slice(None) if polygons is None else np.isin(cut.polygons, polygons)
             rows[chosen] = self.plain if row < 0 else row
         tints = np.ones((len(rows), 3, 3))
         is_plain = rows == self.plain
         if is_plain.any():
-            display_colors = read_colors(cut, "displayColor", self._time)
+            display_colors = read_colors(cut, "displayColor", self.time)
             tints[is_plain] = (
                 _UNBOUND if display_colors is None else np.clip(display_colors[is_plain], 0, 1)
             )
         for row in np.unique(rows):
-            if row < self.plain and self._stated[row].primvars:
+            if row < self.plain and self.stage.materials[row].primvars:
                 self._apply_primvars(int(row), cut, rows, tints)
         return rows, tints
 
@@ -148,16 +141,16 @@ class MeshMaterials:
         self, row: int, cut: CutMesh, rows: NDArray[np.int64], tints: NDArray[np.float64]
     ) -> None:
         """Replace the rows [T] and tints [T, 3, 3] of triangles of a material with primvars."""
-        stated = self._stated[row]
+        stated = self.stage.materials[row]
         mask = rows == row
-        values = {name: stated.read_values(name, cut, self._time) for name in stated.primvars}
+        values = {name: stated.read_values(name, cut, self.time) for name in stated.primvars}
         base = values.pop("diffuseColor", None)
         if base is not None:
             tints[mask] = np.clip(base, 0, 1)[mask]
         elif "diffuseColor" in stated.primvars:
             tints[mask] = np.maximum(stated.constants["diffuseColor"], 0)
         glow = values.pop("emissiveColor", None)
-        if glow is not None and self._emission:
+        if glow is not None and self.emission:
             values["emissiveColor"] = glow * _read_strength(stated)
         means = {name: each.mean(axis=1)[mask] for name, each in values.items() if each is not None}
         if means and mask.any():
@@ -193,7 +186,7 @@ class MeshMaterials:
         if is_lit or "emissiveColor" in stated.primvars:
             lost = ("emission", *lost)
         names = ["diffuseColor", "roughness"]
-        names += ["emissiveColor"] if self._emission and is_lit else []
+        names += ["emissiveColor"] if self.emission and is_lit else []
         material = self._with_inputs(SourceMaterial(lost=lost), stated, *names)
         if "normal" in stated.textures:
             material = self._with_normal_map(material, stated.textures["normal"])
@@ -252,16 +245,16 @@ class MeshMaterials:
         try:
             return self._read_slot(node, f"{stated.where}.{name}", is_grey=is_grey)
         except Rejected as why:
-            if self._notes is None or why.reason in ("texture_outside", "texture_too_large"):
+            if self.notes is None or why.reason in ("texture_outside", "texture_too_large"):
                 raise
-            self._notes.append(f"{stated.where}.{name}: a texture is left out: {why.message}")
+            self.notes.append(f"{stated.where}.{name}: a texture is left out: {why.message}")
             return None
 
     def _read_slot(self, node: TextureNode, where: str, *, is_grey: bool) -> Slot:
         values = self._picture(node)
         is_srgb = node.color_space == "sRGB"
         if node.color_space not in ("sRGB", "raw"):
-            is_srgb = has_colors(self._files.require(node.resolved or node.named))
+            is_srgb = has_colors(self.stage.pictures.require(node.resolved or node.named))
         channel = _CHANNELS[node.output]
         if is_grey:
             values = np.ascontiguousarray(values[..., [channel] * 3 + [3]])
@@ -274,8 +267,8 @@ class MeshMaterials:
                 scale = scale[[channel] * 3 + [3]]
                 bias = bias[[channel] * 3 + [3]]
             picture = _scale_picture(picture, scale, bias)
-            if self._notes is not None and picture.values[..., :3].max() > 1:
-                self._notes.append(f"{where}: texels above 1 are clamped, but for emission")
+            if self.notes is not None and picture.values[..., :3].max() > 1:
+                self.notes.append(f"{where}: texels above 1 are clamped, but for emission")
         return Slot(
             picture=picture,
             uv_set=self.primvars.index(node.chart.primvar),
@@ -287,7 +280,7 @@ class MeshMaterials:
     def _picture(self, node: TextureNode) -> NDArray:
         path = node.resolved or node.named
         if path not in self._values:
-            self._values[path] = self._decode(self._files.require(path), node.named)
+            self._values[path] = self.decode(self.stage.pictures.require(path), node.named)
         return self._values[path]
 
 

@@ -6,13 +6,14 @@ refused: a missing reference, surfaces other than polygons, bones without a pose
 `read_stage_materials` returns the materials of a stage by mesh and polygon, of scenes too.
 """
 
+import contextlib
 import dataclasses
 import hashlib
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property, partial
 from pathlib import Path
-from typing import Any, TypeVar
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -20,15 +21,13 @@ from numpy.typing import NDArray
 from pipeline.foreign.limits import ReadLimits
 from pipeline.foreign.material_files import MaterialFiles
 from pipeline.foreign.mesh import TriangleMesh, join_meshes
-from pipeline.foreign.usd.placed import PlacedPrim, UnposedMesh, placed_prims
+from pipeline.foreign.usd.placed import SOLIDS, PlacedPrim, UnposedMesh, placed_prims
 from pipeline.foreign.usd.polygons import CutMesh, cut_mesh
 from pipeline.foreign.usd.shaders import StatedMaterial, read_bindings, read_material
-from pipeline.foreign.usd.solids import SOLIDS
 from pipeline.foreign.usd.stage import OpenedStage, OutsideFile, read_quietly
 from pipeline.foreign.usd.texture_nodes import TextureNode, asset_bytes
 from storage.errors import Rejected, TrilightError
 
-Read = TypeVar("Read")
 ReadMaterial = Callable[[Any], StatedMaterial | None]
 
 _LOST = {
@@ -168,15 +167,9 @@ def _read_pictures(nodes: Sequence[TextureNode], bytes_left: int) -> MaterialFil
     return MaterialFiles(data=data, refused=refused)
 
 
-def cut_meshes(stage: UsdStage, limits: ReadLimits) -> Mapping[int, CutMesh]:
-    """Return the meshes of a stage that have triangles, by their index within it.
-
-    Raises:
-        Rejected: no_faces, too_many_faces, offset_precision.
-        TrilightError: arrays of a mesh contradict each other, or are not finite.
-    """
+def _cut_meshes(stage: UsdStage, max_faces: int) -> Mapping[int, CutMesh]:
     meshes: dict[int, CutMesh] = {}
-    faces_left = limits.max_faces
+    faces_left = max_faces
     farthest = 0.0
     for number, each in enumerate(stage.meshes):
         cut = cut_mesh(each, stage.time, faces_left)
@@ -209,38 +202,34 @@ class UsdSource:
         """
         self._path = path
         self._limits = limits
-        self.stage = read_or_reject(path, lambda: _read_stage(path, limits))
-        self._digest, bytes_left = _digest_files(self.stage.opened.files, limits.max_bytes)
-        missing = Rejected("no_materials", "materials were not asked for")
-        self._materials: StageMaterials | Rejected = missing
-        if limits.with_materials:
-            read = partial(_read_strictly, self.stage, normals=limits.with_normal_maps)
-            try:
-                self._materials = read_or_reject(
-                    path, lambda: read_stage_materials(self.stage, bytes_left, read)
-                )
-            except Rejected as why:
-                self._materials = Rejected(why.reason, why.message)  # its traceback holds the stage
-
-    @property
-    def sha256(self) -> str:
-        """Return the digest of all layers, the root first, and of the pictures of materials."""
-        digest = self._digest.copy()
-        if isinstance(self._materials, StageMaterials):
-            pictures = self._materials.pictures.data
+        with _reject_errors(path):
+            self.stage = _read_stage(path, limits)
+        digest = hashlib.sha256()
+        self._bytes_left = limits.max_bytes
+        for layer in self.stage.opened.files:
+            data = layer.read_bytes()
+            if len(data) > self._bytes_left:
+                why = f"the layers together; {self._bytes_left} bytes are left"
+                raise Rejected("too_large_bytes", why)
+            digest.update(data)
+            self._bytes_left -= len(data)
+        with contextlib.suppress(Rejected):
+            pictures = self.materials.pictures.data
             for place in sorted(pictures):
                 digest.update(pictures[place])
-        return digest.hexdigest()
-
-    @property
-    def unread(self) -> tuple[str, ...]:
-        """Return sentences on contents of the file that are not read, each once."""
-        return self.stage.opened.notes
+        self.sha256 = digest.hexdigest()
+        """Digest of all layers, the root first, and of the pictures of materials."""
 
     @cached_property
     def meshes(self) -> Mapping[int, CutMesh]:
-        """Return the meshes; raises Rejected as `cut_meshes`, or load_error."""
-        return read_or_reject(self._path, lambda: cut_meshes(self.stage, self._limits))
+        """Return the meshes that have triangles, by their index within the stage.
+
+        Raises:
+            Rejected: no_faces, too_many_faces, offset_precision, or load_error where arrays of a
+                mesh contradict each other, or are not finite.
+        """
+        with _reject_errors(self._path):
+            return _cut_meshes(self.stage, self._limits.max_faces)
 
     @cached_property
     def mesh(self) -> TriangleMesh:
@@ -252,33 +241,26 @@ class UsdSource:
             ]
         )
 
+    @cached_property
     def materials(self) -> StageMaterials:
         """Return the materials; raises Rejected as `read_stage_materials`, or no_materials."""
-        if isinstance(self._materials, Rejected):
-            raise self._materials
-        return self._materials
+        if not self._limits.with_materials:
+            raise Rejected("no_materials", "materials were not asked for")
+        read = partial(_read_strictly, self.stage, normals=self._limits.with_normal_maps)
+        with _reject_errors(self._path):
+            return read_stage_materials(self.stage, self._bytes_left, read)
 
 
-def _digest_files(files: Sequence[Path], bytes_left: int) -> "tuple[hashlib._Hash, int]":
-    """Return the digest of files, and the bytes that are left of their bound."""
-    digest = hashlib.sha256()
-    for path in files:
-        data = path.read_bytes()
-        if len(data) > bytes_left:
-            raise Rejected("too_large_bytes", f"the layers together; {bytes_left} bytes are left")
-        digest.update(data)
-        bytes_left -= len(data)
-    return digest, bytes_left
-
-
-def read_or_reject(path: Path, read: Callable[[], Read]) -> Read:
-    """Return the result of `read` for a USD file; its errors become reasons of Rejected.
+@contextlib.contextmanager
+def _reject_errors(path: Path) -> Iterator[None]:
+    """Turn the errors of reading a USD file into Rejected.
 
     Raises:
-        Rejected: external_uri, skinned_mesh, load_error, or as `read`.
+        Rejected: external_uri, skinned_mesh, load_error, or as the block.
     """
     try:
-        return read_quietly(path, read)
+        with read_quietly(path):
+            yield
     except TrilightError as error:
         reasons = {OutsideFile: "external_uri", UnposedMesh: "skinned_mesh"}
         raise Rejected(reasons.get(type(error), "load_error"), f"{error!s:.300}") from error

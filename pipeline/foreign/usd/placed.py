@@ -15,7 +15,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pipeline.foreign.numbers import FINITE, read_number
-from pipeline.foreign.usd.solids import SOLIDS
 from storage.errors import TrilightError
 from storage.settings.ranges import Within
 
@@ -130,6 +129,9 @@ MAX_NESTED = 150
 """Maximum nesting of prims, through prototypes too."""
 
 DOMES = ("DomeLight", "DomeLight_1")
+SOLIDS = ("Cube", "Sphere", "Cylinder", "Cylinder_1", "Cone", "Capsule", "Capsule_1", "Plane",
+          "TetMesh")  # fmt: skip
+"""Types of prims whose polygons are generated (pipeline.foreign.usd.polygons)."""
 LAMPS = ("RectLight", "DiskLight", "SphereLight", "CylinderLight")
 SCENE_KINDS = ("Mesh", *SOLIDS, "Camera", *LAMPS, *DOMES)
 """Types of prims that scenes are read from."""

@@ -20,10 +20,11 @@ too many or they take too long. A composed prim holds at most 32,767 sites, whic
 import re
 import time
 import zipfile
-from collections import Counter
-from collections.abc import Callable, Sequence
+from collections import defaultdict
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
 from pathlib import Path
-from typing import Any, NoReturn, TypeVar
+from typing import Any, NoReturn
 
 from pipeline.foreign.numbers import Malformed
 from storage.errors import TrilightError
@@ -93,16 +94,13 @@ class OpenedStage:
     @property
     def notes(self) -> tuple[str, ...]:
         """Return notes on unread contents, each kind once with the path of its first one."""
-        kinds = Counter[tuple[str, str]]()
-        first = dict[tuple[str, str], str]()
+        kinds: dict[tuple[str, str], list[str]] = defaultdict(list)
         for note in dict.fromkeys(self.lost):
             where, _, text = note.partition(": ")
-            kind = (where.partition(".")[2] if where.startswith("/") else where, text)
-            kinds[kind] += 1
-            first.setdefault(kind, note)
+            kinds[where.partition(".")[2] if where.startswith("/") else where, text].append(note)
         notes = [
-            first[kind] if count == 1 else f"{first[kind]} ({count} such)"
-            for kind, count in kinds.items()
+            alike[0] if len(alike) == 1 else f"{alike[0]} ({len(alike)} such)"
+            for alike in kinds.values()
         ]
         more = len(notes) - MAX_NOTES
         return tuple(notes if more <= 0 else [*notes[:MAX_NOTES], f"and {more} more"])
@@ -278,20 +276,18 @@ def _check_package(path: Path, size: int) -> None:
             raise TrilightError(f"{path.name}: member {member.filename!r:.80} leads outside.")
 
 
-Read = TypeVar("Read")
-
-
-def read_quietly(path: Path, read: Callable[[], Read]) -> Read:
-    """Return the result of `read` for a file, without USD's own warnings on standard error.
+@contextmanager
+def read_quietly(path: Path) -> Iterator[None]:
+    """Keep USD's own warnings on a file from standard error, and turn its errors into ours.
 
     Raises:
-        TrilightError: as `read`, or the file is broken or has a value of a wrong type.
+        TrilightError: as the block, or the file is broken or has a value of a wrong type.
     """
     from pxr import Tf, UsdUtils
 
     delegate = UsdUtils.CoalescingDiagnosticDelegate()
     try:
-        return read()
+        yield
     except Malformed as error:
         raise Malformed(f"{path.name}: {str(error).removeprefix(f'{path.name}: ')}.") from error
     except TrilightError:

@@ -21,19 +21,10 @@ def torus_faces(rows: int, columns: int) -> NDArray[np.int64]:
 
     The faces point to the side from which rows run upwards and columns to the left.
     """
-    row, column = np.divmod(np.arange(rows * columns), columns)
-    next_row = (row + 1) % rows
-    next_column = (column + 1) % columns
-    corners = np.stack(
-        [
-            row * columns + column,
-            next_row * columns + column,
-            next_row * columns + next_column,
-            row * columns + next_column,
-        ],
-        axis=1,
-    )
-    return corners[:, [0, 1, 2, 0, 2, 3]].reshape(-1, 3)
+    grid = np.arange(rows * columns).reshape(rows, columns)
+    above = np.roll(grid, -1, axis=0)
+    corners = [grid, above, np.roll(above, -1, axis=1), np.roll(grid, -1, axis=1)]
+    return np.stack(corners, axis=-1)[..., [0, 1, 2, 0, 2, 3]].reshape(-1, 3)
 
 
 def sphere_faces(rings: int, columns: int) -> NDArray[np.int64]:
@@ -44,13 +35,12 @@ def sphere_faces(rings: int, columns: int) -> NDArray[np.int64]:
     from above.
     """
     body = torus_faces(rings, columns)[: 2 * (rings - 1) * columns]
-    column = np.arange(columns)
-    next_column = (column + 1) % columns
+    ring = np.arange(columns)
+    shifted = np.roll(ring, -1)
     first = rings * columns
-    last = rings * columns + 1
-    start = (rings - 1) * columns
-    bottom = np.stack([np.full(columns, first), column, next_column], axis=1)
-    top = np.stack([np.full(columns, last), start + next_column, start + column], axis=1)
+    start = first - columns
+    bottom = np.stack([np.full(columns, first), ring, shifted], axis=1)
+    top = np.stack([np.full(columns, first + 1), start + shifted, start + ring], axis=1)
     return np.concatenate([bottom, body, top])[:, ::-1]
 
 
@@ -59,10 +49,9 @@ def sheet_faces(rows: int, columns: int) -> NDArray[np.int64]:
 
     The faces point to the side from which rows run upwards and columns to the right.
     """
-    row, column = np.divmod(np.arange((rows - 1) * (columns - 1)), columns - 1)
-    start = row * columns + column
-    corners = np.stack([start, start + 1, start + columns + 1, start + columns], axis=1)
-    return corners[:, [0, 1, 2, 0, 2, 3]].reshape(-1, 3)
+    grid = np.arange(rows * columns).reshape(rows, columns)
+    corners = [grid[:-1, :-1], grid[:-1, 1:], grid[1:, 1:], grid[1:, :-1]]
+    return np.stack(corners, axis=-1)[..., [0, 1, 2, 0, 2, 3]].reshape(-1, 3)
 
 
 def join(parts: Sequence[Mesh]) -> Mesh:
@@ -70,11 +59,6 @@ def join(parts: Sequence[Mesh]) -> Mesh:
     starts = np.cumsum([0] + [len(positions) for positions, _ in parts])
     faces = [part[1] + start for part, start in zip(parts, starts, strict=False)]
     return np.concatenate([positions for positions, _ in parts]), np.concatenate(faces)
-
-
-def scale_and_move(mesh: Mesh, offset: ArrayLike, scale: ArrayLike = 1.0) -> Mesh:
-    """Return the mesh scaled by positive numbers and then moved."""
-    return mesh[0] * np.asarray(scale) + np.asarray(offset), mesh[1]
 
 
 def taper_and_twist(
@@ -230,141 +214,3 @@ def _box_faces() -> NDArray[np.int64]:
 
 
 _BOX_FACES = _box_faces()
-
-
-_TOOTH = np.array([0.0, 0.0, 0.6, 1.0, 1.0, 0.6])
-"""Relative height of the outline at six equal steps of one tooth: gap, flank, tip, flank."""
-
-
-def sample_gear(rng: np.random.Generator) -> Mesh:
-    """Return a random gear, spur, helical or beveled: a closed surface of 168 triangles per tooth.
-
-    The cross section in a half plane through the axis is a closed loop; sweeping it around the axis
-    while the teeth push its outer corners in and out gives a torus. Sharp edges and flat faces are
-    what this family adds to the others.
-
-    Lengths are in radii of its tips; the web, the hub and its bore stay inside the roots.
-    """
-    kind = rng.choice(["spur", "helical", "bevel"])
-    half = rng.uniform(0.08, 0.35)  # half thickness of the rim
-    teeth = int(rng.integers(7, 19))
-    tooth_depth = rng.uniform(0.12, 0.25)  # from tip to root
-    cut = rng.uniform(0.01, 0.04)  # how far the edges of the teeth are cut back
-    bore = rng.uniform(0.08, 0.2)  # radius of the hole
-    hub = bore + rng.uniform(0.06, 0.14)  # radius of the ring around the bore
-    hub_z = half * rng.uniform(0.9, 1.8)  # half height of that ring
-    rim = 1 - tooth_depth - rng.uniform(0.14, 0.2)  # inner radius of the ring below the roots
-    web_z = half * rng.uniform(0.25, 0.8)  # half height between hub and rim
-    # Turn of the teeth from the middle to the top, and relative growth of the outline.
-    helix_rad = rng.uniform(-0.35, 0.35) if kind == "helical" else 0.0
-    cone = rng.uniform(-0.15, 0.15) if kind == "bevel" else 0.0
-    upper = [(1.0, half - cut), (1 - cut, half), (rim, half), (rim, web_z)]
-    upper += [(hub, web_z), (hub, hub_z), (bore, hub_z)]
-    section = np.array(upper + [(radius, -height) for radius, height in reversed(upper)])
-    toothed = np.isin(np.arange(len(section)), (0, 1, 12, 13))
-    rows = len(_TOOTH) * teeth
-    drop = tooth_depth * (1 - np.tile(_TOOTH, teeth))
-    level = section[:, 1] / half
-    angle = 2 * np.pi * np.arange(rows)[:, None] / rows + helix_rad * level * toothed
-    radius = section[:, 0] - drop[:, None] * toothed
-    radius = np.where(toothed, radius * (1 + cone * level), radius)
-    height = np.broadcast_to(section[:, 1], radius.shape)
-    grid = np.stack([radius * np.cos(angle), radius * np.sin(angle), height], axis=-1)
-    return grid.reshape(-1, 3), torus_faces(rows, len(section))
-
-
-def sample_rock(rng: np.random.Generator) -> Mesh:
-    """Return a random rock: a closed surface, star-shaped about the origin, from a unit ball.
-
-    Planes cut it, softly or sharply, with bumps and with layers: large flat facets that meet at any
-    angle, unlike on a grid of rings.
-    """
-    kind = rng.choice(["pebble", "broken", "layered"])
-    cuts = _rand_cuts(rng, int(rng.integers(9, 22)))
-    sizes = rng.uniform(0.55, 1.0, 3)  # stretch along x, y and z
-    # Bumps over the surface: waves per radius along x, y and z, and a phase.
-    waves = rng.normal(size=(12, 4)) * [0.5, 0.5, 0.5, 3.0]
-    sharpness = rng.uniform(5, 12) if kind == "pebble" else rng.uniform(16, 36)
-    bump_height = rng.uniform(0.1, 0.4) if kind == "pebble" else rng.uniform(0.02, 0.1)
-    layers = rng.uniform(1.6, 3.2) if kind == "layered" else 0.0  # per radius of height
-    layer_depth = rng.uniform(0.06, 0.16)  # how far joints between layers are cut back
-    frequency = rng.integers(*{"pebble": (5, 10), "broken": (9, 16)}.get(kind, (14, 18)))
-    direction, faces = icosphere(int(frequency))
-    radius = _cut_ball(direction, cuts, sharpness)
-    swing = np.sin(2 * np.pi * direction @ waves[:, :3].T + waves[:, 3]).mean(axis=1)
-    radius = radius * (1 + bump_height * swing)
-    if layers:
-        height = layers * (radius * direction[:, 2] + 0.1 * direction[:, 0])
-        # A narrow joint per layer: the fourth power of a wave is flat but near its crest.
-        joint = np.cos(np.pi * height) ** 4
-        radius = radius - layer_depth * joint * radius * (1 - direction[:, 2] ** 2)
-    return direction * radius[:, None] * sizes, faces
-
-
-def _cut_ball(
-    direction: NDArray[np.float64], planes: NDArray[np.float64], sharpness: float
-) -> NDArray[np.float64]:
-    """Return the distance [N] of the cut ball's surface in each direction [N, 3].
-
-    The hard surface is the nearest plane [K, 4]: a unit direction and the distance from the center.
-    The norm of the inverse distances rounds its edges: 6 is a pebble, 30 a broken stone.
-    """
-    inverse = np.maximum(direction @ planes[:, :3].T, 0) / planes[:, 3]
-    every = np.concatenate([inverse, np.ones((len(direction), 1))], axis=1)
-    return (every**sharpness).sum(axis=1) ** (-1 / sharpness)
-
-
-def _rand_cuts(rng: np.random.Generator, count: int) -> NDArray[np.float64]:
-    """Return planes [count, 4] in even directions with a random rotation and noise."""
-    index = np.arange(count) + 0.5
-    z = 1 - 2 * index / count
-    azimuth = np.pi * (1 + np.sqrt(5)) * index + rng.uniform(0, 6)
-    ring = np.sqrt(1 - z * z)
-    spread = np.stack([ring * np.cos(azimuth), ring * np.sin(azimuth), z], axis=1)
-    spread += rng.normal(size=spread.shape) * 0.35
-    spread /= np.linalg.norm(spread, axis=1, keepdims=True)
-    return np.column_stack([spread, rng.uniform(0.55, 0.9, count)])
-
-
-def sample_vase(rng: np.random.Generator) -> Mesh:
-    """Return a random vase: a closed surface (outside, lip, inside).
-
-    Its wall of even thickness is lathed around a smooth profile, plain, fluted or swirled. Unlike
-    closed bodies, open vessels let light in, and their inside shades itself.
-    """
-    # Outer radii at equal heights from foot to lip, joined by a smooth curve.
-    radii = rng.uniform(0.16, 0.55, int(rng.integers(4, 7)))
-    flutes = int(rng.choice([0, 0, 5, 6, 8, 10]))  # folds around the vase; 0 is plain
-    columns = int(rng.integers(28, 45))
-    columns -= columns % max(flutes, 1)  # so that all flutes are alike
-    height = rng.uniform(0.7, 1.6)
-    wall = rng.uniform(0.025, 0.06)  # thickness of wall and bottom
-    flute_depth = rng.uniform(0.1, 0.35)  # as a share of the radius
-    swirl_rad = rng.uniform(-0.8, 0.8)  # turn of the folds from foot to lip
-    rings = int(rng.integers(14, 21))  # from foot to lip
-    level = np.linspace(0, 1, rings)
-    inner_height = wall + (height - wall) * level
-    inner = _smooth(radii, inner_height / height) - wall
-    radius = np.concatenate([_smooth(radii, level), inner[::-1]])
-    heights = np.concatenate([height * level, inner_height[::-1]])
-    azimuth = 2 * np.pi * np.arange(columns) / columns
-    phase = flutes * (azimuth[None] + swirl_rad * heights[:, None] / height)
-    fold = 1 - flute_depth * (0.5 - 0.5 * np.cos(phase)) * bool(flutes)
-    folded = radius[:, None] * fold
-    upright = np.broadcast_to(heights[:, None], folded.shape)
-    grid = np.stack([folded * np.cos(azimuth), folded * np.sin(azimuth), upright], axis=-1)
-    poles = [[0.0, 0.0, 0.0], [0.0, 0.0, wall]]
-    return np.concatenate([grid.reshape(-1, 3), poles]), sphere_faces(2 * rings, columns)
-
-
-def _smooth(values: NDArray[np.float64], where: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Evaluate a Catmull-Rom curve through equally spaced `values` at positions in [0, 1].
-
-    The curve may overshoot the values by an eighth of their differences; callers leave a margin.
-    """
-    padded = np.concatenate([[2 * values[0] - values[1]], values, [2 * values[-1] - values[-2]]])
-    position = np.clip(where, 0, 1) * (len(values) - 1)
-    segment = np.minimum(position.astype(np.int64), len(values) - 2)
-    step = (position - segment)[:, None] ** np.arange(4)
-    basis = 0.5 * np.array([[0, 2, 0, 0], [-1, 0, 1, 0], [2, -5, 4, -1], [-1, 3, -3, 1]])
-    return np.einsum("nk,kj,nj->n", step, basis, padded[segment[:, None] + np.arange(4)])

@@ -9,8 +9,7 @@ import csv
 import io
 import json
 import os
-from collections.abc import Callable, Iterator, Sequence
-from dataclasses import replace
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -21,7 +20,7 @@ from pipeline.objects.file_filters import (
     drop_scenes,
     warn_unread_formats,
 )
-from pipeline.objects.licences import UNKNOWN, StatedLicence, require_unstated, stated_licence
+from pipeline.objects.licences import UNKNOWN, require_unstated, stated_licence
 from pipeline.objects.listing import Listing, assign_uids, failure, is_object_file
 from storage.errors import Rejected, TrilightError
 from storage.records.objects import ObjectRecord
@@ -32,22 +31,28 @@ from storage.remote.safe_url import printable, public_text
 CATALOGUE_NAMES = ("objects.jsonl", "objects.csv")
 
 
-def only_catalogue(exists: Callable[[str], bool], kind: str = "objects") -> str | None:
+def only_catalogue(
+    exists: Callable[[str], bool], licence: str | None, kind: str = "objects"
+) -> str | None:
     """Return the name of a folder's catalogue, or None where it has none.
 
     Args:
         exists: returns True where the folder has a file of this name.
+        licence: the user's licence for files without a statement.
         kind: name of the catalogue: objects, textures or skies.
 
     Raises:
-        TrilightError: the folder has both.
+        TrilightError: the folder has both, or a catalogue and a `licence`.
     """
     present = [name for end in ("jsonl", "csv") if exists(name := f"{kind}.{end}")]
     if len(present) > 1:
         raise TrilightError(
             f"{kind}: the folder has {' and '.join(present)}; expected one catalogue. Remove one."
         )
-    return present[0] if present else None
+    if not present:
+        return None
+    require_unstated(licence, present[0])
+    return present[0]
 
 
 def read_catalogue(path: Path) -> list[ObjectRecord]:
@@ -221,14 +226,13 @@ def list_folder(folder: Path, licence: str | None) -> Listing:
             f"objects {display_path!r} {problem}; expected a folder of {' '.join(SUFFIXES)} "
             "files, or procedural: for built-in objects."
         )
-    catalogue = only_catalogue(lambda name: (folder / name).exists())
+    catalogue = only_catalogue(lambda name: (folder / name).exists(), licence)
     if catalogue is None:
-        return scan_folder(folder, stated_licence(licence))
-    require_unstated(licence, catalogue)
+        return _scan_folder(folder, licence)
     return Listing(records=read_catalogue(folder / catalogue), failures=[])
 
 
-def scan_folder(folder: Path, licence: StatedLicence) -> Listing:
+def _scan_folder(folder: Path, licence: str | None) -> Listing:
     """Return a record for every object file below `folder`, at any depth.
 
     Hidden files are left out (macOS writes `._name.obj` next to `name.obj`), and linked folders are
@@ -253,7 +257,7 @@ def scan_folder(folder: Path, licence: StatedLicence) -> Listing:
 
 def list_files(
     names: Sequence[str],
-    licence: StatedLicence,
+    licence: str | None,
     locate: Callable[[str], dict[str, str]],
     drop_more: Callable[[list[str]], list[str]] = list,
 ) -> Listing:
@@ -261,11 +265,15 @@ def list_files(
 
     Args:
         names: all files of the folder, with / between the parts of their paths.
-        licence: licence of every file.
+        licence: the user's licence for files without a statement.
         locate: returns the fields of a file's record that say where it is; raises Rejected or
             TransferFailed, which becomes a failure of that object.
         drop_more: returns the object files without others that are none.
+
+    Raises:
+        TrilightError: `licence` does not have the form of an identifier.
     """
+    stated = stated_licence(licence)
     names = drop_outputs(names)
     files = [name for name in names if is_object_file(name)]
     warn_unread_formats(names, files)
@@ -273,7 +281,7 @@ def list_files(
     records = []
     for name, uid in uids.items():
         try:
-            records.append(replace(file_record(uid, "", licence), **locate(name)))
+            records.append(file_record(uid, {**stated, **locate(name)}))
         except (Rejected, TransferFailed) as error:
             failures.append(failure(uid, error.reason, error.message))
     return Listing(records=records, failures=failures)
@@ -285,17 +293,10 @@ def is_below(root: Path, path: Path) -> bool:
     return Path(os.path.realpath(path)).is_relative_to(root)
 
 
-def file_record(uid: str, path: str, licence: StatedLicence) -> ObjectRecord:
-    """Return the record of a file without a catalogue row."""
-    return ObjectRecord(
-        uid=uid,
-        path=path,
-        title=uid.rpartition("/")[2],
-        licence=licence.licence,
-        licence_source=licence.licence_source,
-        attribution="",
-        source_url="",
-    )
+def file_record(uid: str, stated: Mapping[str, str]) -> ObjectRecord:
+    """Return the record of a file without a catalogue row; `stated` has its path and licence."""
+    defaults = {"title": uid.rpartition("/")[2], "attribution": "", "source_url": ""}
+    return ObjectRecord(uid=uid, **{**defaults, **stated})
 
 
 def walk_files(root: Path) -> list[str]:

@@ -12,12 +12,7 @@ from operator import attrgetter
 from pathlib import Path
 
 from pipeline.objects.file_filters import drop_outputs
-from pipeline.objects.licences import (
-    StatedLicence,
-    refuse_licences,
-    require_unstated,
-    stated_licence,
-)
+from pipeline.objects.licences import refuse_licences, stated_licence
 from pipeline.objects.listing import failure
 from pipeline.objects.local.folder import (
     file_record,
@@ -91,12 +86,11 @@ def find_maps(
             f"{suffixes} files. Download them first where they are on a server."
         )
     stated = stated_licence(licence)
-    catalogue = only_catalogue(lambda name: (root / name).exists(), plural)
+    catalogue = only_catalogue(lambda name: (root / name).exists(), licence, plural)
     failures: list[Failure] = []
     if catalogue is None:
         records = _scan_pictures(kind, root, stated, failures)
     else:
-        require_unstated(licence, catalogue)
         rows = read_catalogue(root / catalogue)
         records = [replace(row, uid=f"{kind}:{row.uid}") for row in rows]
     if not records and not failures:
@@ -123,7 +117,8 @@ def _with_files(kind: str, root: Path, records: Sequence[ObjectRecord]) -> list[
         if folder.is_dir():
             inner = folder.relative_to(root)
             names = [(inner / name).as_posix() for name in os.listdir(folder)]
-            for files in group_textures(_pictures(names))[0].values():
+            pictures = [n for n in names if n.lower().endswith(PICTURES) and not _is_hidden(n)]
+            for files in group_textures(pictures)[0].values():
                 textures[files["base"]] = files
     maps = []
     for row in records:
@@ -137,7 +132,7 @@ def _with_files(kind: str, root: Path, records: Sequence[ObjectRecord]) -> list[
 
 
 def _scan_pictures(
-    kind: str, root: Path, stated: StatedLicence, failures: list[Failure]
+    kind: str, root: Path, stated: Mapping[str, str], failures: list[Failure]
 ) -> list[ObjectRecord]:
     """Return a record of each texture or map, and add a failure for each other picture."""
     every = [name for name in drop_outputs(walk_files(root)) if not _is_hidden(name)]
@@ -172,12 +167,8 @@ def _scan_pictures(
             failures.append(failure(f"{kind}:{printable(name)}", "name_clash", message))
         else:
             title = printable(stem).rpartition("/")[2]
-            records[uid] = replace(file_record(uid, str(root / name), stated), title=title)
+            records[uid] = file_record(uid, {**stated, "path": str(root / name), "title": title})
     return list(records.values())
-
-
-def _pictures(names: Sequence[str]) -> list[str]:
-    return [n for n in names if n.lower().endswith(PICTURES) and not _is_hidden(n)]
 
 
 def _is_hidden(name: str) -> bool:

@@ -24,8 +24,8 @@ from safetensors.numpy import save
 from scipy.sparse import csr_array
 
 from pipeline.foreign.linear_picture import clip_to_unit
-from pipeline.foreign.picture import UNREADABLE_PICTURE, read_linear_picture
-from pipeline.objects.maps.texture_names import TEXTURE_PARTS, packed_channels
+from pipeline.foreign.picture import FORMATS, UNREADABLE_PICTURE, read_linear_picture
+from pipeline.objects.maps.texture_names import PACKED, TEXTURE_PARTS
 from storage.conventions import linear_from_srgb
 from storage.digests import canonical_json, sha256_hex
 from storage.errors import Rejected
@@ -100,7 +100,6 @@ MOST_NEGATIVE = 1e-3
 MAX_PIXELS = 1 << 26
 """Most pixels of a picture: 8192 x 8192."""
 
-_FORMATS = ("PNG", "JPEG", "TIFF", "BMP", "TGA", "WEBP")
 _MOST = {"I;16": 65535, "I;16L": 65535, "I;16B": 65535, "I": 65535}
 
 
@@ -151,9 +150,12 @@ def prepare_map(kind: str, files: Mapping[str, Path], size: int) -> tuple[bytes,
     pictures: dict[str, NDArray[np.float32]] = {}
     unread: list[str] = []
     for part, path in sorted(files.items()):
-        values, notes = _picture_of(part, path)
+        try:
+            values, notes = picture_values(_read(path), is_color=part == "base")
+        except Rejected as rejection:
+            raise Rejected(rejection.reason, f"{part}: {rejection.message}") from rejection
         unread += [f"{note} of its {part}" for note in notes]
-        if packed_channels(part) and values.shape[2] < 3:
+        if part in PACKED and values.shape[2] < 3:
             unread.append(f"its {part}, which is gray: it has no channels")
         pictures[part] = values
     if "base" in pictures and are_normals(pictures["base"]):
@@ -185,7 +187,8 @@ def texture_set(pictures: Mapping[str, NDArray[np.float32]], size: int) -> Prepa
         size: most texels along a side of the result.
     """
     base = pictures["base"]
-    height, width = _fitting_size(base.shape[:2], size)
+    shrink = min(1.0, size / max(base.shape[:2]))
+    height, width = (max(1, round(side * shrink)) for side in base.shape[:2])
 
     def means(values: NDArray) -> NDArray[np.float64]:
         return area_means(values, height, width)
@@ -210,13 +213,6 @@ def texture_set(pictures: Mapping[str, NDArray[np.float32]], size: int) -> Prepa
     return PreparedMap(content_sha256=content_digest("base colour", base), arrays=arrays)
 
 
-def _fitting_size(shape: tuple[int, ...], size: int) -> tuple[int, int]:
-    """Return height and width with the proportions of a picture and no side over `size`."""
-    shrink = min(1.0, size / max(shape))
-    height, width = (max(1, round(side * shrink)) for side in shape)
-    return height, width
-
-
 def _grey(values: NDArray[np.float32]) -> NDArray[np.float32]:
     return values.mean(axis=2, keepdims=True, dtype=np.float32)
 
@@ -231,20 +227,12 @@ def unpack_parts(
     """Return the components of a texture; separate pictures win over packed channels."""
     parts = dict(pictures)
     for name, values in pictures.items():
-        for part, channel in packed_channels(name).items():
+        for part, channel in PACKED.get(name, {}).items():
             if part not in parts and values.shape[2] == 3:
                 parts[part] = values[..., channel : channel + 1]
     if "gloss" in parts and "roughness" not in parts:
         parts["roughness"] = 1 - parts["gloss"]
     return {part: values for part, values in parts.items() if part in TEXTURE_PARTS}
-
-
-def _picture_of(part: str, path: Path) -> tuple[NDArray[np.float32], tuple[str, ...]]:
-    """Return a picture's values and notes on unread parts; a rejection names the component."""
-    try:
-        return picture_values(_read(path), is_color=part == "base")
-    except Rejected as rejection:
-        raise Rejected(rejection.reason, f"{part}: {rejection.message}") from rejection
 
 
 def _read(path: Path) -> bytes:
@@ -304,7 +292,7 @@ def _plain_values(data: bytes) -> tuple[NDArray[np.float32], bool]:
     """Return a picture of another format, and True where its values are linear floats."""
     is_linear = False
     try:
-        with Image.open(io.BytesIO(data), formats=_FORMATS) as image:
+        with Image.open(io.BytesIO(data), formats=FORMATS) as image:
             if image.width * image.height > MAX_PIXELS or max(image.size) > MAX_SIDE:
                 raise _too_large(image.width, image.height)
             if image.mode in _MOST:

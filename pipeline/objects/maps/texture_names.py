@@ -62,7 +62,7 @@ _OTHER_LANGUAGES: Mapping[str, str] = {
 """The same in German, French, Spanish, Italian, Portuguese, Polish, Dutch, Russian, Chinese and
 Japanese, without accents."""
 
-_PACKED: Mapping[str, Mapping[str, int]] = {
+PACKED: Mapping[str, Mapping[str, int]] = {
     "orm": {"roughness": 1, "metallic": 2},
     "rma": {"roughness": 0, "metallic": 1},
     "mra": {"metallic": 0, "roughness": 1},
@@ -73,7 +73,7 @@ _PACKED: Mapping[str, Mapping[str, int]] = {
 TEXTURE_PARTS = ("base", "specular", "roughness", "metallic")
 """Components of a texture that are read."""
 
-_READ = (*TEXTURE_PARTS, "gloss", *_PACKED)
+_READ = (*TEXTURE_PARTS, "gloss", *PACKED)
 
 _LETTERS = {"b": "base", "c": "base", "d": "base", "n": "normal", "r": "roughness", "h": "height"}
 _UNCLEAR = ("a", "e", "g", "m", "o", "s")
@@ -134,11 +134,6 @@ class _ParsedName:
     part: str
     kind: str = ""
     """Color variant of the set that the file is, or belongs to."""
-
-
-def packed_channels(part: str) -> Mapping[str, int]:
-    """Return the channels of a packed picture by component; empty for other components."""
-    return _PACKED.get(part, {})
 
 
 def group_textures(
@@ -266,28 +261,27 @@ def _without_accents(name: str) -> str:
 
 def _add_letters(stems: Mapping[str, str], named: dict[str, _ParsedName]) -> None:
     """Add files whose names end in a letter, where their set or a color explains it."""
-    letters: dict[str, dict[str, tuple[str, str]]] = defaultdict(dict)
+    letters: dict[str, dict[str, str]] = defaultdict(dict)
     for name, stem in stems.items():
         match = _LETTER.fullmatch(stem) if name not in named else None
         if match is not None:
-            key = f"{match['set']}{match['tail']}"
-            letters[key][name] = match["letter"].lower(), f"{match['set']}{match['tail']}"
+            letters[f"{match['set']}{match['tail']}"][name] = match["letter"].lower()
     parsed_keys = {entry.key for entry in named.values()}
     bare = {stem for name, stem in stems.items() if name not in named}
     for key, files in letters.items():
-        said = {letter for letter, _ in files.values()}
+        said = {*files.values()}
         is_set = said <= {*_LETTERS, *_UNCLEAR} and len(said & {"b", "c", "d"}) == 1
         beside_color = key in bare and said <= {"n", "s", "r", "h", "e"}
         if beside_color or (is_set and ("n" in said or key in parsed_keys)):
-            for name, (letter, stem) in files.items():
-                named[name] = _ParsedName(key, stem, _LETTERS.get(letter, "other"))
+            for name, letter in files.items():
+                named[name] = _ParsedName(key, key, _LETTERS.get(letter, "other"))
 
 
 def _drop_packed(parts: Iterable[dict[str, str]], unused: dict[str, tuple[str, str]]) -> None:
     """Leave out packed pictures whose components exist as separate pictures."""
     for files in parts:
-        for part in [part for part in files if part in _PACKED]:
-            if all(other in files for other in _PACKED[part]):
+        for part in [part for part in files if part in PACKED]:
+            if all(other in files for other in PACKED[part]):
                 message = "its channels are here as pictures of their own"
                 unused[files.pop(part)] = ("map_not_used", message)
         if "roughness" in files and "gloss" in files:

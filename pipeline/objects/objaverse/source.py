@@ -3,7 +3,6 @@
 Files stay where the package `objaverse` keeps them, which other programs use too.
 """
 
-import dataclasses
 import difflib
 import gzip
 import json
@@ -55,7 +54,6 @@ _URL = RemoteUrl(
 _FOLDER = Path("~/.objaverse/hf-objaverse-v1")
 _MOST_BYTES = 1 << 34
 """Largest file that is downloaded; the mesh stage has limits of its own."""
-_THREADS = 8
 _PLACE = re.compile(r"glbs/[\w-]+/[\w-]+\.glb")
 
 
@@ -181,11 +179,10 @@ def _record(uid: str, annotation: dict[str, Any]) -> ObjectRecord:
 
 
 def _fetch(files: _ObjaverseFiles, records: list[ObjectRecord], downloaded: CountDone) -> Fetched:
-    def fetch(record: ObjectRecord) -> ObjectRecord:
-        path = files.fetch(files.paths[record.uid.removeprefix(_name(""))])
-        return dataclasses.replace(record, path=str(path))
+    def fetch(record: ObjectRecord) -> Path:
+        return files.fetch(files.paths[record.uid.removeprefix(_name(""))])
 
-    return fetch_all(records, fetch, downloaded, threads=_THREADS, stop=threading.Event())
+    return fetch_all(records, fetch, downloaded, threading.Event())
 
 
 def _name(uid: str) -> str:

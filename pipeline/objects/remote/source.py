@@ -19,7 +19,6 @@ from pathlib import Path
 from typing import Any, BinaryIO, cast
 from urllib.parse import quote, unquote, urlsplit
 
-from pipeline.objects.licences import StatedLicence, require_unstated, stated_licence
 from pipeline.objects.listing import CountDone, Fetched, Listing, fetch_all
 from pipeline.objects.local.folder import (
     CATALOGUE_NAMES,
@@ -50,7 +49,6 @@ _MAX_DEPTH = 32
 """Maximum depth of folders: a server may answer every address with the same page."""
 MAX_BYTES = 200_000_000
 """Largest downloaded object with its buffers, in bytes: the limit of the mesh stage."""
-THREADS = 8
 
 
 class RemoteFolder:
@@ -351,11 +349,10 @@ def list_remote(url: RemoteUrl, licence: str | None) -> Listing:
             its catalogue is wrong, or there are a catalogue and a `licence`.
     """
     folder = RemoteFolder(url)
-    catalogue = only_catalogue(folder.has)
+    catalogue = only_catalogue(folder.has, licence)
     if catalogue is None:
-        listing = _list_object_files(folder, stated_licence(licence))
+        listing = _list_object_files(folder, licence)
     else:
-        require_unstated(licence, catalogue)
         listing = Listing(records=_list_catalogue(folder, catalogue), failures=[])
     return dataclasses.replace(listing, fetch=partial(_fetch, folder))
 
@@ -375,7 +372,7 @@ def _list_catalogue(folder: RemoteFolder, catalogue: str) -> list[ObjectRecord]:
     ]
 
 
-def _list_object_files(folder: RemoteFolder, licence: StatedLicence) -> Listing:
+def _list_object_files(folder: RemoteFolder, licence: str | None) -> Listing:
     names = folder.names()
     for catalogue in set(CATALOGUE_NAMES) & set(names):
         # without the catalogue, the run could use objects that it forbids
@@ -391,12 +388,12 @@ def _list_object_files(folder: RemoteFolder, licence: StatedLicence) -> Listing:
 
 
 def _fetch(folder: RemoteFolder, records: list[ObjectRecord], downloaded: CountDone) -> Fetched:
-    def fetch(record: ObjectRecord) -> ObjectRecord:
+    def fetch(record: ObjectRecord) -> Path:
         name = folder.name_of(record)
         try:
-            return dataclasses.replace(record, path=str(folder.fetch_object(name)))
+            return folder.fetch_object(name)
         except TransferFailed as error:
             message = f"{folder.display_url(name)}: {error.message}"
             raise TransferFailed(error.reason, message) from error
 
-    return fetch_all(records, fetch, downloaded, threads=THREADS, stop=folder.stop)
+    return fetch_all(records, fetch, downloaded, folder.stop)

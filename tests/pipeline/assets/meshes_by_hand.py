@@ -14,8 +14,7 @@ from pipeline.assets.prepare import prepare_asset
 from pipeline.assets.quality.measure import level_mesh
 from pipeline.assets.settings import AssetSettings
 from pipeline.foreign.mesh import TriangleMesh, join_meshes
-from pipeline.objects.builtin.superquadric import superquadric
-from pipeline.objects.builtin.torus_knot import torus_knot
+from pipeline.objects.builtin.surfaces import superquadric, torus_knot
 from storage.errors import Rejected
 from storage.records.asset import Asset
 from storage.records.objects import ObjectRecord

@@ -22,7 +22,7 @@ from pipeline.assets.settings import AssetSettings, GateSettings
 from pipeline.foreign.mesh import TriangleMesh
 from pipeline.generation.prepare_isolated import mesh_stage
 from pipeline.objects.generated import generate_objects
-from pipeline.objects.sources import find_objects
+from pipeline.objects.sources import list_objects
 from pipeline.presets.registry import preset_settings
 from pipeline.renders.mitsuba_variant import vector_extension
 from storage.digests import canonical_json, sha256_hex
@@ -205,7 +205,8 @@ LICENCES = ("CC0-1.0", "LicenseRef-unknown", "LicenseRef-Stanford-3D-Scanning-Re
 def records(shared: Path, tmp_path_factory: pytest.TempPathFactory) -> list[ObjectRecord]:
     """All that the catalogue lists, whatever their licences: nothing is made of them here."""
     source, work_dir = str(shared / "objects"), tmp_path_factory.mktemp("work")
-    return list(find_objects(source, work_dir=work_dir, allowed_licences=LICENCES).records)
+    listed = list_objects(source, work_dir=work_dir, allowed_licences=LICENCES)
+    return listed.fetch_selected().records
 
 
 @pytest.mark.parametrize("step", [27, pytest.param(2, marks=pytest.mark.slow("every"))])

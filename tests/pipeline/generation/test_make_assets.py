@@ -14,7 +14,7 @@ from infra.cli import assets
 from pipeline.assets.settings import AssetSettings, OwnMaterialSettings
 from pipeline.generation.make_assets import AssetFolder, AssetReport, make_assets
 from pipeline.objects.licences import DEFAULT_ALLOWED
-from pipeline.objects.sources import find_objects
+from pipeline.objects.sources import list_objects
 from storage.errors import TrilightError
 from storage.records.objects import read_failures
 from tests.command_line import trilight
@@ -105,7 +105,8 @@ def test_every_object_has_its_outcome_and_meshes_open_elsewhere(
 
 def test_the_folder_is_a_source_of_objects(made: tuple[Path, AssetReport], tmp_path: Path) -> None:
     out, report = made
-    found = find_objects(str(out), work_dir=tmp_path, allowed_licences=DEFAULT_ALLOWED)
+    listed = list_objects(str(out), work_dir=tmp_path, allowed_licences=DEFAULT_ALLOWED)
+    found = listed.fetch_selected()
     assert not found.failures
     assert [record.uid for record in found.records] == [row.uid for row in report.rows]
     for record, row in zip(found.records, report.rows, strict=True):

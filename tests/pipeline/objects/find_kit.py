@@ -4,7 +4,8 @@ from pathlib import Path
 from typing import Any
 
 from pipeline.objects.licences import DEFAULT_ALLOWED
-from pipeline.objects.sources import FoundObjects, find_objects
+from pipeline.objects.listing import Listing
+from pipeline.objects.sources import list_objects
 
 
 def touch(folder: Path, *names: str) -> None:
@@ -14,10 +15,11 @@ def touch(folder: Path, *names: str) -> None:
         path.write_text("v 0 0 0")
 
 
-def find(source: Path | str, **options: Any) -> FoundObjects:
+def find(source: Path | str, **options: Any) -> Listing:
     options = {"allowed_licences": DEFAULT_ALLOWED, "work_dir": Path("unused"), **options}
-    return find_objects(str(source), **options)
+    selection = {name: options.pop(name) for name in {*options} & {"downloaded"}}
+    return list_objects(str(source), **options).fetch_selected(**selection)
 
 
-def reasons(found: FoundObjects) -> dict[str, str]:
+def reasons(found: Listing) -> dict[str, str]:
     return {failure.item: failure.reason for failure in found.failures}

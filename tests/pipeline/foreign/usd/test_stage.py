@@ -20,7 +20,8 @@ HEAD = "#usda 1.0\n"
 
 
 def prims_of(path: Path) -> list[str]:
-    stage = read_quietly(path, OpenedStage(path).compose)
+    with read_quietly(path):
+        stage = OpenedStage(path).compose()
     return [str(prim.GetPath()) for prim in stage.Traverse()]
 
 
@@ -81,7 +82,8 @@ def test_brackets_in_the_name_of_a_folder_are_no_archive(tmp_path: Path, packed:
             (folder / name).write_text(text)
         assert asset_bytes(f"{folder}/lib.usda", 100) == layers["lib.usda"].encode()
     opened = OpenedStage(folder / ("s.usdz" if packed else "s.usda"))
-    stage = read_quietly(opened.path, opened.compose)
+    with read_quietly(opened.path):
+        stage = opened.compose()
     assert [str(prim.GetPath()) for prim in stage.Traverse()] == ["/x", "/x/L"]
     assert opened.files == [opened.path, *([] if packed else [folder / "lib.usda"])]
 
@@ -114,7 +116,8 @@ def test_the_user_may_name_the_folder_and_the_stage_is_compared_with_it_at_last(
 def test_what_is_missing_is_noted(tmp_path: Path) -> None:
     (tmp_path / "a.usda").write_text(f'{HEAD}def "A" (references = @./no.usda@</A>) {{}}')
     opened = OpenedStage(tmp_path / "a.usda")
-    read_quietly(opened.path, opened.compose)
+    with read_quietly(opened.path):
+        opened.compose()
     assert opened.lost == ["file './no.usda' is missing"]
 
 

@@ -7,9 +7,9 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
-from pipeline.objects.builtin import lattice
+from pipeline.objects.builtin import surfaces
 from pipeline.objects.builtin.solids import Mesh
-from pipeline.objects.builtin.torus_knot import torus_knot
+from pipeline.objects.builtin.surfaces import torus_knot
 from pipeline.objects.generated import FAMILIES
 from storage.digests import sha256_hex
 from storage.seeds import rng_for
@@ -145,8 +145,8 @@ def _lattice(cells: tuple[int, int, int], **changes: object) -> Mesh:
     }  # fmt: skip
     stated = SimpleNamespace(cells=cells, **(shape | changes))
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(lattice, "_Lattice", lambda _: stated)
-        return lattice.sample_lattice(rng_for(0, "any"))
+        patch.setattr(surfaces, "_Lattice", lambda _: stated)
+        return surfaces.sample_lattice(rng_for(0, "any"))
 
 
 def _graph(x: int, y: int, z: int) -> tuple[int, int]:

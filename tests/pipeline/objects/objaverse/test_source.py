@@ -11,8 +11,8 @@ from typing import Any
 
 import pytest
 
+from pipeline.objects.listing import Listing
 from pipeline.objects.objaverse import source as objaverse
-from pipeline.objects.sources import FoundObjects
 from storage.errors import TrilightError
 from tests.for_each import for_each
 from tests.http_server import Fault, Site
@@ -64,15 +64,15 @@ def fill_site(site: Site) -> None:
         site.files[glb(name)] = f"glTF {name}".encode()
 
 
-def find(text: str, **options: Any) -> FoundObjects:
+def find(text: str, **options: Any) -> Listing:
     return find_kit.find(f"objaverse:{text}", **options)
 
 
-def found_names(found: FoundObjects) -> list[str]:
+def found_names(found: Listing) -> list[str]:
     return [NAME[record.uid.removeprefix("objaverse/")] for record in found.records]
 
 
-def reasons(found: FoundObjects) -> dict[str, str]:
+def reasons(found: Listing) -> dict[str, str]:
     return {
         NAME.get(one.item.removeprefix("objaverse/"), one.item): one.reason
         for one in found.failures
@@ -101,7 +101,7 @@ def test_uids_come_with_their_rights(site: Site, place: Path) -> None:
     assert a.source_url == "https://v/a"
     assert Path(a.path).read_text() == "glTF a"
     assert (by_name["b"].licence, by_name["c"].licence) == ("CC-BY-SA-4.0", "CC0-1.0")
-    assert found.failures == ()
+    assert found.failures == []
     site.requests.clear()
     assert find(f"{UID['a']},{UID['b']},{UID['c']}") == found
     assert site.requests == []
