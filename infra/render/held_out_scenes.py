@@ -15,6 +15,7 @@ from pipeline.isolation import ChildLimits, IsolatedChild
 from pipeline.presets.settings import DatasetSettings
 from pipeline.presets.training import smoke
 from pipeline.renders.mitsuba_variant import Variant, choose_variant, environment
+from pipeline.shards.pack_shards import PublishedShards
 from scene_templates.settings import SceneSettings
 from storage.dataset.layout import DatasetFolder
 from storage.dataset.splits import JUDGED_SPLIT
@@ -49,7 +50,8 @@ def composing_child(
     """
     variant = variant or choose_variant()
     workers = threads or available_cores()
-    publication = begin_or_resume_dataset(DatasetFolder(folder), settings, environment(variant), 1)
+    shards = PublishedShards(DatasetFolder(folder))
+    publication = begin_or_resume_dataset(shards, settings, environment(variant), 1)
     accepted = ObjectLock(
         source=objects, licence=None, settings=settings, writer=publication, workers=workers
     ).freeze()

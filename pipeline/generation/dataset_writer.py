@@ -79,12 +79,10 @@ class DatasetWriter:
     that moment, and reaches the disk before the call returns.
     """
 
-    def __init__(
-        self, store: Store, folder: DatasetFolder, manifest: Manifest, splits: SplitSettings
-    ) -> None:
-        self.store = store
+    def __init__(self, shards: PublishedShards, manifest: Manifest, splits: SplitSettings) -> None:
+        self.store = shards.store
         """Where the dataset is published."""
-        self.folder = folder
+        self.folder = shards.folder
         self.manifest = manifest
         """Manifest of the dataset; it lists shards only once the dataset is finished."""
         self.given_up = 0
@@ -94,7 +92,7 @@ class DatasetWriter:
         self.left_to_others = False
         """True if another machine has just listed the shards, and writes the documents."""
         self._splits = splits
-        self._shards = PublishedShards(folder, store)
+        self._shards = shards
         self._ends: dict[str, range] = {}
         """Last shards of earlier plans of a bucket, by name, with the scenes that they should hold
         now."""
@@ -433,7 +431,7 @@ def _require_extendable(folder: DatasetFolder, manifest: Manifest) -> None:
 
 
 def begin_or_resume_dataset(
-    folder: DatasetFolder,
+    shards: PublishedShards,
     settings: DatasetSettings,
     environment: Mapping[str, Any],
     num_scenes: int,
@@ -452,7 +450,8 @@ def begin_or_resume_dataset(
     if num_scenes < 1:
         raise TrilightError(f"scenes is {num_scenes}; expected at least 1.")
     num_planned = planned_scenes(num_scenes, settings.splits)
-    store = folder.store()
+    folder = shards.folder
+    store = shards.store
     with folder.mutex("manifest"):
         if is_new := store.get(folder.manifest.name, 1) is None:
             _require_free(folder, store)
@@ -470,12 +469,12 @@ def begin_or_resume_dataset(
             )
             write_manifest(folder.manifest, manifest)
         if is_new and not store.create_if_absent(folder.manifest.name, folder.manifest):
-            PublishedShards(folder, store).adopt()  # another machine was first
+            shards.adopt()  # another machine was first
         manifest = read_head(folder.manifest)
     _require_same_dataset(folder, manifest, settings, environment, accept_environment)
     if not store.is_here:  # in a folder the manifest says so
         store.put(f"{PLANNED}{max(num_planned, manifest.num_scenes):012d}", b"\n")
-    writer = DatasetWriter(store, folder, manifest, settings.splits)
+    writer = DatasetWriter(shards, manifest, settings.splits)
     writer.refresh_plan(num_planned)
     return writer
 

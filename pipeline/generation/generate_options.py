@@ -3,6 +3,7 @@
 import re
 from collections.abc import Mapping
 from dataclasses import field
+from functools import cached_property
 from typing import Annotated, Any
 
 from pipeline.exchange.from_description import AlbedoOverOne
@@ -10,7 +11,7 @@ from pipeline.presets.registry import DATASET_PRESETS, preset_settings
 from pipeline.presets.settings import DatasetSettings
 from pipeline.renders.mitsuba_variant import Device
 from pipeline.renders.settings import NoiseFloor, NoiseTargets, Resolution
-from storage.dataset.layout import dataset_folder
+from storage.dataset.layout import DatasetFolder, dataset_folder
 from storage.dataset.settings import MOST_SCENES
 from storage.errors import TrilightError
 from storage.extensions import function_name
@@ -143,8 +144,9 @@ class GenerateOptions:
     def num_scenes(self) -> int:
         return DATASET_PRESETS[self.build].num_scenes if self.scenes is None else self.scenes
 
+    @cached_property
     def settings(self) -> DatasetSettings:
-        """Return the preset's settings with the changes of these options.
+        """The preset's settings with the changes of these options.
 
         Raises:
             TrilightError: values contradict each other.
@@ -161,6 +163,10 @@ class GenerateOptions:
     @property
     def place(self) -> str:
         return f"data/{function_name(self.build)}" if self.out is None else self.out
+
+    @property
+    def folder(self) -> DatasetFolder:
+        return dataset_folder(self.place)
 
     def shard_range(self) -> range | None:
         """Return the range of requested shards, or None for all.

@@ -51,8 +51,8 @@ from pipeline.renders.mitsuba_variant import (
     gpu_memory_bytes,
     visible_gpus,
 )
-from pipeline.shards.pack_shards import UnfinishedShard, hold_dataset_lock
-from storage.dataset.layout import DatasetFolder, dataset_folder
+from pipeline.shards.pack_shards import PublishedShards, UnfinishedShard
+from storage.dataset.layout import DatasetFolder
 from storage.dataset.manifest import Manifest, ShardEntry, read_head
 from storage.dataset.progress import write_asked
 from storage.dataset.settings import SplitSettings
@@ -235,7 +235,7 @@ def resolve_inputs(
     Raises:
         TrilightError: the settings contradict each other, or the source or files are unusable.
     """
-    settings = options.settings()
+    settings = options.settings
     if options.revisits is not None or settings.revisit is not None:
         return resolve_revisit(settings, options.revisits)
     licence = options.licence
@@ -280,13 +280,14 @@ def choose_dataset_variant(options: GenerateOptions, folder: DatasetFolder) -> V
 @contextlib.contextmanager
 def begin_run(options: GenerateOptions) -> Iterator[Run]:
     """Join a dataset's workers and yield the run; the first worker freezes the objects."""
-    folder = dataset_folder(options.place)
+    folder = options.folder
     folder = replace(folder, root=Path(os.path.realpath(folder.root)))
     settings, accept = resolve_inputs(options, folder)  # refuses before anything is written
-    with hold_dataset_lock(folder):
+    shards = PublishedShards(folder)
+    with shards.hold_lock():
         variant = choose_dataset_variant(options, folder)
         writer = begin_or_resume_dataset(
-            folder,
+            shards,
             settings,
             environment(variant),
             options.num_scenes,
