@@ -11,8 +11,6 @@ from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from pathlib import Path
 
-from pipeline.generation.generate_options import GenerateOptions
-from pipeline.generation.render_sample import failure_of
 from pipeline.isolation import (
     ChildFailed,
     ChildLimits,
@@ -21,16 +19,18 @@ from pipeline.isolation import (
     call_with_retries,
     reach,
 )
+from pipeline.objects.listing import failure
 from pipeline.objects.maps.listing import PLURALS, FoundMap, find_maps
 from pipeline.objects.maps.prepared import decode_prepared, map_cache_key, prepare_map
 from pipeline.presets.settings import DatasetSettings
+from scene_templates.settings import SceneSettings
 from storage.atomic import write_atomically
 from storage.cache import cache_folder
 from storage.conventions import SPLITS
 from storage.dataset.splits import split_of_object
 from storage.digests import sha256_hex
 from storage.errors import Rejected, TrilightError
-from storage.records.objects import SKY, TEXTURE, Failure, LockedObject
+from storage.records.objects import SKY, TEXTURE, Failure, LockedObject, failure_of
 from storage.remote.safe_url import printable
 
 log = logging.getLogger("trilight.maps")
@@ -49,32 +49,28 @@ class AcceptedMaps:
     """Reasons why other files cannot be used, or not fully."""
 
 
-def map_folders(options: GenerateOptions, settings: DatasetSettings) -> Mapping[str, str]:
-    """Return the folders of textures and maps that the options name, by kind.
+def map_folders(folders: Mapping[str, str | None], scenes: SceneSettings) -> Mapping[str, str]:
+    """Return the folders of textures and maps that are given, by kind.
 
     Raises:
         TrilightError: a folder is given that no scene would use, or scenes need a folder that is
             not given.
     """
-    scenes = settings.scenes
-    shares = {
-        TEXTURE: (options.textures, "textures", scenes.textures.share, scenes.textures.own_share),
-        SKY: (options.skies, "skies", scenes.skies.share, scenes.skies.own_share),
-    }
-    for folder, name, share, own_share in shares.values():
-        used = bool(share and own_share)
-        if folder is None and used:
+    for kind, drawn in ((TEXTURE, scenes.textures), (SKY, scenes.skies)):
+        name = PLURALS[kind]
+        is_used = bool(drawn.share and drawn.own_share)
+        if folders[kind] is None and is_used:
             raise TrilightError(
-                f"scenes.{name}.own_share is {own_share:g}, but --{name} is not given; expected a "
-                f"folder. Add --{name} FOLDER, or --set scenes.{name}.own_share=0."
+                f"scenes.{name}.own_share is {drawn.own_share:g}, but --{name} is not given; "
+                f"expected a folder. Add --{name} FOLDER, or --set scenes.{name}.own_share=0."
             )
-        if folder is not None and not used:
+        if folders[kind] is not None and not is_used:
             raise TrilightError(
-                f"--{name} is given, but scenes.{name}.share is {share:g} and own_share "
-                f"{own_share:g}; expected both above 0. Add --set scenes.{name}.share=0.5 "
+                f"--{name} is given, but scenes.{name}.share is {drawn.share:g} and own_share "
+                f"{drawn.own_share:g}; expected both above 0. Add --set scenes.{name}.share=0.5 "
                 f"--set scenes.{name}.own_share=1, or leave --{name} out."
             )
-    return {kind: entry[0] for kind, entry in shares.items() if entry[0] is not None}
+    return {kind: folder for kind, folder in folders.items() if folder is not None}
 
 
 def accept_maps(
@@ -100,12 +96,7 @@ def accept_maps(
         outcomes = _prepare_maps(kind, listing.maps, settings, workers)
         usable = [outcome for outcome in outcomes if not isinstance(outcome, Failure)]
         failures += [
-            Failure(
-                stage="objects",
-                item=locked.uid,
-                reason="not_read",
-                message=notes.read_text("utf-8"),
-            )
+            failure(locked.uid, "not_read", notes.read_text("utf-8"))
             for locked, path in usable
             if (notes := _notes(path)).exists()
         ]

@@ -61,7 +61,7 @@ from storage.dataset.statistics import Statistics
 from storage.errors import EnvironmentFailure, TrilightError
 from storage.file_locks import WaitNotice
 from storage.machine import available_cores
-from storage.records.objects import Failure
+from storage.records.objects import SKY, TEXTURE, Failure
 
 _MOST_CHILDREN = 4
 """Children of a GPU. One that only renders fills an H200 (60,700 views an hour, four 58,500), but a
@@ -142,14 +142,11 @@ class Run:
             )
 
 
-def num_workers(options: GenerateOptions, settings: DatasetSettings, device: Device) -> int:
-    """Return the number of parallel tasks of one process; an executor may set another."""
-    if options.workers is not None:
-        return options.workers
+def default_workers(device: Device, resolution: int) -> int:
+    """Return the usual number of parallel tasks of one process; an executor may set another."""
     if device == "cpu":
         return 1
-    num_gpus = max(1, len(visible_gpus()))
-    return num_gpus * children_of_gpu(settings.renders.resolution, gpu_memory_bytes())
+    return max(1, len(visible_gpus())) * children_of_gpu(resolution, gpu_memory_bytes())
 
 
 def children_of_gpu(resolution: int, memory_bytes: int) -> int:
@@ -239,15 +236,15 @@ def resolve_inputs(
     if options.revisits is not None or settings.revisit is not None:
         return resolve_revisit(settings, options.revisits)
     licence = options.licence
+    # of scene files too: they draw no maps, so that shares of maps are refused
+    maps = map_folders({TEXTURE: options.textures, SKY: options.skies}, settings.scenes)
     if options.scenes_from is not None:
         files = find_scene_files(options.scenes_from, options.albedo_over_one)
         settings = settings_for_files(settings, files, options.views)
-        map_folders(options, settings)  # refuses shares of maps: scenes of files draw none
         return settings, partial(accept_scene_files, files, licence, settings)
     source = object_source(settings, options.objects)
     if not folder.manifest.exists():
         check_source(source, allowed_licences=settings.allowed_licences, licence=licence)
-    maps = map_folders(options, settings)
 
     def accept(writer: DatasetWriter) -> AcceptedObjects:
         return ObjectLock(
@@ -310,7 +307,8 @@ def begin_run(options: GenerateOptions) -> Iterator[Run]:
             environment={} if options.accept_environment else manifest.environment,
             accepted=accepted,
             lock_sha256=manifest.objects_lock_sha256,
-            num_at_once=num_workers(options, settings, variant.device),
+            num_at_once=options.workers
+            or default_workers(variant.device, settings.renders.resolution),
             extensions=manifest.extensions,
             device=variant.device,
         )

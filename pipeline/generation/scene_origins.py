@@ -7,7 +7,7 @@ new dataset from a finished one, and adds new cameras, lights and materials.
 import contextlib
 import dataclasses
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from functools import cached_property, partial
 from pathlib import Path
 from typing import Any
@@ -20,7 +20,6 @@ from pipeline.exchange.scene_files import SceneFiles, SceneFolder, build_scene, 
 from pipeline.generation.dataset_writer import DatasetWriter
 from pipeline.generation.frozen_pool import ComposedScenes, require_same
 from pipeline.generation.prepare_isolated import asset_child
-from pipeline.generation.render_sample import RenderInput
 from pipeline.isolation import ChildFailed, IsolatedChild, call_with_retries, reach
 from pipeline.objects.licences import stated_licence
 from pipeline.presets.settings import DatasetSettings, RevisitSettings
@@ -35,9 +34,25 @@ from storage.dataset.splits import JUDGED_SPLIT
 from storage.digests import canonical_json
 from storage.errors import EnvironmentFailure, TrilightError
 from storage.records.objects import OBJECT, LockedObject
-from storage.records.sample import decode_sample
+from storage.records.sample import Sample, decode_sample
 from storage.records.scene import Scene
 from storage.seeds import SceneKey
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class RenderInput:
+    """A scene to render, with the cameras and pictures that stay."""
+
+    scene: Scene
+    """The scene, with a camera for each view."""
+    kept_cameras: int = 0
+    """Number of first cameras that are never replaced: their rejection rejects the scene."""
+    kept_views: int = 0
+    """Number of first cameras whose pictures need not be rendered again."""
+    kept_sample: Sample | None = None
+    """The sample that holds the kept pictures."""
+    kept_members: Mapping[str, bytes] = field(default_factory=dict)
+    """Packed files of the kept pictures, by suffix."""
 
 
 @dataclass(frozen=True, kw_only=True)

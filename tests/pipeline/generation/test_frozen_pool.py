@@ -362,10 +362,11 @@ def test_share_alike_licences_never_meet() -> None:
 
 
 def test_folders_and_shares_belong_together() -> None:
+    textures_alone = {TEXTURE: "t", SKY: None}
     with pytest.raises(TrilightError, match="--skies is not given"):
-        map_folders(GenerateOptions(textures="t"), preset_settings("smoke", changes=SHARES))
+        map_folders(textures_alone, preset_settings("smoke", changes=SHARES).scenes)
     with pytest.raises(TrilightError, match=r"--textures is given, but .*own_share 0"):
-        map_folders(GenerateOptions(textures="t"), preset_settings("smoke"))
+        map_folders(textures_alone, preset_settings("smoke").scenes)
     with pytest.raises(TrilightError, match="--scenes-from scenes was given with --textures"):
         GenerateOptions(textures="t", scenes_from="scenes")
     with pytest.raises(TrilightError, match="only with --textures or --skies"):
