@@ -54,7 +54,7 @@ def composing_child(
     publication = begin_or_resume_dataset(shards, settings, environment(variant), 1)
     accepted = ObjectLock(
         source=objects, licence=None, settings=settings, writer=publication, workers=workers
-    ).freeze()
+    ).accept()
     arguments = (settings, accepted.origin, asset_store(), variant, workers)
     limits = dataclasses.replace(_LIMITS, memory_bytes=variant.address_space(_LIMITS.memory_bytes))
     return IsolatedChild(limits=limits, factory=SceneWorker, args=arguments)

@@ -28,9 +28,8 @@ from pathlib import Path
 from typing import Any, Generic, TypeVar
 
 from pipeline.exchange.scene_files import SceneFiles, find_scene_files
-from pipeline.generation.accept_maps import map_folders
 from pipeline.generation.dataset_writer import DatasetWriter, begin_or_resume_dataset
-from pipeline.generation.freeze_objects import ObjectLock
+from pipeline.generation.freeze_objects import ObjectLock, map_folders
 from pipeline.generation.generate_options import GenerateOptions, generate_words
 from pipeline.generation.scene_origins import (
     Accept,

@@ -12,9 +12,8 @@ import pytest
 
 from pipeline.assets.stage import PreparedObject
 from pipeline.generation import object_batches
-from pipeline.generation.accept_maps import AcceptedMaps
 from pipeline.generation.dataset_writer import DatasetWriter, begin_or_resume_dataset
-from pipeline.generation.freeze_objects import ObjectLock
+from pipeline.generation.freeze_objects import AcceptedMaps, ObjectLock
 from pipeline.generation.prepare_isolated import asset_store
 from pipeline.generation.scene_origins import AcceptedObjects
 from pipeline.presets.registry import preset_settings

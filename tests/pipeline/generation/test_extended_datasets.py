@@ -16,6 +16,7 @@ from pipeline.generation.derive_dataset import _extensions
 from pipeline.generation.freeze_objects import ObjectLock
 from pipeline.generation.generate_options import GenerateOptions
 from pipeline.generation.pipeline import make_dataset, make_task, prepare_dataset
+from pipeline.generation.scene_origins import AcceptedObjects
 from pipeline.isolation import call_with_retries
 from pipeline.presets.registry import DATASET_PRESETS, preset_settings, resolve_dataset_preset
 from pipeline.shards.pack_shards import PublishedShards
@@ -324,11 +325,13 @@ def test_the_command_is_there_while_objects_are_prepared(
     without_rendering(monkeypatch)
     place = str(tmp_path / "set")
     asked: list[list[str] | None] = []
+    freeze = ObjectLock.accept
 
-    def look(lock: ObjectLock) -> None:
+    def look(lock: ObjectLock) -> AcceptedObjects:
         asked.append(read_asked(open_dataset(place)))
+        return freeze(lock)
 
-    monkeypatch.setattr(ObjectLock, "prepare", look)
+    monkeypatch.setattr(ObjectLock, "accept", look)
     for objects in ("builtin:9", "builtin:8"):
         prepare_dataset(tiny_order(build="tiny", out=place, scenes=4, objects=objects))
     assert asked[0] is not None and asked[0][:4] == ["generate", "tiny", "--objects", "builtin:9"]

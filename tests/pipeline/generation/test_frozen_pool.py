@@ -12,10 +12,9 @@ import numpy as np
 import pytest
 
 from pipeline.documents.rights import encode_attribution
-from pipeline.generation import accept_maps as accepting
 from pipeline.generation import freeze_objects, frozen_pool, pipeline, render_workers
-from pipeline.generation.accept_maps import AcceptedMaps, accept_maps, map_folders
 from pipeline.generation.dataset_writer import DatasetWriter
+from pipeline.generation.freeze_objects import AcceptedMaps, accept_maps, map_folders
 from pipeline.generation.frozen_pool import (
     AssetMissing,
     ComposedScenes,
@@ -141,10 +140,10 @@ def test_a_second_start_looks_at_no_object(
         raise LookupError(source)
 
     monkeypatch.setattr(freeze_objects, "list_objects", look)
-    assert asked(writer).freeze() == accepted
+    assert asked(writer).accept() == accepted
     for source, licence in (("another", None), (SOURCE, "MIT")):
         with pytest.raises(LookupError):
-            asked(writer, source, licence).freeze()
+            asked(writer, source, licence).accept()
     index, lock = writer.folder.staged_index, writer.folder.objects_lock
     for path in (index, lock):
         was = path.read_bytes()
@@ -261,7 +260,7 @@ def accepted(settings: DatasetSettings, tmp_path_factory: pytest.TempPathFactory
     folders = {TEXTURE: str(root / "textures"), SKY: str(root / "skies")}
     with pytest.MonkeyPatch.context() as patch:
         patch.setenv("TRILIGHT_CACHE", str(root / "cache"))
-        patch.setattr(accepting, "IsolatedChild", ChildHere)
+        patch.setattr(freeze_objects, "IsolatedChild", ChildHere)
         return accept_maps(folders, None, settings, workers=1)
 
 

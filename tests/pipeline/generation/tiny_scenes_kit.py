@@ -58,7 +58,7 @@ def without_rendering(
     """
     scenes: list[tuple[str, int]] = []
 
-    def freeze(lock: ObjectLock, *more: Any) -> AcceptedObjects:
+    def freeze(lock: ObjectLock) -> AcceptedObjects:
         if not lock.writer.manifest.objects_lock_sha256:
             lock.writer.lock_objects([LOCKED])
         return dataclasses.replace(NO_OBJECTS, num_found=1)
@@ -68,8 +68,7 @@ def without_rendering(
         made(scene)
         return dataclasses.replace(tiny_sample(seed=scene), key=sample_key(scene)), []
 
-    monkeypatch.setattr(ObjectLock, "prepare", lambda lock: None)
-    monkeypatch.setattr(ObjectLock, "freeze", freeze)
+    monkeypatch.setattr(ObjectLock, "accept", freeze)
     monkeypatch.setattr("pipeline.generation.pipeline.make_scene", make)
     without_probe(monkeypatch)
     return scenes
