@@ -22,6 +22,7 @@ from pipeline.generation.derive_dataset import list_scenes as read_scene_rows
 from pipeline.shards.finished_dataset import open_finished
 from storage.errors import TrilightError
 from storage.settings.described import checked
+from storage.settings.overrides import option_words
 from storage.settings.ranges import Within
 
 app = App(name="shards", help_epilogue="", help_flags=HELP_FLAGS, group_commands=Group("Commands"))
@@ -97,7 +98,7 @@ def list_scenes(source: SourceOptions, selection: Selection) -> None:
         note(f"the first {_MOST_LISTED} are shown; --json lists all")
     if rows:
         words = ["shards", "select", place, "--out", f"{place}-selected"]
-        next_step([*words, *selection.words])
+        next_step([*words, *option_words(selection)])
 
 
 @app.command(help="Repack the scenes of every split into shards of another size.")

@@ -17,6 +17,7 @@ from storage.errors import TrilightError
 from storage.extensions import function_name
 from storage.remote.safe_url import safe_url
 from storage.settings.described import checked
+from storage.settings.fields import option_of
 from storage.settings.overrides import option_words
 from storage.settings.ranges import Seed, Share, Within
 
@@ -119,15 +120,15 @@ class GenerateOptions:
         for name, excluded in _EXCLUDED.items():
             if name in stated and (wrong := [other for other in excluded if other in stated]):
                 raise TrilightError(
-                    f"{_flag(name)} {getattr(self, name)} was given with "
-                    f"{' and '.join(map(_flag, wrong))}; expected it without: it says what scenes "
-                    "are made of. Leave one out."
+                    f"{option_of(name)} {getattr(self, name)} was given with "
+                    f"{' and '.join(map(option_of, wrong))}; expected it without: it says what "
+                    "scenes are made of. Leave one out."
                 )
         for name, necessary in _NEEDS.items():
             if name in stated and not {*necessary} & {*stated}:
                 raise TrilightError(
-                    f"{_flag(name)} is {getattr(self, name)!r}; expected it only with "
-                    f"{' or '.join(map(_flag, necessary))}."
+                    f"{option_of(name)} is {getattr(self, name)!r}; expected it only with "
+                    f"{' or '.join(map(option_of, necessary))}."
                 )
         dataset_folder(self.place)
         self.shard_range()
@@ -183,10 +184,6 @@ class GenerateOptions:
                 "to but not including the last."
             )
         return range(int(match[1]), int(match[2]))
-
-
-def _flag(name: str) -> str:
-    return f"--{name.replace('_', '-')}"
 
 
 def generate_words(options: GenerateOptions) -> list[str]:

@@ -86,10 +86,6 @@ class Run:
     job: "ShardJob"
     """Input that all tasks of the run share."""
 
-    @property
-    def accepted(self) -> AcceptedObjects:
-        return self.job.accepted
-
     def unfinished_shards(self) -> list[int]:
         return self.publication.unfinished_shards(self.options.shard_range())
 
@@ -97,7 +93,7 @@ class Run:
         """Return the result of the run; a finished dataset adds its digest and statistics."""
         writer = self.publication
         notes: tuple[str, ...] = ()
-        origin = self.accepted.origin
+        origin = self.job.accepted.origin
         if isinstance(origin, SceneFiles):
             notes = origin.notes
         elif statistics and self.options.revisits is None:
@@ -111,8 +107,8 @@ class Run:
             notes += tuple(filter(None, size_notes))
         return Outcome(
             digest=finished.dataset_digest if finished else "",
-            num_objects_found=self.accepted.num_found,
-            num_objects_used=self.accepted.num_objects,
+            num_objects_found=self.job.accepted.num_found,
+            num_objects_used=self.job.accepted.num_objects,
             num_scenes_given_up=writer.given_up,
             failures=tuple(writer.failures),
             num_shards=len(finished.shards) if finished else writer.num_finished_shards(),
@@ -127,7 +123,7 @@ class Run:
         Scene files that cannot become a scene do not count.
         """
         writer = self.publication
-        origin = self.accepted.origin
+        origin = self.job.accepted.origin
         num_unusable = len(origin.unusable) if isinstance(origin, SceneFiles) else 0
         num_scenes = writer.manifest.num_scenes
         budget = self.options.failure_budget

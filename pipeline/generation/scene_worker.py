@@ -25,10 +25,8 @@ from pipeline.renders.noise_floor import MeasuredFloor
 from pipeline.renders.renderer import SceneRenderer, set_threads
 from pipeline.renders.results import RenderedView
 from pipeline.scenes.compose import compose_scene
-from pipeline.scenes.triangle_budget import PooledAsset
 from pipeline.scenes.views import ViewCamera, Visibility, cameras_of, cameras_of_view, with_cameras
 from scene_templates.settings import SceneSettings
-from scene_templates.user_maps import OwnMaps
 from storage.dataset.layout import DatasetFolder
 from storage.dataset.progress import tell_views
 from storage.errors import Rejected
@@ -84,10 +82,11 @@ class SceneWorker:
         set_threads(threads)
         self._settings = settings
         self._origin = origin
-        self._assets = assets
         self._folder = folder
-        self._pool = functools.cache(self._open_pool)
-        self._maps = functools.cache(self._open_maps)
+        self._pool = functools.cache(lambda split: SplitPool(self._frozen, split, assets))
+        """Objects of a split, sorted by uid; each is opened on first access."""
+        self._maps = functools.cache(lambda split: user_maps(self._frozen.maps, split))
+        """The user's textures and maps of a split; each is read when a scene takes it."""
 
     def attempt(
         self, split: str, scene_index: int, attempt: int, from_file: Scene | None = None
@@ -152,14 +151,6 @@ class SceneWorker:
     def _frozen(self) -> ComposedScenes:
         assert isinstance(self._origin, ComposedScenes), "only composed scenes draw objects"
         return self._origin
-
-    def _open_pool(self, split: str) -> Sequence[PooledAsset]:
-        """Return the objects of a split, sorted by uid; each is opened on first access."""
-        return SplitPool(self._frozen, split, self._assets)
-
-    def _open_maps(self, split: str) -> OwnMaps:
-        """Return the user's textures and maps of a split; each is read when a scene takes it."""
-        return user_maps(self._frozen.maps, split)
 
 
 class ViewProgress:
