@@ -450,6 +450,7 @@ def begin_or_resume_dataset(
     if num_scenes < 1:
         raise TrilightError(f"scenes is {num_scenes}; expected at least 1.")
     num_planned = planned_scenes(num_scenes, settings.splits)
+    stated = settings.as_json()
     folder = shards.folder
     store = shards.store
     with folder.mutex("manifest"):
@@ -459,7 +460,7 @@ def begin_or_resume_dataset(
         if not folder.manifest.exists():
             manifest = Manifest(
                 build=settings.build,
-                settings=settings.as_json(),
+                settings=stated,
                 environment=environment,
                 num_scenes=num_planned,
                 num_views=settings.scenes.num_views,
@@ -471,7 +472,7 @@ def begin_or_resume_dataset(
         if is_new and not store.create_if_absent(folder.manifest.name, folder.manifest):
             shards.adopt()  # another machine was first
         manifest = read_head(folder.manifest)
-    _require_same_dataset(folder, manifest, settings, environment, accept_environment)
+    _require_same_dataset(folder, manifest, stated, environment, accept_environment)
     if not store.is_here:  # in a folder the manifest says so
         store.put(f"{PLANNED}{max(num_planned, manifest.num_scenes):012d}", b"\n")
     writer = DatasetWriter(shards, manifest, settings.splits)
@@ -482,13 +483,13 @@ def begin_or_resume_dataset(
 def _require_same_dataset(
     folder: DatasetFolder,
     manifest: Manifest,
-    settings: DatasetSettings,
+    settings: Mapping[str, Any],
     environment: Mapping[str, Any],
     accept_environment: bool,
 ) -> None:
     _require_extendable(folder, manifest)
     stored = from_record(DatasetSettings, manifest.settings).as_json()  # fields may come later
-    differing = list(differences(stored, settings.as_json()))
+    differing = list(differences(stored, settings))
     what = "setting"
     next_step = "choose another --out"
     if not (differing or accept_environment):

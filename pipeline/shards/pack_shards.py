@@ -401,8 +401,6 @@ class PublishedShards:
                 theirs, num_scenes=own_head.num_scenes, growing=own_head.growing
             )
         self.fetch_lock(theirs.objects_lock_sha256)
-        if not theirs.objects_lock_sha256:
-            self.merge_failures()
         write_manifest(self.folder.manifest, theirs)
 
     def _read_note(self, name: str) -> ShardNote | None:
