@@ -15,6 +15,7 @@ from pipeline.renders.settings import RenderSettings
 from scene_templates.frozen_v1 import SCENES_V1
 from scene_templates.out_of_range import out_of_range_2_settings, out_of_range_settings
 from storage.dataset.settings import SplitSettings, StorageSettings
+from storage.settings.overrides import apply_overrides
 
 _LICENCES = (
     "CC0-1.0",
@@ -107,32 +108,29 @@ SETTINGS_V1 = DatasetSettings(
 )
 """Common settings of the published sets; each set states its changes."""
 
-JUDGING_SPLITS = SplitSettings(
-    scenes_per_shard=20,
-    shards_per_cycle=8,
-    held_out_objects=0.125,
-    one_split=True,
-    listed_scenes=None,
-    listed_shards=(),
-)
-"""Split settings of sets whose scenes all belong to the split `test`."""
-
-
-_EXACT = StorageSettings(profile="lossless", passes=())
+_JUDGING = {
+    "splits.scenes_per_shard": 20,
+    "splits.shards_per_cycle": 8,
+    "splits.held_out_objects": 0.125,
+    "splits.one_split": True,
+    "storage.profile": "lossless",
+}
+"""Settings of sets whose scenes all belong to the split `test`, by dotted name."""
 
 
 def out_of_range() -> DatasetSettings:
     """Scenes with one axis beyond the trained range: 37 values of nine axes in four layouts."""
-    return dataclasses.replace(
-        SETTINGS_V1,
-        build="out-of-range",
-        assets=dataclasses.replace(SETTINGS_V1.assets, budgets=(3900, 2600, 1700, 1100, 700, 400)),
-        scenes=out_of_range_settings(max_triangles=4096),
+    changes = {
+        **_JUDGING,
+        "build": "out-of-range",
+        "assets.budgets": [3900, 2600, 1700, 1100, 700, 400],
         # Lights of a hundredth of the area: a view is black where it is a thousand times darker.
-        renders=dataclasses.replace(SETTINGS_V1.renders, max_spp=2048, min_mean_radiance=1e-5),
-        splits=dataclasses.replace(JUDGING_SPLITS, scenes_per_shard=37),
-        storage=_EXACT,
-    )
+        "renders.max_spp": 2048,
+        "renders.min_mean_radiance": 1e-5,
+        "splits.scenes_per_shard": 37,
+    }
+    scenes = out_of_range_settings(max_triangles=4096)
+    return dataclasses.replace(apply_overrides(SETTINGS_V1, changes), scenes=scenes)
 
 
 def out_of_range_2() -> DatasetSettings:
@@ -140,13 +138,9 @@ def out_of_range_2() -> DatasetSettings:
 
     It is another set: the first nine axes have the same distribution, and different scenes.
     """
-    base = out_of_range()
-    return dataclasses.replace(
-        base,
-        build="out-of-range-2",
-        scenes=out_of_range_2_settings(max_triangles=4096),
-        splits=dataclasses.replace(base.splits, scenes_per_shard=49),
-    )
+    changes = {"build": "out-of-range-2", "splits.scenes_per_shard": 49}
+    scenes = out_of_range_2_settings(max_triangles=4096)
+    return dataclasses.replace(apply_overrides(out_of_range(), changes), scenes=scenes)
 
 
 def benchmark_v1() -> DatasetSettings:
@@ -156,15 +150,15 @@ def benchmark_v1() -> DatasetSettings:
     (their digest is below, and in docs/reference). For the second resolution use
     `--resolution 512`.
     """
-    return dataclasses.replace(
-        SETTINGS_V1,
-        build="benchmark-v1",
-        seed=20261121,
-        source=BENCHMARK,
-        renders=dataclasses.replace(SETTINGS_V1.renders, noise_floor_db=48.0, max_spp=2048),
-        splits=JUDGING_SPLITS,
-        storage=_EXACT,
-    )
+    changes = {
+        **_JUDGING,
+        "build": "benchmark-v1",
+        "seed": 20261121,
+        "source": BENCHMARK,
+        "renders.noise_floor_db": 48.0,
+        "renders.max_spp": 2048,
+    }
+    return apply_overrides(SETTINGS_V1, changes)
 
 
 PRESETS_FOR_JUDGING = {

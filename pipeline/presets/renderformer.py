@@ -26,63 +26,60 @@ turn in their plane, so that the diagonals of floor and walls run one way.
 
 import dataclasses
 import functools
+from collections.abc import Mapping
+from typing import Any
 
 from pipeline.presets.frozen_v1 import SETTINGS_V1
 from pipeline.presets.settings import DatasetPreset, DatasetSettings
 from scene_templates.families import Family
-from scene_templates.frozen_v1 import SCENES_V1
 from scene_templates.renderformer_v1 import Policy, stage_1_families, stage_2_families
-from scene_templates.settings import SceneSettings
+from storage.settings.overrides import apply_overrides
+
+_PUBLISHED_SCENES = {
+    "scenes.families_in_turn": False,
+    "scenes.enough_error": 0.0,
+    "scenes.centring": "vertex_mean",
+    "scenes.num_views": 4,
+    "scenes.placement.orientation": "euler",
+    "scenes.placement.resting_share": 0.0,
+    "scenes.placement.overlap_share": 1.0,
+    "scenes.placement.inside": False,
+    "scenes.materials.triangle_colours_share": 0.0,
+    "scenes.lights.orientation": "euler",
+    "scenes.lights.reflectance": 1.0,
+    "scenes.views.min_coverage": 0.0,
+    "scenes.views.min_lit": 0.0,
+    "scenes.views.max_shell_back": 1.0,
+}
 
 
 def renderformer_v1_256(policy: Policy = "de-biased") -> DatasetSettings:
     """The published first stage: 21 families, 256 pixels, at most 1572 triangles."""
-    return dataclasses.replace(
-        SETTINGS_V1,
-        build="renderformer-v1-256" + _suffix(policy),
-        assets=dataclasses.replace(SETTINGS_V1.assets, budgets=(1188, 840, 594, 396, 297, 198)),
-        scenes=_published_scenes(stage_1_families(policy), max_triangles=1572),
-    )
+    changes = {
+        "assets.budgets": [1188, 840, 594, 396, 297, 198],
+        "scenes.max_triangles": 1572,
+    }
+    return _published("renderformer-v1-256", policy, stage_1_families(policy), changes)
 
 
 def renderformer_v1_512(policy: Policy = "de-biased") -> DatasetSettings:
     """The published second stage: 14 families, 512 pixels, at most 4192 triangles."""
-    return dataclasses.replace(
-        SETTINGS_V1,
-        build="renderformer-v1-512" + _suffix(policy),
-        assets=dataclasses.replace(SETTINGS_V1.assets, budgets=(3968, 2380, 1188, 840, 594, 396)),
-        scenes=_published_scenes(stage_2_families(policy), max_triangles=4192),
-        renders=dataclasses.replace(SETTINGS_V1.renders, resolution=512),
-        splits=dataclasses.replace(SETTINGS_V1.splits, scenes_per_shard=64),
-    )
+    changes = {
+        "assets.budgets": [3968, 2380, 1188, 840, 594, 396],
+        "scenes.max_triangles": 4192,
+        "renders.resolution": 512,
+        "splits.scenes_per_shard": 64,
+    }
+    return _published("renderformer-v1-512", policy, stage_2_families(policy), changes)
 
 
-def _published_scenes(families: tuple[Family, ...], *, max_triangles: int) -> SceneSettings:
-    return dataclasses.replace(
-        SCENES_V1,
-        families=families,
-        families_in_turn=False,
-        max_triangles=max_triangles,
-        enough_error=0.0,
-        centring="vertex_mean",
-        num_views=4,
-        placement=dataclasses.replace(
-            SCENES_V1.placement,
-            orientation="euler",
-            resting_share=0.0,
-            overlap_share=1.0,
-            inside=False,
-        ),
-        materials=dataclasses.replace(SCENES_V1.materials, triangle_colours_share=0.0),
-        lights=dataclasses.replace(SCENES_V1.lights, orientation="euler", reflectance=1.0),
-        views=dataclasses.replace(
-            SCENES_V1.views, min_coverage=0.0, min_lit=0.0, max_shell_back=1.0
-        ),
-    )
-
-
-def _suffix(policy: Policy) -> str:
-    return "-original" if policy == "original" else ""
+def _published(
+    name: str, policy: Policy, families: tuple[Family, ...], changes: Mapping[str, Any]
+) -> DatasetSettings:
+    build = {"build": f"{name}-original" if policy == "original" else name}
+    settings = apply_overrides(SETTINGS_V1, {**build, **_PUBLISHED_SCENES, **changes})
+    scenes = dataclasses.replace(settings.scenes, families=families)
+    return dataclasses.replace(settings, scenes=scenes)
 
 
 RENDERFORMER_PRESETS = {
