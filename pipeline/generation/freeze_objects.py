@@ -18,7 +18,6 @@ from pathlib import Path
 
 from pipeline.assets.stage import PreparedObject
 from pipeline.generation.dataset_writer import DatasetWriter
-from pipeline.generation.frozen_pool import ComposedScenes, require_same
 from pipeline.generation.object_batches import (
     ObjectWork,
     PrepareResult,
@@ -26,7 +25,7 @@ from pipeline.generation.object_batches import (
     prepare_in_batches,
 )
 from pipeline.generation.prepare_isolated import format_unread, write_unread
-from pipeline.generation.scene_origins import AcceptedObjects
+from pipeline.generation.scene_origins import AcceptedObjects, ComposedScenes, require_same
 from pipeline.isolation import (
     ChildFailed,
     ChildLimits,

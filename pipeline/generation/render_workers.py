@@ -15,9 +15,9 @@ from typing import Any
 
 from pipeline.exchange.scene_files import SceneFiles
 from pipeline.generation.freeze_objects import require_tried
-from pipeline.generation.frozen_pool import ComposedScenes, changed_error
 from pipeline.generation.generation_run import ShardJob
 from pipeline.generation.prepare_isolated import asset_child, asset_store, mesh_stage
+from pipeline.generation.scene_origins import ComposedScenes, changed_error
 from pipeline.generation.scene_worker import SceneWorker
 from pipeline.isolation import ChildLimits, ChildPool, IsolatedChild, call_with_retries, reach
 from pipeline.objects.sources import ListedObjects, list_objects

@@ -1,12 +1,13 @@
 """Where scenes come from: layouts of frozen objects, scene files, or a finished dataset.
 
 Scene files are checked and frozen by their digests. A revisit takes scenes, objects and splits of a
-new dataset from a finished one, and adds new cameras, lights and materials.
+new dataset from a finished one, and adds new cameras, lights and materials. Frozen objects are
+opened when a scene draws them (pipeline.generation.scene_worker).
 """
 
 import contextlib
 import dataclasses
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import cached_property, partial
 from pathlib import Path
@@ -18,7 +19,6 @@ from pipeline.assets.settings import AssetSettings
 from pipeline.exchange.from_description import AlbedoOverOne, scaled_albedo_notes
 from pipeline.exchange.scene_files import SceneFiles, SceneFolder, build_scene, require_usable
 from pipeline.generation.dataset_writer import DatasetWriter
-from pipeline.generation.frozen_pool import ComposedScenes, require_same
 from pipeline.generation.prepare_isolated import asset_child
 from pipeline.isolation import ChildFailed, IsolatedChild, call_with_retries, reach
 from pipeline.objects.licences import stated_licence
@@ -53,6 +53,22 @@ class RenderInput:
     """The sample that holds the kept pictures."""
     kept_members: Mapping[str, bytes] = field(default_factory=dict)
     """Packed files of the kept pictures, by suffix."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class ComposedScenes:
+    """Scenes that layouts compose of frozen objects; can be sent to another machine."""
+
+    lock: Path
+    """Path of objects.lock.jsonl in the dataset's folder."""
+    index: Path
+    """Path of the lock's index (storage.records.object_index)."""
+    source: str
+    """Source of the objects, for those that have to be prepared again."""
+    licence: str | None
+    """Licence that the user states for files without one."""
+    maps: tuple[tuple[LockedObject, Path], ...] = ()
+    """The user's textures and skies with their prepared files."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -238,6 +254,26 @@ def _accept_objects(source: FinishedDataset, writer: DatasetWriter) -> AcceptedO
         num_found=len(locked),
         origin=RevisitedScenes(root=root, digest=source.manifest.dataset_digest),
     )
+
+
+def changed_error(display_name: str, uid: str, state: str) -> TrilightError:
+    """Return the error of a frozen object or file that its source has lost or changed."""
+    return TrilightError(
+        f"{display_name}: {uid!r} {state}; expected what the dataset was begun with "
+        "(objects.lock.jsonl). Restore it, name the source that has it by --objects or "
+        "--scenes-from, or choose another --out."
+    )
+
+
+def require_same(
+    display_name: str, frozen: Mapping[str, LockedObject], now: Sequence[LockedObject]
+) -> None:
+    """Raise TrilightError if a row differs from the frozen one, is missing, or is new."""
+    by_uid = {entry.uid: entry for entry in now}
+    for uid in sorted({*frozen, *by_uid}):
+        if frozen.get(uid) != by_uid.get(uid):
+            state = "has changed" if uid in by_uid else "is missing or no longer usable"
+            raise changed_error(display_name, uid, state if uid in frozen else "is new")
 
 
 def settings_for_files(

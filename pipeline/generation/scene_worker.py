@@ -1,6 +1,9 @@
 """`SceneWorker`: composes scenes and renders their samples, inside a worker process.
 
-`render_workers` starts these processes; `pipeline.isolation` survives their crashes. The choice of
+`render_workers` starts these processes; `pipeline.isolation` survives their crashes. A worker
+trusts the lock and the asset store: it starts without opening any object. It opens the one to three
+objects of a scene, checks their digests against the lock, and keeps a few open. If an object's file
+is missing on this machine, `render_workers.restore_object` prepares it again. The choice of
 a camera wraps rendering: a view is rendered by its first camera whose picture is accepted. A
 `SceneRenderer` renders or rejects one camera and knows no other; `cameras_of_view` proposes cameras
 and knows no picture.
@@ -10,35 +13,50 @@ import contextlib
 import functools
 import os
 import time
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from pipeline.assets.asset_store import AssetStore
-from pipeline.generation.frozen_pool import AssetMissing, ComposedScenes, SplitPool, user_maps
-from pipeline.generation.scene_origins import RenderInput, RevisitedScenes, SceneOrigin
+from pipeline.generation.scene_origins import (
+    ComposedScenes,
+    RenderInput,
+    RevisitedScenes,
+    SceneOrigin,
+)
+from pipeline.objects.maps.prepared import decode_prepared
 from pipeline.presets.settings import DatasetSettings
 from pipeline.renders.mitsuba_variant import Variant, activate
 from pipeline.renders.noise_floor import MeasuredFloor
 from pipeline.renders.renderer import SceneRenderer, set_threads
 from pipeline.renders.results import RenderedView
 from pipeline.scenes.compose import compose_scene
+from pipeline.scenes.triangle_budget import FitTable, PooledAsset, least_triangles
 from pipeline.scenes.views import ViewCamera, Visibility, cameras_of, cameras_of_view, with_cameras
 from scene_templates.settings import SceneSettings
+from scene_templates.user_maps import OwnMaps, UserMap, UserTexture
 from storage.dataset.layout import DatasetFolder
 from storage.dataset.progress import tell_views
-from storage.errors import Rejected
-from storage.records.objects import Failure, failure_of
+from storage.digests import sha256_hex
+from storage.errors import Rejected, TrilightError
+from storage.records.asset import decode_asset
+from storage.records.object_index import ObjectIndex
+from storage.records.objects import SKY, TEXTURE, Failure, LockedObject, LockRows, failure_of
 from storage.records.passes.pictures import passes_exr
 from storage.records.sample import PartFloor, Sample, ViewRecord, sample_key
 from storage.records.scene import Scene
+from storage.records.texture import MapSource
 from storage.renderer import Sampling
 from storage.seeds import SceneKey, seed_for
 
 MAX_ATTEMPTS = 16
 """Attempts at a scene before it is given up."""
+_MOST_OPEN = 8
+"""Objects that a child keeps open for each split; most scenes have three at most."""
 _EVERY_S = 0.5
 """Seconds between two writes of the progress of a scene."""
 
@@ -151,6 +169,105 @@ class SceneWorker:
     def _frozen(self) -> ComposedScenes:
         assert isinstance(self._origin, ComposedScenes), "only composed scenes draw objects"
         return self._origin
+
+
+class AssetMissing(Exception):
+    """The store lacks the prepared file of an object, or has another than the lock's.
+
+    Attributes:
+        uid: uid of the object.
+        asset_name: name of the missing file.
+    """
+
+    def __init__(self, uid: str, asset_name: str) -> None:
+        super().__init__(f"object {uid!r}: its prepared file is not in the asset store")
+        self.uid = uid
+        self.asset_name = asset_name
+
+
+class SplitPool(Sequence[PooledAsset]):
+    """The objects of one split, sorted by uid, each opened on access."""
+
+    def __init__(self, frozen: ComposedScenes, split: str, store: AssetStore) -> None:
+        index = ObjectIndex(frozen.index)
+        if split not in index.facts.splits:
+            raise TrilightError(f"split {split!r}: no frozen object belongs to it; expected one.")
+        rows = index.facts.splits[split]
+        self.fits = FitTable(
+            index.column("least", rows), index.column("camp", rows), index.facts.camps, rows.camps
+        )
+        self._offsets = index.column("offset", rows)
+        self._index = index
+        self._first = rows.start
+        self._split = split
+        self._lock = LockRows(frozen.lock)
+        self._store = store
+        self._open = functools.lru_cache(_MOST_OPEN)(self._read)
+
+    def __len__(self) -> int:
+        return len(self._offsets)
+
+    def __getitem__(self, row: int) -> PooledAsset:  # type: ignore[override]
+        """Return an object; read its file unless it is still open.
+
+        Raises:
+            AssetMissing: it has to be prepared again.
+            TrilightError: the index is not that of the lock.
+        """
+        if not 0 <= row < len(self):
+            raise IndexError(row)
+        return self._open(row)
+
+    def _read(self, row: int) -> PooledAsset:
+        locked = self._lock.at(int(self._offsets[row : row + 1][0]))
+        name = self._index.asset_name(self._first + row)
+        try:
+            data = self._store.asset_path(name).read_bytes()
+        except FileNotFoundError as error:
+            raise AssetMissing(locked.uid, name) from error
+        if sha256_hex(data) != locked.asset_sha256:
+            raise AssetMissing(locked.uid, name)
+        asset = decode_asset(data)
+        pooled = PooledAsset(locked=locked, asset=asset)
+        stored = locked.split, least_triangles(asset), pooled.camp
+        if stored != (self._split, self.fits.size(row), self.fits.camp(row)):
+            raise TrilightError(
+                f"objects.index: says otherwise of {locked.uid!r} than objects.lock.jsonl and its "
+                "file; expected the index of this lock. Delete .staging/objects.index, and it is "
+                "made again."
+            )
+        return pooled
+
+
+def user_maps(rows: Iterable[tuple[LockedObject, Path]], split: str) -> OwnMaps:
+    """Return the maps that scenes of a split may use, sorted by uid; no file is read yet.
+
+    Args:
+        rows: rows of a lock with the prepared files; objects among them are left out.
+        split: train, validation or test.
+    """
+    loads: Mapping[str, Callable[[Path], Any]] = {TEXTURE: _texture, SKY: _radiance}
+    of_kind: dict[str, list[UserMap[Any]]] = {TEXTURE: [], SKY: []}
+    for locked, path in sorted(rows, key=lambda row: row[0].uid):
+        if locked.split == split and locked.kind in of_kind:
+            source = MapSource(
+                name=locked.title,
+                licence=locked.licence,
+                attribution=locked.attribution,
+                source_url=locked.source_url,
+            )
+            load = functools.partial(loads[locked.kind], path)
+            of_kind[locked.kind].append(UserMap(uid=locked.uid, source=source, load=load))
+    return OwnMaps(textures=of_kind[TEXTURE], skies=of_kind[SKY])
+
+
+def _texture(path: Path) -> UserTexture:
+    arrays = decode_prepared(path.read_bytes(), path.name).arrays
+    return arrays["diffuse"], arrays["specular"], arrays.get("roughness")
+
+
+def _radiance(path: Path) -> NDArray[np.float32]:
+    return decode_prepared(path.read_bytes(), path.name).arrays["radiance"]
 
 
 class ViewProgress:

@@ -12,20 +12,13 @@ import numpy as np
 import pytest
 
 from pipeline.documents.rights import encode_attribution
-from pipeline.generation import freeze_objects, frozen_pool, pipeline, render_workers
+from pipeline.generation import freeze_objects, pipeline, render_workers, scene_worker
 from pipeline.generation.dataset_writer import DatasetWriter
 from pipeline.generation.freeze_objects import AcceptedMaps, accept_maps, map_folders
-from pipeline.generation.frozen_pool import (
-    AssetMissing,
-    ComposedScenes,
-    SplitPool,
-    require_same,
-    user_maps,
-)
 from pipeline.generation.generate_options import GenerateOptions
 from pipeline.generation.prepare_isolated import asset_store
-from pipeline.generation.scene_origins import AcceptedObjects
-from pipeline.generation.scene_worker import SceneAttempt
+from pipeline.generation.scene_origins import AcceptedObjects, ComposedScenes, require_same
+from pipeline.generation.scene_worker import AssetMissing, SceneAttempt, SplitPool, user_maps
 from pipeline.objects.maps.prepared import prepare_map
 from pipeline.presets.registry import preset_settings
 from pipeline.presets.settings import DatasetSettings
@@ -111,14 +104,14 @@ def test_scenes_of_opened_objects_are_those_of_objects_in_memory(
 def test_only_a_few_objects_are_open(
     made: tuple[DatasetWriter, AcceptedObjects], monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(frozen_pool, "_MOST_OPEN", 3)
+    monkeypatch.setattr(scene_worker, "_MOST_OPEN", 3)
     read: list[bytes] = []
 
     def counted(data: bytes) -> Asset:
         read.append(data)
         return decode_asset(data)
 
-    monkeypatch.setattr(frozen_pool, "decode_asset", counted)
+    monkeypatch.setattr(scene_worker, "decode_asset", counted)
     pool = _opened(made[1])
     assert not read
     for row in (0, 1, 2, 0, 3, 0, 1):

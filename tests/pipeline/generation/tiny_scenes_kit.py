@@ -9,10 +9,9 @@ import pytest
 
 from pipeline.executors.threads import ThreadRunner
 from pipeline.generation.freeze_objects import ObjectLock
-from pipeline.generation.frozen_pool import ComposedScenes
 from pipeline.generation.generate_options import GenerateOptions
 from pipeline.generation.generation_run import ShardJob
-from pipeline.generation.scene_origins import AcceptedObjects
+from pipeline.generation.scene_origins import AcceptedObjects, ComposedScenes
 from pipeline.renders.mitsuba_variant import Variant
 from storage.dataset.layout import DatasetFolder
 from storage.dataset.statistics import Statistics
