@@ -20,7 +20,7 @@ from pipeline.exchange.from_description import AlbedoOverOne, scaled_albedo_note
 from pipeline.exchange.scene_files import SceneFiles, SceneFolder, build_scene, require_usable
 from pipeline.generation.dataset_writer import DatasetWriter
 from pipeline.generation.prepare_isolated import asset_child
-from pipeline.isolation import ChildFailed, IsolatedChild, call_with_retries, reach
+from pipeline.isolation import ChildFailed, call_with_retries, reach
 from pipeline.objects.licences import stated_licence
 from pipeline.presets.settings import DatasetSettings, RevisitSettings
 from pipeline.scenes.redrawn import with_new_lights, with_new_materials
@@ -339,9 +339,15 @@ def accept_scene_files(
 def _build_all(
     folder: SceneFolder, licence: str, settings: DatasetSettings, out: DatasetFolder
 ) -> SceneFiles:
-    """Build every scene; return digests of the usable files, and errors of the others."""
+    """Build every scene; return digests of the usable files, and errors of the others.
+
+    Raises:
+        EnvironmentFailure: a file could not be read this time.
+        TrilightError: no file is usable.
+    """
     announce_objects(out, len(folder.names))
     num_views = settings.scenes.num_views
+    over_one = folder.albedo_over_one
     sha256: dict[str, str] = {}
     notes: list[str] = []
     unusable = dict(folder.unusable)
@@ -349,9 +355,19 @@ def _build_all(
         for name in folder.names:
             if name not in unusable:
                 try:
-                    digests, words = _build_in_child(child, folder, name, settings)
+                    digests, words = call_with_retries(
+                        child, build_once, folder.root, name, settings.assets, num_views, over_one
+                    )
                     sha256 |= digests
                     notes += words
+                except ChildFailed as failure:
+                    if not failure.is_verdict:
+                        raise EnvironmentFailure(
+                            f"{name}: its meshes could not be read this time ({failure}). Run the "
+                            "same command again; if that does not help, see `trilight doctor`."
+                        ) from failure
+                    why = f"its meshes cannot be read ({failure}); fix or remove the file."
+                    unusable[name] = f"{name}: {why}"
                 except EnvironmentFailure:
                     raise
                 except TrilightError as mistake:
@@ -365,7 +381,7 @@ def _build_all(
         sha256=sha256,
         unusable=unusable,
         licence=licence,
-        albedo_over_one=folder.albedo_over_one,
+        albedo_over_one=over_one,
         notes=(*notes, *left_out, *folder.notes(num_views)),
     )
 
@@ -391,21 +407,3 @@ def build_once(
         notes=unread,
     )
     return sha256, tuple(f"{name}: {text}" for text in (*unread, *scaled_albedo_notes(scene)))
-
-
-def _build_in_child(
-    child: IsolatedChild, folder: SceneFolder, name: str, settings: DatasetSettings
-) -> tuple[Mapping[str, str], tuple[str, ...]]:
-    """Build a scene in a child; raises TrilightError, or EnvironmentFailure for the machine."""
-    arguments = (settings.assets, settings.scenes.num_views, folder.albedo_over_one)
-    try:
-        return call_with_retries(child, build_once, folder.root, name, *arguments)
-    except ChildFailed as failure:
-        if failure.is_verdict:
-            raise TrilightError(
-                f"{name}: its meshes cannot be read ({failure}); fix or remove the file."
-            ) from failure
-        raise EnvironmentFailure(
-            f"{name}: its meshes could not be read this time ({failure}). Run the same command "
-            "again; if that does not help, see `trilight doctor`."
-        ) from failure

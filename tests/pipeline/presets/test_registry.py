@@ -280,7 +280,7 @@ def test_a_default_that_is_changed_later_changes_no_frozen_set() -> None:
         else:
             raise AssertionError("a default is still there")
         from pipeline.presets.frozen_v1 import PRESETS_FOR_JUDGING, RENDERFORMER_PRESETS
-                DATASET_PRESETS = PRESETS_FOR_JUDGING | RENDERFORMER_PRESETS
+        DATASET_PRESETS = PRESETS_FOR_JUDGING | RENDERFORMER_PRESETS
         """)
     assert found == {name: DATASET_PRESETS[name].settings().digest for name in FROZEN}
 
