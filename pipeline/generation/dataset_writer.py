@@ -17,11 +17,7 @@ from typing import Any
 
 from pipeline.presets.settings import DatasetSettings, differences
 from pipeline.renders.mitsuba_variant import device_of
-from pipeline.shards.pack_shards import (
-    PLANNED,
-    PublishedShards,
-    unpack_here,
-)
+from pipeline.shards.pack_shards import PLANNED, PublishedShards, unpack_here
 from storage.atomic import write_atomically
 from storage.dataset.dataset import Dataset, published_manifest
 from storage.dataset.derived import derivation_of

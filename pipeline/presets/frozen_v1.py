@@ -233,7 +233,7 @@ def renderformer_v1_256(policy: Policy = "de-biased") -> DatasetSettings:
         "assets.budgets": [1188, 840, 594, 396, 297, 198],
         "scenes.max_triangles": 1572,
     }
-    return _published("renderformer-v1-256", policy, stage_1_families(policy), changes)
+    return _settings_of_stage("renderformer-v1-256", policy, stage_1_families(policy), changes)
 
 
 def renderformer_v1_512(policy: Policy = "de-biased") -> DatasetSettings:
@@ -244,10 +244,10 @@ def renderformer_v1_512(policy: Policy = "de-biased") -> DatasetSettings:
         "renders.resolution": 512,
         "splits.scenes_per_shard": 64,
     }
-    return _published("renderformer-v1-512", policy, stage_2_families(policy), changes)
+    return _settings_of_stage("renderformer-v1-512", policy, stage_2_families(policy), changes)
 
 
-def _published(
+def _settings_of_stage(
     name: str, policy: Policy, families: tuple[Family, ...], changes: Mapping[str, Any]
 ) -> DatasetSettings:
     build = {"build": f"{name}-original" if policy == "original" else name}
