@@ -18,11 +18,7 @@ from pathlib import Path
 
 from pipeline.assets.stage import PreparedObject
 from pipeline.generation.dataset_writer import DatasetWriter
-from pipeline.generation.object_batches import (
-    ObjectWork,
-    cut_objects,
-    prepare_in_batches,
-)
+from pipeline.generation.object_batches import ObjectWork, cut_objects, prepare_in_batches
 from pipeline.generation.prepare_isolated import PrepareResult, format_unread, write_unread
 from pipeline.generation.scene_origins import AcceptedObjects, ComposedScenes, require_same
 from pipeline.isolation import (
