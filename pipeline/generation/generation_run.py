@@ -97,14 +97,11 @@ class Run:
         if isinstance(origin, SceneFiles):
             notes = origin.notes
         elif statistics and self.options.revisits is None:
-            notes = frozen_note(self.options.build, statistics)
             splits = self.job.settings.splits
             num_scenes = writer.manifest.num_scenes
-            size_notes = (
-                keeps_scenes(num_scenes, self.options.scenes, splits),
-                lacks_validation(num_scenes, splits),
-            )
-            notes += tuple(filter(None, size_notes))
+            kept = keeps_scenes(num_scenes, self.options.scenes, splits)
+            sizes = filter(None, (kept, lacks_validation(num_scenes, splits)))
+            notes = (*frozen_note(self.options.build, statistics), *sizes)
         return Outcome(
             digest=finished.dataset_digest if finished else "",
             num_objects_found=self.job.accepted.num_found,
