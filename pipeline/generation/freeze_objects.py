@@ -139,7 +139,7 @@ class ObjectLock:
         known = facts.lock_sha256, facts.lock_bytes, facts.asked
         if known != (self.writer.manifest.objects_lock_sha256, lock.num_bytes, self._digest):
             return None
-        maps = tuple(row for row in self._accept_maps().rows if lock.find(row[0].uid) == row[0])
+        maps = tuple(row for row in self.accept_maps().rows if lock.find(row[0].uid) == row[0])
         if len(maps) != facts.num_maps:  # the long way says which one has changed
             return None
         return self._frozen_inputs(facts.num_objects, facts.num_found, maps)
@@ -148,7 +148,7 @@ class ObjectLock:
         """Freeze the objects of the source, or check each of those that were frozen."""
         folder = self.writer.folder
         frozen = self.writer.frozen_objects()
-        maps = self._accept_maps()
+        maps = self.accept_maps()
         selected = listed.allowed
         if frozen is not None:
             maps = replace(maps, rows=tuple(row for row in maps.rows if row[0].uid in frozen))
@@ -276,8 +276,37 @@ class ObjectLock:
     def _display_name(self) -> str:
         return f"objects {safe_url(self.source)!r}"
 
-    def _accept_maps(self) -> AcceptedMaps:
-        return accept_maps(self.map_folders, self.map_licence, self.settings, workers=self.workers)
+    def accept_maps(self) -> AcceptedMaps:
+        """Prepare the textures and maps of the folders.
+
+        Raises:
+            TrilightError: a folder is missing or empty, none of its files can be used, or the cache
+                cannot be written.
+        """
+        allowed = self.settings.allowed_licences
+        rows: list[tuple[LockedObject, Path]] = []
+        failures: list[Failure] = []
+        for kind, folder in self.map_folders.items():
+            listing = find_maps(kind, folder, licence=self.map_licence, allowed_licences=allowed)
+            outcomes = _prepare_maps(kind, listing.maps, self.settings, self.workers)
+            usable = [outcome for outcome in outcomes if not isinstance(outcome, Failure)]
+            failures += [
+                failure(locked.uid, "not_read", notes.read_text("utf-8"))
+                for locked, path in usable
+                if (notes := _notes(path)).exists()
+            ]
+            lost = [outcome for outcome in outcomes if isinstance(outcome, Failure)]
+            failures += [*listing.failures, *lost]
+            if not usable:
+                first = (*lost, *listing.failures)[0]
+                raise TrilightError(
+                    f"{PLURALS[kind]}: none of {len(lost) + len(listing.failures)} files can be "
+                    f"used; the first is {first.item}: {first.reason} ({first.message}). Fix or "
+                    "replace it."
+                )
+            _warn_of_maps(kind, [locked for locked, _ in usable], lost)
+            rows += usable
+        return AcceptedMaps(rows=tuple(rows), failures=tuple(failures))
 
     def _list_source(self) -> ListedObjects:
         return list_objects(
@@ -390,46 +419,6 @@ def map_folders(folders: Mapping[str, str | None], scenes: SceneSettings) -> Map
                 f"--set scenes.{name}.own_share=1, or leave --{name} out."
             )
     return {kind: folder for kind, folder in folders.items() if folder is not None}
-
-
-def accept_maps(
-    folders: Mapping[str, str], licence: str | None, settings: DatasetSettings, *, workers: int
-) -> AcceptedMaps:
-    """Prepare the textures and maps of folders.
-
-    Args:
-        folders: a folder by kind, TEXTURE or SKY.
-        licence: licence that the user states for folders without a catalogue.
-        workers: number of files that are decoded at the same time.
-
-    Raises:
-        TrilightError: a folder is missing or empty, none of its files can be used, or the cache
-            cannot be written.
-    """
-    rows: list[tuple[LockedObject, Path]] = []
-    failures: list[Failure] = []
-    for kind, folder in folders.items():
-        listing = find_maps(
-            kind, folder, licence=licence, allowed_licences=settings.allowed_licences
-        )
-        outcomes = _prepare_maps(kind, listing.maps, settings, workers)
-        usable = [outcome for outcome in outcomes if not isinstance(outcome, Failure)]
-        failures += [
-            failure(locked.uid, "not_read", notes.read_text("utf-8"))
-            for locked, path in usable
-            if (notes := _notes(path)).exists()
-        ]
-        lost = [outcome for outcome in outcomes if isinstance(outcome, Failure)]
-        failures += [*listing.failures, *lost]
-        if not usable:
-            first = (*lost, *listing.failures)[0]
-            raise TrilightError(
-                f"{PLURALS[kind]}: none of {len(lost) + len(listing.failures)} files can be used; "
-                f"the first is {first.item}: {first.reason} ({first.message}). Fix or replace it."
-            )
-        _warn_of_maps(kind, [locked for locked, _ in usable], lost)
-        rows += usable
-    return AcceptedMaps(rows=tuple(rows), failures=tuple(failures))
 
 
 def _prepare_maps(

@@ -7,6 +7,7 @@ import shutil
 from collections.abc import Iterator
 from pathlib import Path
 from types import SimpleNamespace
+from typing import Any
 
 import numpy as np
 import pytest
@@ -14,7 +15,7 @@ import pytest
 from pipeline.documents.rights import encode_attribution
 from pipeline.generation import freeze_objects, pipeline, render_workers, scene_worker
 from pipeline.generation.dataset_writer import DatasetWriter
-from pipeline.generation.freeze_objects import AcceptedMaps, accept_maps, map_folders
+from pipeline.generation.freeze_objects import AcceptedMaps, ObjectLock, map_folders
 from pipeline.generation.generate_options import GenerateOptions
 from pipeline.generation.prepare_isolated import asset_store
 from pipeline.generation.scene_origins import AcceptedObjects, ComposedScenes, require_same
@@ -254,7 +255,15 @@ def accepted(settings: DatasetSettings, tmp_path_factory: pytest.TempPathFactory
     with pytest.MonkeyPatch.context() as patch:
         patch.setenv("TRILIGHT_CACHE", str(root / "cache"))
         patch.setattr(freeze_objects, "IsolatedChild", ChildHere)
-        return accept_maps(folders, None, settings, workers=1)
+        writer: Any = None
+        return ObjectLock(
+            source="",
+            licence=None,
+            settings=settings,
+            writer=writer,
+            workers=1,
+            map_folders=folders,
+        ).accept_maps()
 
 
 def test_rows_have_splits_by_content_and_copies_stay_together(accepted: AcceptedMaps) -> None:
