@@ -99,9 +99,9 @@ class Run:
         elif statistics and self.options.revisits is None:
             splits = self.job.settings.splits
             num_scenes = writer.manifest.num_scenes
-            kept = keeps_scenes(num_scenes, self.options.scenes, splits)
-            sizes = filter(None, (kept, lacks_validation(num_scenes, splits)))
-            notes = (*frozen_note(self.options.build, statistics), *sizes)
+            kept_note = keeps_scenes(num_scenes, self.options.scenes, splits)
+            size_notes = filter(None, (kept_note, lacks_validation(num_scenes, splits)))
+            notes = (*frozen_note(self.options.build, statistics), *size_notes)
         return Outcome(
             digest=finished.dataset_digest if finished else "",
             num_objects_found=self.job.accepted.num_found,
