@@ -141,7 +141,7 @@ def predict_cost(
     it is left out if there are others. Means are resampled 2000 times (Efron's bootstrap), which is
     too narrow for very few scenes and cannot predict costs that none of them shows.
     """
-    splits = options.settings().splits
+    splits = options.settings.splits
     num_scenes = planned_scenes(options.num_scenes, splits)
     num_shards = shards_for(num_scenes, splits)
     core_hours = _total(measured.core_s[1:] or measured.core_s, num_scenes / 3600)
@@ -177,7 +177,7 @@ def describe_run(options: GenerateOptions, folder: DatasetFolder) -> str:
 
     It is empty if files or another dataset define the scenes.
     """
-    settings = options.settings()
+    settings = options.settings
     if options.scenes_from or options.revisits or settings.revisit:
         return ""
     scenes = options.num_scenes

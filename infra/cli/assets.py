@@ -106,7 +106,7 @@ def _print_report(
     _print_table(report)
     decimated = [row for row in report.rows if row.method != "source"]
     rows = [
-        ("accepted", f"{len(report.rows)}, of which {report.num_repaired} repaired"),
+        ("accepted", f"{len(report.rows)}, of which {report.counts['repaired']} repaired"),
         ("decimated", f"{len(decimated)}; the others are within the budget as they are"),
         *_epsilon_rows(report, settings),
         *_material_rows(report, settings, folder),

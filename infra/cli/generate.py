@@ -71,13 +71,13 @@ class ExecutorOptions:
 
 @command("build")
 def generate(options: GenerateOptions, base: BaseSettings, runner: ExecutorOptions) -> None:
-    require_its_extensions(dataset_folder(options.place))
+    require_its_extensions(options.folder)
     make(with_base_settings(options, base), runner)
 
 
 def make(options: GenerateOptions, runner: ExecutorOptions) -> None:
     """Make a dataset and print the result; raises TrilightError."""
-    folder = dataset_folder(options.place)
+    folder = options.folder
     started = time.monotonic()
     first_words(f"Making {folder.display_name} with the preset {options.build}")
     executor = find_executor(runner.runner, runner.address, options.workers)

@@ -2,7 +2,7 @@
 
 from collections.abc import Sequence
 from pathlib import Path
-from typing import Annotated, Literal
+from typing import Annotated
 
 from cyclopts import App, Group
 
@@ -22,6 +22,7 @@ from pipeline.generation.derive_dataset import list_scenes as read_scene_rows
 from pipeline.shards.finished_dataset import open_finished
 from storage.errors import TrilightError
 from storage.settings.described import checked
+from storage.settings.overrides import option_words
 from storage.settings.ranges import Within
 
 app = App(name="shards", help_epilogue="", help_flags=HELP_FLAGS, group_commands=Group("Commands"))
@@ -47,38 +48,17 @@ class MergeOptions:
 
 
 @checked()
-class SelectOptions:
-    """Source and conditions."""
+class SourceOptions:
+    """Source."""
 
     dataset: Path
     """Folder of a finished dataset."""
-    split: Literal["train", "validation", "test"] | None = None
-    """Keep only the scenes of this split; by default all."""
-    template: str | None = None
-    """Keep only the scenes of this layout, such as plane; by default all."""
-    min_noise_floor_db: Annotated[float | None, Within(-100, 200, unit="dB")] = None
-    """Keep only scenes whose views all have this stated error (psnr_log_db); by default all."""
-    where: str | None = None
-    """Keep only scenes that meet a condition such as "max(roughness) < 0.3"; by default all. The
-    reference page Quantities has the names."""
-
-    @property
-    def selection(self) -> Selection:
-        """The conditions as the selection of a derived dataset."""
-        return Selection(
-            split=self.split,
-            template=self.template,
-            min_noise_floor_db=self.min_noise_floor_db,
-            where=self.where,
-        )
 
 
 @checked()
-class ReshardOptions:
+class ReshardOptions(SourceOptions):
     """Source and shard size."""
 
-    dataset: Path
-    """Folder of a finished dataset."""
     scenes_per_shard: Annotated[int, Within(1, 10**9, unit="scenes")]
     """Number of scenes in each new shard."""
 
@@ -93,23 +73,23 @@ def merge(sources: MergeOptions, new: NewDatasetOptions) -> None:
 
 @app.command(help="Keep the scenes that meet every condition, under their keys.")
 @command("dataset")
-def select(options: SelectOptions, new: NewDatasetOptions) -> None:
-    if options.selection == Selection():
+def select(source: SourceOptions, selection: Selection, new: NewDatasetOptions) -> None:
+    if selection == Selection():
         raise TrilightError("select: expected --where, --split, --template or --min-noise-floor.")
-    derive = DeriveOptions(operation="select", selection=options.selection)
-    _run([options.dataset], derive, new.out)
+    _run([source.dataset], DeriveOptions(operation="select", selection=selection), new.out)
 
 
 @app.command(
     name="list", help="List the scenes that `select` would keep, without making a dataset."
 )
 @command("dataset")
-def list_scenes(chosen: SelectOptions) -> None:
-    first_words(f"Reading {chosen.dataset}")
+def list_scenes(source: SourceOptions, selection: Selection) -> None:
+    place = str(source.dataset)
+    first_words(f"Reading {place}")
     with progress("shards") as done:
-        source = open_finished(str(chosen.dataset))
-        rows = read_scene_rows(source, chosen.selection, progress=done)
-    of = source.manifest.num_samples
+        dataset = open_finished(place)
+        rows = read_scene_rows(dataset, selection, progress=done)
+    of = dataset.manifest.num_samples
     print_json({"of": of, "scenes": rows})
     print_table(
         f"{len(rows)} of {of} scenes; of several views the least, most spp", rows[:_MOST_LISTED]
@@ -117,8 +97,8 @@ def list_scenes(chosen: SelectOptions) -> None:
     if len(rows) > _MOST_LISTED:
         note(f"the first {_MOST_LISTED} are shown; --json lists all")
     if rows:
-        words = ["shards", "select", str(chosen.dataset), "--out", f"{chosen.dataset}-selected"]
-        next_step([*words, *chosen.selection.words])
+        words = ["shards", "select", place, "--out", f"{place}-selected"]
+        next_step([*words, *option_words(selection)])
 
 
 @app.command(help="Repack the scenes of every split into shards of another size.")

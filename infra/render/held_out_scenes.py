@@ -15,6 +15,7 @@ from pipeline.isolation import ChildLimits, IsolatedChild
 from pipeline.presets.settings import DatasetSettings
 from pipeline.presets.training import smoke
 from pipeline.renders.mitsuba_variant import Variant, choose_variant, environment
+from pipeline.shards.pack_shards import PublishedShards
 from scene_templates.settings import SceneSettings
 from storage.dataset.layout import DatasetFolder
 from storage.dataset.splits import JUDGED_SPLIT
@@ -49,10 +50,11 @@ def composing_child(
     """
     variant = variant or choose_variant()
     workers = threads or available_cores()
-    publication = begin_or_resume_dataset(DatasetFolder(folder), settings, environment(variant), 1)
+    shards = PublishedShards(DatasetFolder(folder))
+    publication = begin_or_resume_dataset(shards, settings, environment(variant), 1)
     accepted = ObjectLock(
         source=objects, licence=None, settings=settings, writer=publication, workers=workers
-    ).freeze()
+    ).accept()
     arguments = (settings, accepted.origin, asset_store(), variant, workers)
     limits = dataclasses.replace(_LIMITS, memory_bytes=variant.address_space(_LIMITS.memory_bytes))
     return IsolatedChild(limits=limits, factory=SceneWorker, args=arguments)

@@ -17,7 +17,7 @@ from pipeline.isolation import ChildFailed, IsolatedChild, call_with_retries, re
 from storage.digests import sha256_hex
 from storage.errors import EnvironmentFailure, Rejected, TrilightError
 from storage.records.asset import Asset, Level, decode_asset
-from storage.records.objects import Failure, ObjectRecord
+from storage.records.objects import Failure, ObjectRecord, failure_of
 
 _LOG = logging.getLogger(__name__)
 
@@ -85,12 +85,7 @@ def prepare_assets(
         try:
             return _Preparation(record, settings, store, methods, borrow_child).run()
         except Rejected as rejection:
-            return Failure(
-                stage="assets",
-                item=record.uid,
-                reason=rejection.reason,
-                message=rejection.message,
-            )
+            return failure_of("assets", record.uid, rejection)
         finally:
             done()
 

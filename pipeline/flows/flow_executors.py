@@ -20,7 +20,6 @@ from pipeline.generation.generate_options import GenerateOptions
 from pipeline.generation.generation_run import Outcome
 from pipeline.generation.render_workers import close_idle_children
 from storage.atomic import write_atomically
-from storage.dataset.layout import dataset_folder
 from storage.errors import TrilightError
 
 if TYPE_CHECKING:
@@ -102,7 +101,7 @@ def _client(address: str) -> "Client":
 
 def _require_shared(client: "Client", options: GenerateOptions) -> None:
     """Raise if a worker of the cluster cannot see the output folder."""
-    folder = dataset_folder(options.place)
+    folder = options.folder
     seen_by_all = folder.staging.resolve() / f"met-{uuid.uuid4().hex}"
     write_atomically(seen_by_all, b"")
     try:

@@ -43,10 +43,8 @@ from storage.number_ranges import number_ranges
 @parameters_of(GenerateOptions, **DATASET_FORMS)
 def prepare_assets(**parameters: Any) -> None:
     """Begin a dataset: list, clean, decimate and freeze its objects, without a picture."""
-    run = prepare_dataset(options_of_form(parameters, GenerateOptions))
-    get_run_logger().info(
-        "%d of %d objects accepted", run.accepted.num_objects, run.accepted.num_found
-    )
+    accepted = prepare_dataset(options_of_form(parameters, GenerateOptions)).job.accepted
+    get_run_logger().info("%d of %d objects accepted", accepted.num_objects, accepted.num_found)
 
 
 @flow(name="generate-scenes", flow_run_name=run_name, persist_result=False)

@@ -17,11 +17,7 @@ from typing import Any
 
 from pipeline.presets.settings import DatasetSettings, differences
 from pipeline.renders.mitsuba_variant import device_of
-from pipeline.shards.pack_shards import (
-    PLANNED,
-    PublishedShards,
-    unpack_here,
-)
+from pipeline.shards.pack_shards import PLANNED, PublishedShards, unpack_here
 from storage.atomic import write_atomically
 from storage.dataset.dataset import Dataset, published_manifest
 from storage.dataset.derived import derivation_of
@@ -79,12 +75,10 @@ class DatasetWriter:
     that moment, and reaches the disk before the call returns.
     """
 
-    def __init__(
-        self, store: Store, folder: DatasetFolder, manifest: Manifest, splits: SplitSettings
-    ) -> None:
-        self.store = store
+    def __init__(self, shards: PublishedShards, manifest: Manifest, splits: SplitSettings) -> None:
+        self.store = shards.store
         """Where the dataset is published."""
-        self.folder = folder
+        self.folder = shards.folder
         self.manifest = manifest
         """Manifest of the dataset; it lists shards only once the dataset is finished."""
         self.given_up = 0
@@ -94,7 +88,7 @@ class DatasetWriter:
         self.left_to_others = False
         """True if another machine has just listed the shards, and writes the documents."""
         self._splits = splits
-        self._shards = PublishedShards(folder, store)
+        self._shards = shards
         self._ends: dict[str, range] = {}
         """Last shards of earlier plans of a bucket, by name, with the scenes that they should hold
         now."""
@@ -433,7 +427,7 @@ def _require_extendable(folder: DatasetFolder, manifest: Manifest) -> None:
 
 
 def begin_or_resume_dataset(
-    folder: DatasetFolder,
+    shards: PublishedShards,
     settings: DatasetSettings,
     environment: Mapping[str, Any],
     num_scenes: int,
@@ -452,7 +446,9 @@ def begin_or_resume_dataset(
     if num_scenes < 1:
         raise TrilightError(f"scenes is {num_scenes}; expected at least 1.")
     num_planned = planned_scenes(num_scenes, settings.splits)
-    store = folder.store()
+    stated = settings.as_json()
+    folder = shards.folder
+    store = shards.store
     with folder.mutex("manifest"):
         if is_new := store.get(folder.manifest.name, 1) is None:
             _require_free(folder, store)
@@ -460,7 +456,7 @@ def begin_or_resume_dataset(
         if not folder.manifest.exists():
             manifest = Manifest(
                 build=settings.build,
-                settings=settings.as_json(),
+                settings=stated,
                 environment=environment,
                 num_scenes=num_planned,
                 num_views=settings.scenes.num_views,
@@ -470,12 +466,12 @@ def begin_or_resume_dataset(
             )
             write_manifest(folder.manifest, manifest)
         if is_new and not store.create_if_absent(folder.manifest.name, folder.manifest):
-            PublishedShards(folder, store).adopt()  # another machine was first
+            shards.adopt()  # another machine was first
         manifest = read_head(folder.manifest)
-    _require_same_dataset(folder, manifest, settings, environment, accept_environment)
+    _require_same_dataset(folder, manifest, stated, environment, accept_environment)
     if not store.is_here:  # in a folder the manifest says so
         store.put(f"{PLANNED}{max(num_planned, manifest.num_scenes):012d}", b"\n")
-    writer = DatasetWriter(store, folder, manifest, settings.splits)
+    writer = DatasetWriter(shards, manifest, settings.splits)
     writer.refresh_plan(num_planned)
     return writer
 
@@ -483,13 +479,13 @@ def begin_or_resume_dataset(
 def _require_same_dataset(
     folder: DatasetFolder,
     manifest: Manifest,
-    settings: DatasetSettings,
+    settings: Mapping[str, Any],
     environment: Mapping[str, Any],
     accept_environment: bool,
 ) -> None:
     _require_extendable(folder, manifest)
     stored = from_record(DatasetSettings, manifest.settings).as_json()  # fields may come later
-    differing = list(differences(stored, settings.as_json()))
+    differing = list(differences(stored, settings))
     what = "setting"
     next_step = "choose another --out"
     if not (differing or accept_environment):

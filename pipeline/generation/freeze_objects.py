@@ -1,49 +1,77 @@
 """`ObjectLock`: freezes the objects of a dataset, or loads those that are frozen.
 
-The frozen objects are the pool that its scenes draw from, equal for all workers.
+The frozen objects are the pool that its scenes draw from, equal for all workers. The user's
+textures and environment maps are frozen with them. Each of their files is decoded once, in a child
+with limits; the result is in the user's cache. The digest of its content decides the split of a
+texture or map, by the rule of objects.
 """
 
+import contextlib
 import logging
 import shutil
 import threading
 from collections.abc import Callable, Mapping, Sequence
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, field, replace
 from operator import attrgetter
 from pathlib import Path
 
 from pipeline.assets.stage import PreparedObject
-from pipeline.generation.accept_maps import AcceptedMaps, accept_maps
 from pipeline.generation.dataset_writer import DatasetWriter
-from pipeline.generation.frozen_pool import ComposedScenes, require_same
-from pipeline.generation.object_batches import (
-    ObjectWork,
-    PrepareResult,
-    cut_objects,
-    prepare_in_batches,
+from pipeline.generation.object_batches import ObjectWork, cut_objects, prepare_in_batches
+from pipeline.generation.prepare_isolated import PrepareResult, format_unread, write_unread
+from pipeline.generation.scene_origins import AcceptedObjects, ComposedScenes, require_same
+from pipeline.isolation import (
+    ChildFailed,
+    ChildLimits,
+    ChildPool,
+    IsolatedChild,
+    call_with_retries,
+    is_transient,
+    reach,
 )
-from pipeline.generation.prepare_isolated import format_unread, write_unread
-from pipeline.generation.scene_origins import AcceptedObjects
-from pipeline.isolation import is_transient
+from pipeline.objects.listing import failure
+from pipeline.objects.maps.listing import PLURALS, FoundMap, find_maps
+from pipeline.objects.maps.prepared import decode_prepared, map_cache_key, prepare_map
 from pipeline.objects.sources import ListedObjects, list_objects
 from pipeline.presets.settings import DatasetSettings
+from scene_templates.settings import SceneSettings
+from storage.atomic import write_atomically
+from storage.cache import cache_folder
 from storage.conventions import SPLITS
 from storage.dataset.progress import announce_downloads, announce_objects, count_object
 from storage.dataset.splits import require_objects, split_of_object, split_of_shard
 from storage.digests import canonical_json, sha256_hex
-from storage.errors import EnvironmentFailure, TrilightError
+from storage.errors import EnvironmentFailure, Rejected, TrilightError
 from storage.records.object_index import IndexedObject, IndexFacts, ObjectIndex, write_object_index
 from storage.records.objects import (
     OBJECT,
+    SKY,
+    TEXTURE,
     Failure,
     LockedObject,
     LockRows,
     ObjectRecord,
     count_by_reason,
+    failure_of,
 )
 from storage.records.safe_read import open_plain
-from storage.remote.safe_url import safe_url
+from storage.remote.safe_url import printable, safe_url
 
 log = logging.getLogger("trilight.objects")
+
+_MAP_LIMITS = ChildLimits(memory_bytes=8 << 30, wall_s=600, cpu_s=300, calls_per_child=200)
+"""The largest map, 8192 x 4096 in float32, takes 403 MB, and its mip levels six times as much."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class AcceptedMaps:
+    """The user's textures and environment maps that scenes may use."""
+
+    rows: tuple[tuple[LockedObject, Path], ...] = ()
+    """Every usable texture and map with its prepared file."""
+    failures: tuple[Failure, ...] = ()
+    """Reasons why other files cannot be used, or not fully."""
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -68,14 +96,28 @@ class ObjectLock:
     def accept(self) -> AcceptedObjects:
         """Return the frozen objects; prepare and freeze them with the other workers if need be.
 
+        The user's textures and maps are frozen with them.
+
         Raises:
-            TrilightError, EnvironmentFailure: as `freeze`.
+            TrilightError, EnvironmentFailure: as `list_objects`, `prepare_in_batches`,
+                `accept_maps` and `freeze_prepared`.
         """
         if trusted := self.load():
             return trusted
-        listed = self.prepare()
-        with self.writer.hold_lock("objects"):  # one worker freezes, and the others load it
-            return self.freeze(listed)
+        writer = self.writer
+        listed = None
+        with writer.hold_lock("objects"):  # one writes built-in objects, the others load them
+            writer.fetch_lock()
+            if writer.frozen_objects() is None:
+                listed = self._list_source()
+                announce_objects(writer.folder, len(listed.allowed))
+        if listed:  # together with the other workers, so without the lock
+            index = writer.folder.staged_index
+            self._prepare(listed, listed.allowed, should_stop=lambda: writer.is_published(index))
+        with writer.hold_lock("objects"):  # one worker freezes, and the others load it
+            return self.load() or self._freeze(
+                listed or self._list_source(), retry_transient=listed is None
+            )
 
     def load(self) -> AcceptedObjects | None:
         """Return the frozen objects by their index, without opening any of them.
@@ -97,52 +139,16 @@ class ObjectLock:
         known = facts.lock_sha256, facts.lock_bytes, facts.asked
         if known != (self.writer.manifest.objects_lock_sha256, lock.num_bytes, self._digest):
             return None
-        maps = tuple(row for row in self._accept_maps().rows if lock.find(row[0].uid) == row[0])
+        maps = tuple(row for row in self.accept_maps().rows if lock.find(row[0].uid) == row[0])
         if len(maps) != facts.num_maps:  # the long way says which one has changed
             return None
         return self._frozen_inputs(facts.num_objects, facts.num_found, maps)
 
-    def prepare(self) -> ListedObjects | None:
-        """Prepare objects cooperatively, without holding the objects mutex, unless they are frozen.
-
-        Returns:
-            The listed source, for `freeze`; None if the objects are frozen already.
-
-        Raises:
-            TrilightError: as `list_objects` and `prepare_in_batches`.
-        """
+    def _freeze(self, listed: ListedObjects, *, retry_transient: bool) -> AcceptedObjects:
+        """Freeze the objects of the source, or check each of those that were frozen."""
         folder = self.writer.folder
-        with self.writer.hold_lock("objects"):  # one writes built-in objects, the others load them
-            self.writer.fetch_lock()
-            if self.writer.frozen_objects() is not None:
-                return None
-            listed = self._list_source()
-            announce_objects(folder, len(listed.allowed))
-        self._prepare(
-            listed,
-            listed.allowed,
-            should_stop=lambda: self.writer.is_published(folder.staged_index),
-        )
-        return listed
-
-    def freeze(self, listed: ListedObjects | None = None) -> AcceptedObjects:
-        """Prepare the meshes of the source and freeze them; later, load those that were frozen.
-
-        The user's textures and maps are frozen with them. Call while holding the mutex `objects`.
-
-        Args:
-            listed: the listed source, if it is known.
-
-        Raises:
-            TrilightError, EnvironmentFailure: as `list_objects` and `freeze_prepared`.
-        """
-        folder = self.writer.folder
-        if trusted := self.load():
-            return trusted
         frozen = self.writer.frozen_objects()
-        shared = listed is not None
-        listed = listed or self._list_source()
-        maps = self._accept_maps()
+        maps = self.accept_maps()
         selected = listed.allowed
         if frozen is not None:
             maps = replace(maps, rows=tuple(row for row in maps.rows if row[0].uid in frozen))
@@ -153,7 +159,7 @@ class ObjectLock:
             batches = [batch for batch in batches if any(one.uid in frozen for one in batch)]
             selected = [one for batch in batches for one in batch]
             announce_objects(folder, len(selected))
-        prepared, rejected = self._prepare(listed, selected, retry_transient=not shared)
+        prepared, rejected = self._prepare(listed, selected, retry_transient=retry_transient)
         lost = [failure for failure in rejected if failure.stage == "objects"]
         listed.require_some(len(selected) - len(lost), [*listed.refused, *lost])
         if frozen is not None:
@@ -270,8 +276,37 @@ class ObjectLock:
     def _display_name(self) -> str:
         return f"objects {safe_url(self.source)!r}"
 
-    def _accept_maps(self) -> AcceptedMaps:
-        return accept_maps(self.map_folders, self.map_licence, self.settings, workers=self.workers)
+    def accept_maps(self) -> AcceptedMaps:
+        """Prepare the textures and maps of the folders.
+
+        Raises:
+            TrilightError: a folder is missing or empty, none of its files can be used, or the cache
+                cannot be written.
+        """
+        allowed = self.settings.allowed_licences
+        rows: list[tuple[LockedObject, Path]] = []
+        failures: list[Failure] = []
+        for kind, folder in self.map_folders.items():
+            listing = find_maps(kind, folder, licence=self.map_licence, allowed_licences=allowed)
+            outcomes = _prepare_maps(kind, listing.maps, self.settings, self.workers)
+            usable = [outcome for outcome in outcomes if not isinstance(outcome, Failure)]
+            failures += [
+                failure(locked.uid, "not_read", notes.read_text("utf-8"))
+                for locked, path in usable
+                if (notes := _notes(path)).exists()
+            ]
+            lost = [outcome for outcome in outcomes if isinstance(outcome, Failure)]
+            failures += [*listing.failures, *lost]
+            if not usable:
+                first = (*lost, *listing.failures)[0]
+                raise TrilightError(
+                    f"{PLURALS[kind]}: none of {len(lost) + len(listing.failures)} files can be "
+                    f"used; the first is {first.item}: {first.reason} ({first.message}). Fix or "
+                    "replace it."
+                )
+            _warn_of_maps(kind, [locked for locked, _ in usable], lost)
+            rows += usable
+        return AcceptedMaps(rows=tuple(rows), failures=tuple(failures))
 
     def _list_source(self) -> ListedObjects:
         return list_objects(
@@ -359,4 +394,103 @@ def require_tried(display_name: str, failure: Failure) -> None:
             f"{display_name}: {failure.item!r}, which the dataset was begun with, could not be "
             f"prepared this time ({failure.reason}: {failure.message}). Nothing has changed; run "
             "the same command again."
+        )
+
+
+def map_folders(folders: Mapping[str, str | None], scenes: SceneSettings) -> Mapping[str, str]:
+    """Return the folders of textures and maps that are given, by kind.
+
+    Raises:
+        TrilightError: a folder is given that no scene would use, or scenes need a folder that is
+            not given.
+    """
+    for kind, drawn in ((TEXTURE, scenes.textures), (SKY, scenes.skies)):
+        name = PLURALS[kind]
+        is_used = bool(drawn.share and drawn.own_share)
+        if folders[kind] is None and is_used:
+            raise TrilightError(
+                f"scenes.{name}.own_share is {drawn.own_share:g}, but --{name} is not given; "
+                f"expected a folder. Add --{name} FOLDER, or --set scenes.{name}.own_share=0."
+            )
+        if folders[kind] is not None and not is_used:
+            raise TrilightError(
+                f"--{name} is given, but scenes.{name}.share is {drawn.share:g} and own_share "
+                f"{drawn.own_share:g}; expected both above 0. Add --set scenes.{name}.share=0.5 "
+                f"--set scenes.{name}.own_share=1, or leave --{name} out."
+            )
+    return {kind: folder for kind, folder in folders.items() if folder is not None}
+
+
+def _prepare_maps(
+    kind: str, maps: Sequence[FoundMap], settings: DatasetSettings, workers: int
+) -> list[tuple[LockedObject, Path] | Failure]:
+    scenes = settings.scenes
+    size = scenes.textures.surfaces.size if kind == TEXTURE else scenes.skies.maps.height
+    all_files = reach(files=(path for user_map in maps for path in user_map.files.values()))
+
+    def prepare(user_map: FoundMap) -> tuple[LockedObject, Path] | Failure:
+        try:
+            with pool.borrow() as child:
+                path = _prepare_file(kind, user_map.files, size, child)
+            data = path.read_bytes()
+            content_sha256 = decode_prepared(data, path.name).content_sha256
+        except Rejected as rejection:
+            return failure_of("objects", user_map.record.uid, rejection)
+        locked = LockedObject(
+            **user_map.record.identity,
+            asset_sha256=sha256_hex(data),
+            split=split_of_object(content_sha256, settings.splits),
+            kind=kind,
+        )
+        return locked, path
+
+    children = ChildPool(
+        lambda _: IsolatedChild(limits=_MAP_LIMITS, confined_to=all_files), workers
+    )
+    with contextlib.closing(children) as pool, ThreadPoolExecutor(workers) as threads:
+        return list(threads.map(prepare, maps))
+
+
+def _notes(prepared: Path) -> Path:
+    """Return the path of the note on unread parts of a prepared file; absent if there are none."""
+    return prepared.with_suffix(".txt")
+
+
+def _prepare_file(kind: str, files: Mapping[str, Path], size: int, child: IsolatedChild) -> Path:
+    """Prepare a file in a child unless the cache has it; return its path. Raises Rejected."""
+    name = map_cache_key(kind, files, size)
+    path = cache_folder("maps") / name[:2] / f"{name}.safetensors"
+    if not path.exists():
+        try:
+            data, unread = call_with_retries(child, prepare_map, kind, files, size)
+        except ChildFailed as failure:
+            raise Rejected(failure.reason, failure.sentence) from failure
+        if map_cache_key(kind, files, size) != name:
+            raise Rejected("unreadable_file", "it changed while it was being prepared")
+        if unread:
+            message = printable(f"it is used without {'; '.join(unread)}")
+            write_atomically(_notes(path), message.encode())
+        write_atomically(path, data)
+    return path
+
+
+def _warn_of_maps(kind: str, locked: Sequence[LockedObject], lost: Sequence[Failure]) -> None:
+    if lost:
+        first = lost[0]
+        log.warning(
+            "%s: %d cannot be used, such as %s (%s: %s); failures.jsonl names all",
+            PLURALS[kind],
+            len(lost),
+            first.item,
+            first.reason,
+            first.message,
+        )
+    without = [split for split in SPLITS if split not in {entry.split for entry in locked}]
+    if without and {entry.split for entry in locked} != {"test"}:
+        log.warning(
+            "%s: of %d, none belongs to %s, whose scenes get procedural ones; about 30 different "
+            "ones are enough for every split",
+            PLURALS[kind],
+            len(locked),
+            " and ".join(without),
         )

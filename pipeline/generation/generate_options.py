@@ -3,6 +3,7 @@
 import re
 from collections.abc import Mapping
 from dataclasses import field
+from functools import cached_property
 from typing import Annotated, Any
 
 from pipeline.exchange.from_description import AlbedoOverOne
@@ -10,12 +11,13 @@ from pipeline.presets.registry import DATASET_PRESETS, preset_settings
 from pipeline.presets.settings import DatasetSettings
 from pipeline.renders.mitsuba_variant import Device
 from pipeline.renders.settings import NoiseFloor, Resolution
-from storage.dataset.layout import dataset_folder
+from storage.dataset.layout import DatasetFolder, dataset_folder
 from storage.dataset.settings import MOST_SCENES
 from storage.errors import TrilightError
 from storage.extensions import function_name
 from storage.remote.safe_url import safe_url
 from storage.settings.described import checked
+from storage.settings.fields import option_of
 from storage.settings.overrides import option_words
 from storage.settings.ranges import Seed, Share, Within
 
@@ -118,15 +120,15 @@ class GenerateOptions:
         for name, excluded in _EXCLUDED.items():
             if name in stated and (wrong := [other for other in excluded if other in stated]):
                 raise TrilightError(
-                    f"{_flag(name)} {getattr(self, name)} was given with "
-                    f"{' and '.join(map(_flag, wrong))}; expected it without: it says what scenes "
-                    "are made of. Leave one out."
+                    f"{option_of(name)} {getattr(self, name)} was given with "
+                    f"{' and '.join(map(option_of, wrong))}; expected it without: it says what "
+                    "scenes are made of. Leave one out."
                 )
         for name, necessary in _NEEDS.items():
             if name in stated and not {*necessary} & {*stated}:
                 raise TrilightError(
-                    f"{_flag(name)} is {getattr(self, name)!r}; expected it only with "
-                    f"{' or '.join(map(_flag, necessary))}."
+                    f"{option_of(name)} is {getattr(self, name)!r}; expected it only with "
+                    f"{' or '.join(map(option_of, necessary))}."
                 )
         dataset_folder(self.place)
         self.shard_range()
@@ -135,8 +137,9 @@ class GenerateOptions:
     def num_scenes(self) -> int:
         return DATASET_PRESETS[self.build].num_scenes if self.scenes is None else self.scenes
 
+    @cached_property
     def settings(self) -> DatasetSettings:
-        """Return the preset's settings with the changes of these options.
+        """The preset's settings with the changes of these options.
 
         Raises:
             TrilightError: values contradict each other.
@@ -154,6 +157,10 @@ class GenerateOptions:
     def place(self) -> str:
         return f"data/{function_name(self.build)}" if self.out is None else self.out
 
+    @property
+    def folder(self) -> DatasetFolder:
+        return dataset_folder(self.place)
+
     def shard_range(self) -> range | None:
         """Return the range of requested shards, or None for all.
 
@@ -169,10 +176,6 @@ class GenerateOptions:
                 "to but not including the last."
             )
         return range(int(match[1]), int(match[2]))
-
-
-def _flag(name: str) -> str:
-    return f"--{name.replace('_', '-')}"
 
 
 def generate_words(options: GenerateOptions) -> list[str]:

@@ -28,9 +28,8 @@ from pathlib import Path
 from typing import Any, Generic, TypeVar
 
 from pipeline.exchange.scene_files import SceneFiles, find_scene_files
-from pipeline.generation.accept_maps import map_folders
 from pipeline.generation.dataset_writer import DatasetWriter, begin_or_resume_dataset
-from pipeline.generation.freeze_objects import ObjectLock
+from pipeline.generation.freeze_objects import ObjectLock, map_folders
 from pipeline.generation.generate_options import GenerateOptions, generate_words
 from pipeline.generation.scene_origins import (
     Accept,
@@ -51,8 +50,8 @@ from pipeline.renders.mitsuba_variant import (
     gpu_memory_bytes,
     visible_gpus,
 )
-from pipeline.shards.pack_shards import UnfinishedShard, hold_dataset_lock
-from storage.dataset.layout import DatasetFolder, dataset_folder
+from pipeline.shards.pack_shards import PublishedShards, UnfinishedShard
+from storage.dataset.layout import DatasetFolder
 from storage.dataset.manifest import Manifest, ShardEntry, read_head
 from storage.dataset.progress import write_asked
 from storage.dataset.settings import SplitSettings
@@ -61,7 +60,7 @@ from storage.dataset.statistics import Statistics
 from storage.errors import EnvironmentFailure, TrilightError
 from storage.file_locks import WaitNotice
 from storage.machine import available_cores
-from storage.records.objects import Failure
+from storage.records.objects import SKY, TEXTURE, Failure
 
 _MOST_CHILDREN = 4
 """Children of a GPU. One that only renders fills an H200 (60,700 views an hour, four 58,500), but a
@@ -87,10 +86,6 @@ class Run:
     job: "ShardJob"
     """Input that all tasks of the run share."""
 
-    @property
-    def accepted(self) -> AcceptedObjects:
-        return self.job.accepted
-
     def unfinished_shards(self) -> list[int]:
         return self.publication.unfinished_shards(self.options.shard_range())
 
@@ -98,22 +93,19 @@ class Run:
         """Return the result of the run; a finished dataset adds its digest and statistics."""
         writer = self.publication
         notes: tuple[str, ...] = ()
-        origin = self.accepted.origin
+        origin = self.job.accepted.origin
         if isinstance(origin, SceneFiles):
             notes = origin.notes
         elif statistics and self.options.revisits is None:
-            notes = frozen_note(self.options.build, statistics)
             splits = self.job.settings.splits
             num_scenes = writer.manifest.num_scenes
-            size_notes = (
-                keeps_scenes(num_scenes, self.options.scenes, splits),
-                lacks_validation(num_scenes, splits),
-            )
-            notes += tuple(filter(None, size_notes))
+            kept_note = keeps_scenes(num_scenes, self.options.scenes, splits)
+            size_notes = filter(None, (kept_note, lacks_validation(num_scenes, splits)))
+            notes = (*frozen_note(self.options.build, statistics), *size_notes)
         return Outcome(
             digest=finished.dataset_digest if finished else "",
-            num_objects_found=self.accepted.num_found,
-            num_objects_used=self.accepted.num_objects,
+            num_objects_found=self.job.accepted.num_found,
+            num_objects_used=self.job.accepted.num_objects,
             num_scenes_given_up=writer.given_up,
             failures=tuple(writer.failures),
             num_shards=len(finished.shards) if finished else writer.num_finished_shards(),
@@ -128,7 +120,7 @@ class Run:
         Scene files that cannot become a scene do not count.
         """
         writer = self.publication
-        origin = self.accepted.origin
+        origin = self.job.accepted.origin
         num_unusable = len(origin.unusable) if isinstance(origin, SceneFiles) else 0
         num_scenes = writer.manifest.num_scenes
         budget = self.options.failure_budget
@@ -142,14 +134,11 @@ class Run:
             )
 
 
-def num_workers(options: GenerateOptions, settings: DatasetSettings, device: Device) -> int:
-    """Return the number of parallel tasks of one process; an executor may set another."""
-    if options.workers is not None:
-        return options.workers
+def default_workers(device: Device, resolution: int) -> int:
+    """Return the usual number of parallel tasks of one process; an executor may set another."""
     if device == "cpu":
         return 1
-    num_gpus = max(1, len(visible_gpus()))
-    return num_gpus * children_of_gpu(settings.renders.resolution, gpu_memory_bytes())
+    return max(1, len(visible_gpus())) * children_of_gpu(resolution, gpu_memory_bytes())
 
 
 def children_of_gpu(resolution: int, memory_bytes: int) -> int:
@@ -235,19 +224,19 @@ def resolve_inputs(
     Raises:
         TrilightError: the settings contradict each other, or the source or files are unusable.
     """
-    settings = options.settings()
+    settings = options.settings
     if options.revisits is not None or settings.revisit is not None:
         return resolve_revisit(settings, options.revisits)
     licence = options.licence
+    # of scene files too: they draw no maps, so that shares of maps are refused
+    maps = map_folders({TEXTURE: options.textures, SKY: options.skies}, settings.scenes)
     if options.scenes_from is not None:
         files = find_scene_files(options.scenes_from, options.albedo_over_one)
         settings = settings_for_files(settings, files, options.views)
-        map_folders(options, settings)  # refuses shares of maps: scenes of files draw none
         return settings, partial(accept_scene_files, files, licence, settings)
     source = object_source(settings, options.objects)
     if not folder.manifest.exists():
         check_source(source, allowed_licences=settings.allowed_licences, licence=licence)
-    maps = map_folders(options, settings)
 
     def accept(writer: DatasetWriter) -> AcceptedObjects:
         return ObjectLock(
@@ -280,13 +269,14 @@ def choose_dataset_variant(options: GenerateOptions, folder: DatasetFolder) -> V
 @contextlib.contextmanager
 def begin_run(options: GenerateOptions) -> Iterator[Run]:
     """Join a dataset's workers and yield the run; the first worker freezes the objects."""
-    folder = dataset_folder(options.place)
+    folder = options.folder
     folder = replace(folder, root=Path(os.path.realpath(folder.root)))
     settings, accept = resolve_inputs(options, folder)  # refuses before anything is written
-    with hold_dataset_lock(folder):
+    shards = PublishedShards(folder)
+    with shards.hold_lock():
         variant = choose_dataset_variant(options, folder)
         writer = begin_or_resume_dataset(
-            folder,
+            shards,
             settings,
             environment(variant),
             options.num_scenes,
@@ -309,7 +299,8 @@ def begin_run(options: GenerateOptions) -> Iterator[Run]:
             environment={} if options.accept_environment else manifest.environment,
             accepted=accepted,
             lock_sha256=manifest.objects_lock_sha256,
-            num_at_once=num_workers(options, settings, variant.device),
+            num_at_once=options.workers
+            or default_workers(variant.device, settings.renders.resolution),
             extensions=manifest.extensions,
             device=variant.device,
         )

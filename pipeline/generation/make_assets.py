@@ -74,16 +74,15 @@ class AssetReport:
     """Unread parts of the accepted objects' files."""
 
     @property
-    def num_repaired(self) -> int:
-        """Number of accepted objects with dropped or flipped triangles."""
-        return sum(row.source.repaired for row in self.rows)
+    def counts(self) -> dict[str, int]:
+        """Numbers of objects; the repaired ones have dropped or flipped triangles."""
+        repaired = sum(row.source.repaired for row in self.rows)
+        return {"accepted": len(self.rows), "repaired": repaired, "rejected": len(self.failures)}
 
     def as_json(self) -> dict[str, Any]:
         """Return counts and one row per object."""
         return {
-            "accepted": len(self.rows),
-            "repaired": self.num_repaired,
-            "rejected": len(self.failures),
+            **self.counts,
             "objects": [row.as_json() for row in self.rows],
             "failures": [dataclasses.asdict(failure) for failure in self.failures],
             "unread": dict(self.unread),
@@ -205,9 +204,7 @@ def _write(
     write_unread(folder.logs, report.unread)
     write_atomically(folder.attribution, encode_attribution(report.rows))
     summary = {
-        "accepted": len(report.rows),
-        "repaired": report.num_repaired,
-        "rejected": len(report.failures),
+        **report.counts,
         "recipe": RECIPE,
         "libraries": library_versions(),
         "settings": settings_record(settings),

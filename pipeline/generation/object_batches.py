@@ -22,7 +22,7 @@ from pipeline.assets.settings import AssetSettings
 from pipeline.assets.stage import PreparedObject
 from pipeline.foreign.limits import SUFFIXES
 from pipeline.generation.dataset_writer import DatasetWriter
-from pipeline.generation.prepare_isolated import Prepare, mesh_stage
+from pipeline.generation.prepare_isolated import Prepare, PrepareResult, mesh_stage
 from pipeline.isolation import is_transient
 from pipeline.objects.listing import Fetched
 from storage.atomic import write_atomically
@@ -47,7 +47,6 @@ _PAUSES_S = (0.2, 10.0)
 """Shortest and longest seconds between two looks at other workers' batches; the pause doubles."""
 
 
-PrepareResult = tuple[list[PreparedObject], list[Failure]]
 Fetch = Callable[[list[ObjectRecord]], Fetched]
 
 

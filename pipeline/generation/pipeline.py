@@ -46,7 +46,6 @@ from pipeline.generation.generation_run import (
     begin_run,
     wait_for_others,
 )
-from pipeline.generation.render_sample import failure_of
 from pipeline.generation.render_workers import (
     close_children,
     cores_of_child,
@@ -59,7 +58,7 @@ from pipeline.shards.pack_shards import UnfinishedShard
 from storage.dataset.manifest import ShardEntry
 from storage.dataset.statistics import Statistics
 from storage.errors import Rejected, TrilightError
-from storage.records.objects import Failure
+from storage.records.objects import Failure, failure_of
 from storage.records.sample import Sample, sample_key
 from storage.records.scene import Scene
 

@@ -28,9 +28,8 @@ _LIMITS = ChildLimits(memory_bytes=5 << 30, wall_s=300, cpu_s=60, calls_per_chil
 The wall time only ends idle waits; a busy machine does not decide which objects are accepted."""
 
 
-Prepare = Callable[
-    [list[ObjectRecord], Callable[[], None]], tuple[list[PreparedObject], list[Failure]]
-]
+PrepareResult = tuple[list[PreparedObject], list[Failure]]
+Prepare = Callable[[list[ObjectRecord], Callable[[], None]], PrepareResult]
 """Prepares objects, from any thread; arguments and errors as `prepare_assets`."""
 
 
@@ -59,9 +58,7 @@ def mesh_stage(settings: AssetSettings, workers: int) -> Iterator[Prepare]:
         workers: number of objects that are prepared at the same time.
     """
 
-    def prepare(
-        records: list[ObjectRecord], done: Callable[[], None]
-    ) -> tuple[list[PreparedObject], list[Failure]]:
+    def prepare(records: list[ObjectRecord], done: Callable[[], None]) -> PrepareResult:
         paths = {path for one in records for path in (one.path, one.root) if path}
         all_files = reach(files=map(Path, sorted(paths)))
 

@@ -8,16 +8,15 @@ reads these, confined to their folder (pipeline.isolation.confinement).
 import contextlib
 import functools
 import threading
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterator
 from dataclasses import replace
 from pathlib import Path
-from typing import Any
 
 from pipeline.exchange.scene_files import SceneFiles
 from pipeline.generation.freeze_objects import require_tried
-from pipeline.generation.frozen_pool import ComposedScenes, changed_error
 from pipeline.generation.generation_run import ShardJob
 from pipeline.generation.prepare_isolated import asset_child, asset_store, mesh_stage
+from pipeline.generation.scene_origins import ComposedScenes, changed_error
 from pipeline.generation.scene_worker import SceneWorker
 from pipeline.isolation import ChildLimits, ChildPool, IsolatedChild, call_with_retries, reach
 from pipeline.objects.sources import ListedObjects, list_objects
@@ -117,8 +116,13 @@ def _read_scene(job: ShardJob, reader: IsolatedChild, index: int) -> Scene:
 def _render_pool(job: ShardJob) -> ChildPool:
     require_same_extensions("this worker: the dataset", job.extensions, extension_digests("data"))
     variant = choose_variant(device=job.device)
-    if job.environment:
-        require_environment(job.environment, environment(variant))
+    begun_in = job.environment
+    for name, old, new in differences(begun_in, environment(variant)) if begun_in else ():
+        raise TrilightError(
+            f"this worker differs from the machine that began the run: {name} is {new!r}; "
+            f"expected {old!r}. Use machines of one kind and one image, or accept pictures that "
+            "agree only within their stated errors with --accept-environment."
+        )
     gpus = visible_gpus() if variant.device == "gpu" else ()
     memory_bytes = variant.address_space(_RENDER_LIMITS.memory_bytes)
     limits = replace(_RENDER_LIMITS, memory_bytes=memory_bytes)
@@ -134,16 +138,6 @@ def _render_pool(job: ShardJob) -> ChildPool:
 def cores_of_child(job: ShardJob) -> int:
     """Return the number of threads of a render child of this process."""
     return max(1, available_cores() // job.num_at_once)
-
-
-def require_environment(expected: Mapping[str, Any], actual: Mapping[str, Any]) -> None:
-    """Raise TrilightError if this machine would make other bytes than the dataset's."""
-    for name, old, new in differences(expected, actual):
-        raise TrilightError(
-            f"this worker differs from the machine that began the run: {name} is {new!r}; "
-            f"expected {old!r}. Use machines of one kind and one image, or accept pictures that "
-            "agree only within their stated errors with --accept-environment."
-        )
 
 
 def restore_object(job: ShardJob, uid: str, asset_name: str) -> None:

@@ -1,13 +1,14 @@
 """Where scenes come from: layouts of frozen objects, scene files, or a finished dataset.
 
 Scene files are checked and frozen by their digests. A revisit takes scenes, objects and splits of a
-new dataset from a finished one, and adds new cameras, lights and materials.
+new dataset from a finished one, and adds new cameras, lights and materials. Frozen objects are
+opened when a scene draws them (pipeline.generation.scene_worker).
 """
 
 import contextlib
 import dataclasses
-from collections.abc import Callable, Mapping
-from dataclasses import dataclass
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, field
 from functools import cached_property, partial
 from pathlib import Path
 from typing import Any
@@ -18,10 +19,8 @@ from pipeline.assets.settings import AssetSettings
 from pipeline.exchange.from_description import AlbedoOverOne, scaled_albedo_notes
 from pipeline.exchange.scene_files import SceneFiles, build_scene, require_usable
 from pipeline.generation.dataset_writer import DatasetWriter
-from pipeline.generation.frozen_pool import ComposedScenes, require_same
 from pipeline.generation.prepare_isolated import asset_child
-from pipeline.generation.render_sample import RenderInput
-from pipeline.isolation import ChildFailed, IsolatedChild, call_with_retries, reach
+from pipeline.isolation import ChildFailed, call_with_retries, reach
 from pipeline.objects.licences import stated_licence
 from pipeline.presets.settings import DatasetSettings, RevisitSettings
 from pipeline.scenes.redrawn import with_new_lights, with_new_materials
@@ -35,9 +34,41 @@ from storage.dataset.splits import JUDGED_SPLIT
 from storage.digests import canonical_json
 from storage.errors import EnvironmentFailure, TrilightError
 from storage.records.objects import OBJECT, LockedObject
-from storage.records.sample import decode_sample
+from storage.records.sample import Sample, decode_sample
 from storage.records.scene import Scene
 from storage.seeds import SceneKey
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class RenderInput:
+    """A scene to render, with the cameras and pictures that stay."""
+
+    scene: Scene
+    """The scene, with a camera for each view."""
+    kept_cameras: int = 0
+    """Number of first cameras that are never replaced: their rejection rejects the scene."""
+    kept_views: int = 0
+    """Number of first cameras whose pictures need not be rendered again."""
+    kept_sample: Sample | None = None
+    """The sample that holds the kept pictures."""
+    kept_members: Mapping[str, bytes] = field(default_factory=dict)
+    """Packed files of the kept pictures, by suffix."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class ComposedScenes:
+    """Scenes that layouts compose of frozen objects; can be sent to another machine."""
+
+    lock: Path
+    """Path of objects.lock.jsonl in the dataset's folder."""
+    index: Path
+    """Path of the lock's index (storage.records.object_index)."""
+    source: str
+    """Source of the objects, for those that have to be prepared again."""
+    licence: str | None
+    """Licence that the user states for files without one."""
+    maps: tuple[tuple[LockedObject, Path], ...] = ()
+    """The user's textures and skies with their prepared files."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -225,6 +256,26 @@ def _accept_objects(source: FinishedDataset, writer: DatasetWriter) -> AcceptedO
     )
 
 
+def changed_error(display_name: str, uid: str, state: str) -> TrilightError:
+    """Return the error of a frozen object or file that its source has lost or changed."""
+    return TrilightError(
+        f"{display_name}: {uid!r} {state}; expected what the dataset was begun with "
+        "(objects.lock.jsonl). Restore it, name the source that has it by --objects or "
+        "--scenes-from, or choose another --out."
+    )
+
+
+def require_same(
+    display_name: str, frozen: Mapping[str, LockedObject], now: Sequence[LockedObject]
+) -> None:
+    """Raise TrilightError if a row differs from the frozen one, is missing, or is new."""
+    by_uid = {entry.uid: entry for entry in now}
+    for uid in sorted({*frozen, *by_uid}):
+        if frozen.get(uid) != by_uid.get(uid):
+            state = "has changed" if uid in by_uid else "is missing or no longer usable"
+            raise changed_error(display_name, uid, state if uid in frozen else "is new")
+
+
 def settings_for_files(
     settings: DatasetSettings, folder: SceneFiles, views: int | None
 ) -> DatasetSettings:
@@ -288,9 +339,15 @@ def accept_scene_files(
 def _build_all(
     folder: SceneFiles, licence: str, settings: DatasetSettings, out: DatasetFolder
 ) -> SceneFiles:
-    """Build every scene; return digests of the usable files, and errors of the others."""
+    """Build every scene; return digests of the usable files, and errors of the others.
+
+    Raises:
+        EnvironmentFailure: a file could not be read this time.
+        TrilightError: no file is usable.
+    """
     announce_objects(out, len(folder.names))
     num_views = settings.scenes.num_views
+    over_one = folder.albedo_over_one
     sha256: dict[str, str] = {}
     notes: list[str] = []
     unusable = dict(folder.unusable)
@@ -298,9 +355,19 @@ def _build_all(
         for name in folder.names:
             if name not in unusable:
                 try:
-                    digests, words = _build_in_child(child, folder, name, settings)
+                    digests, words = call_with_retries(
+                        child, build_once, folder.root, name, settings.assets, num_views, over_one
+                    )
                     sha256 |= digests
                     notes += words
+                except ChildFailed as failure:
+                    if not failure.is_verdict:
+                        raise EnvironmentFailure(
+                            f"{name}: its meshes could not be read this time ({failure}). Run the "
+                            "same command again; if that does not help, see `trilight doctor`."
+                        ) from failure
+                    why = f"its meshes cannot be read ({failure}); fix or remove the file."
+                    unusable[name] = f"{name}: {why}"
                 except EnvironmentFailure:
                     raise
                 except TrilightError as mistake:
@@ -335,21 +402,3 @@ def build_once(
         notes=unread,
     )
     return sha256, tuple(f"{name}: {text}" for text in (*unread, *scaled_albedo_notes(scene)))
-
-
-def _build_in_child(
-    child: IsolatedChild, folder: SceneFiles, name: str, settings: DatasetSettings
-) -> tuple[Mapping[str, str], tuple[str, ...]]:
-    """Build a scene in a child; raises TrilightError, or EnvironmentFailure for the machine."""
-    arguments = (settings.assets, settings.scenes.num_views, folder.albedo_over_one)
-    try:
-        return call_with_retries(child, build_once, folder.root, name, *arguments)
-    except ChildFailed as failure:
-        if failure.is_verdict:
-            raise TrilightError(
-                f"{name}: its meshes cannot be read ({failure}); fix or remove the file."
-            ) from failure
-        raise EnvironmentFailure(
-            f"{name}: its meshes could not be read this time ({failure}). Run the same command "
-            "again; if that does not help, see `trilight doctor`."
-        ) from failure

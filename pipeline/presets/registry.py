@@ -6,8 +6,7 @@ from typing import Any
 
 from pipeline.objects.generated import BENCHMARK
 from pipeline.objects.generated import PREFIX as BUILTIN
-from pipeline.presets.frozen_v1 import PRESETS_FOR_JUDGING
-from pipeline.presets.renderformer import RENDERFORMER_PRESETS
+from pipeline.presets.frozen_v1 import PRESETS_FOR_JUDGING, RENDERFORMER_PRESETS
 from pipeline.presets.settings import DatasetPreset, DatasetSettings
 from pipeline.presets.training import PRESETS_FOR_TRAINING
 from pipeline.renders.settings import Targets, target_overrides

@@ -20,19 +20,12 @@ published scenes have defects (reference: renderformer.md, G):
 - emitters reflect nothing: what shines at 300 need not.
 """
 
-import dataclasses
-
-from pipeline.assets.settings import AssetSettings, OwnMaterialSettings
+from pipeline.assets.settings import AssetSettings
 from pipeline.objects.licences import DEFAULT_ALLOWED
 from pipeline.presets.settings import DatasetPreset, DatasetSettings
 from pipeline.renders.settings import CALIBRATED_LOOKS, RenderSettings
-from scene_templates.families import DEFAULT_FAMILIES, alone
-from scene_templates.placement import PlacementSettings
-from scene_templates.sample_camera import CameraSettings
-from scene_templates.sample_lights import LightSettings
-from scene_templates.sample_material import MaterialSettings
-from scene_templates.settings import SceneSettings, ViewLaws
-from scene_templates.skies.procedural_skies import SkyMapSettings, SkySettings
+from scene_templates.families import DEFAULT_FAMILIES
+from scene_templates.settings import SceneSettings
 from storage.dataset.settings import SplitSettings
 from storage.settings.overrides import apply_overrides
 
@@ -97,46 +90,41 @@ def sky_256() -> DatasetSettings:
 
 def object_views() -> DatasetSettings:
     """One object with its own materials and normal maps, alone below a sky: 24 views, 38 dB."""
-    base = smoke()
-    return dataclasses.replace(
-        base,
-        build="object-views",
-        assets=AssetSettings(
-            budgets=(16_384, 8_192, 4_096, 2_048, 1_024, 512),
-            own_materials=OwnMaterialSettings(normal_maps=True),
-        ),
-        scenes=SceneSettings(
-            families=(alone(),),
-            max_triangles=16_384,
-            enough_error=0.001,
-            num_views=24,
-            placement=PlacementSettings(orientation="kept", overlap_share=0.0),
-            materials=MaterialSettings(source="object"),
-            lights=LightSettings(count=(0, 0)),
-            # An object of radius 0.5 fills nine tenths of the width of its pictures.
-            cameras=CameraSettings(
-                distance=(1.6, 1.6),
-                target_jitter=0.0,
-                up_jitter=0.0,
-                fov_deg=(40.0, 40.0),
-                path="fibonacci",
-            ),
-            # Its views are the stated ones, whatever is seen from there.
-            views=ViewLaws(min_coverage=0.0, min_lit=0.0, max_shell_back=1.0),
-            skies=SkySettings(
-                share=1.0, over_lamps_log=(0.5, 2.0), maps=SkyMapSettings(height=128)
-            ),
-        ),
-        renders=dataclasses.replace(
-            base.renders,
-            resolution=512,
-            noise_floor_db=None,
-            noise_floor_objects_db=38.0,
-            max_spp=1024,
-            min_mean_radiance=0.0,
-        ),
-        splits=SplitSettings(scenes_per_shard=16, shards_per_cycle=64, held_out_objects=0.02),
-    )
+    changes = {
+        "build": "object-views",
+        "assets.budgets": [16_384, 8_192, 4_096, 2_048, 1_024, 512],
+        "assets.own_materials.normal_maps": True,
+        "scenes.families": ["alone"],
+        "scenes.max_triangles": 16_384,
+        "scenes.enough_error": 0.001,
+        "scenes.num_views": 24,
+        "scenes.placement.orientation": "kept",
+        "scenes.placement.overlap_share": 0.0,
+        "scenes.materials.source": "object",
+        "scenes.lights.count": [0, 0],
+        # An object of radius 0.5 fills nine tenths of the width of its pictures.
+        "scenes.cameras.distance": [1.6, 1.6],
+        "scenes.cameras.target_jitter": 0.0,
+        "scenes.cameras.up_jitter": 0.0,
+        "scenes.cameras.fov_deg": [40.0, 40.0],
+        "scenes.cameras.path": "fibonacci",
+        # Its views are the stated ones, whatever is seen from there.
+        "scenes.views.min_coverage": 0.0,
+        "scenes.views.min_lit": 0.0,
+        "scenes.views.max_shell_back": 1.0,
+        "scenes.skies.share": 1.0,
+        "scenes.skies.over_lamps_log": [0.5, 2.0],
+        "scenes.skies.maps.height": 128,
+        "renders.resolution": 512,
+        "renders.noise_floor_db": None,
+        "renders.noise_floor_objects_db": 38.0,
+        "renders.max_spp": 1024,
+        "renders.min_mean_radiance": 0.0,
+        "splits.scenes_per_shard": 16,
+        "splits.shards_per_cycle": 64,
+        "splits.held_out_objects": 0.02,
+    }
+    return apply_overrides(smoke(), changes)
 
 
 def olat() -> DatasetSettings:

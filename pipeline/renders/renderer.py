@@ -1,7 +1,7 @@
 """`SceneRenderer`: pictures of a scene with a measured error.
 
 It renders the camera that it is given, or refuses its picture; who chooses cameras, and which one
-comes next, is not known here (pipeline.generation.render_sample).
+comes next, is not known here (pipeline.generation.scene_worker).
 
 A picture is sampled as two halves that share nothing. They are denoised apart to measure its floors
 (pipeline.renders.noise_floor), until these reach their targets or the samples reach the cap

@@ -67,8 +67,6 @@ class _Term:
 class Condition:
     """A parsed condition."""
 
-    text: str
-    """Source text of the condition."""
     names: frozenset[str]
     """Names of the values that the condition uses."""
     holds: Callable[[Values], bool]
@@ -104,7 +102,6 @@ def condition(text: str) -> Condition:
     if part.kind != "truth":
         reader.refuse(tree, part.kind, "a comparison")
     return Condition(
-        text=text,
         names=frozenset(node.id for node in ast.walk(tree) if isinstance(node, ast.Name))
         - {*_FUNCTIONS},
         holds=lambda values: bool(part.of(values)),

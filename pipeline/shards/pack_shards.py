@@ -23,7 +23,7 @@ import os
 import shutil
 import time
 from collections.abc import Iterator, Mapping, Sequence
-from functools import cached_property, partial
+from functools import cached_property
 from pathlib import Path
 from typing import BinaryIO
 
@@ -72,7 +72,7 @@ from storage.records.packed_maps import MAP_NAME
 from storage.records.profiles import Profile
 from storage.records.sample import Sample, sample_key
 from storage.remote.shard_cache import shard_cache
-from storage.remote.store import RemoteStore, Store
+from storage.remote.store import RemoteStore
 
 PLANNED = ".staging/planned/"
 """Folder of a bucket with one file for each requested number of scenes; the largest counts."""
@@ -172,15 +172,45 @@ def unpack_shard(folder: DatasetFolder, note: ShardNote, scenes: range, stream: 
 class PublishedShards:
     """Publishes the shards of a folder, and tells which are published."""
 
-    def __init__(self, folder: DatasetFolder, store: Store) -> None:
-        self._folder = folder
-        self._store = store
+    def __init__(self, folder: DatasetFolder) -> None:
+        self.folder = folder
+        self.store = folder.store()
+        """Where the dataset is published."""
         self._unpacked = set[str]()
+
+    def hold_lock(self) -> contextlib.AbstractContextManager[None]:
+        """Hold the lock that a dataset's workers share; one that is alone updates the folder.
+
+        Before a bucket it gets the bucket's state. Elsewhere, the manifest of a dataset without any
+        object, scene or shard is deleted: it begins again.
+
+        Raises:
+            TrilightError: the folder cannot be written, or the bucket not be read.
+        """
+        return self.folder.hold_shared_lock(
+            self._forget_unused if self.store.is_here else self.adopt
+        )
+
+    def _forget_unused(self) -> None:
+        """Delete the manifest of a dataset without any frozen object, scene or shard.
+
+        A run that ended that early, over its objects, must not bind the next one to its settings.
+        Call while alone in the folder; a worker that missed this notices it
+        (`DatasetWriter.refresh`).
+        """
+        folder = self.folder
+        with contextlib.suppress(TrilightError):  # a later reader reports an unreadable manifest
+            if read_head(folder.manifest).objects_lock_sha256:
+                return
+            folder.objects_lock.unlink(missing_ok=True)  # a kill came before the manifest named it
+            is_empty = not any(shard_names_in(folder.root))
+            if is_empty and not any(folder.staged_samples.rglob("*.tar")):
+                folder.manifest.unlink()
 
     @cached_property
     def _names_listed(self) -> set[str]:
         """The shards that the bucket's manifest lists: of a grown or copied dataset."""
-        return {shard.name for shard in published_manifest(self._store).shards}
+        return {shard.name for shard in published_manifest(self.store).shards}
 
     def names_in_part(self, part: int, ends: Mapping[str, range]) -> Iterator[str]:
         """Yield the names of the published shards of a part of the dataset, growing ones too.
@@ -188,32 +218,32 @@ class PublishedShards:
         Args:
             ends: shards of a bucket with fewer scenes than planned; their scenes are staged here.
         """
-        if self._store.is_here:
-            return shard_names_in_part(self._folder.root, part)
+        if self.store.is_here:
+            return shard_names_in_part(self.folder.root, part)
         self._look_at(part, ends)
-        return shard_names_in_part(self._folder.staged_sent, part)
+        return shard_names_in_part(self.folder.staged_sent, part)
 
     def _look_at(self, part: int, ends: Mapping[str, range]) -> None:
         """Mark the shards of a part of the dataset that are finished in the bucket."""
         place = place_of_part(part)
-        notes = self._store.list(f"{self._folder.name_of(self._folder.staged_entries)}/{place}")
-        for name in filter(SHARD_NAME.fullmatch, self._store.list(place)):
+        notes = self.store.list(f"{self.folder.name_of(self.folder.staged_entries)}/{place}")
+        for name in filter(SHARD_NAME.fullmatch, self.store.list(place)):
             noted = name_of_note(name) in notes
-            if self._folder.is_sent(name) or not (noted or name in self._names_listed):
+            if self.folder.is_sent(name) or not (noted or name in self._names_listed):
                 continue
             if scenes := ends.get(name):
                 note = self._read_note(name)
                 if note is None:  # as in a copied dataset
-                    theirs = published_manifest(self._store)
+                    theirs = published_manifest(self.store)
                     shard = {entry.name: entry for entry in theirs.shards}[name]
                     planned = planned_scenes_of(theirs, shard)
                     note = ShardNote(shard=shard, failures=(), scenes=planned)
                 if (note.scenes or MOST_SCENES) < len(scenes):
                     self._unpack(note, scenes[: note.scenes])
                     continue
-                note_shard(self._folder, note)  # another machine may have grown it
-                if name in read_head(self._folder.manifest).growing:
-                    self._folder.shard(name).unlink(missing_ok=True)
+                note_shard(self.folder, note)  # another machine may have grown it
+                if name in read_head(self.folder.manifest).growing:
+                    self.folder.shard(name).unlink(missing_ok=True)
             self._mark_sent(name)
 
     def _unpack(self, note: ShardNote, scenes: range) -> None:
@@ -221,26 +251,26 @@ class PublishedShards:
         with contextlib.suppress(TrilightError):  # else its scenes are made again
             if note.shard.name not in self._unpacked:
                 shard = note.shard
-                with self._store.open_shard(
+                with self.store.open_shard(
                     shard.name, num_bytes=shard.num_bytes, sha256=shard.sha256, checked=True
                 ) as tar:
-                    unpack_shard(self._folder, note, scenes, tar)
+                    unpack_shard(self.folder, note, scenes, tar)
         self._unpacked.add(note.shard.name)
 
     def notes(self, names: Sequence[str]) -> list[ShardNote]:
         """Return the notes on finished shards: from the folder, or else from the bucket."""
-        folder = self._folder
+        folder = self.folder
         local_names = {
             name for name in names if note_of(folder, name).exists() or folder.shard(name).exists()
         }
         remote_names = (name_of_note(name) for name in names if name not in local_names)
         noted = [noted_shard(folder, name) for name in names if name in local_names]
-        return noted + fetch_notes(self._store.get, remote_names, folder.display_name)
+        return noted + fetch_notes(self.store.get, remote_names, folder.display_name)
 
     def publish_all(self) -> None:
         """Publish what a killed worker, or another one of this machine, has left to publish."""
-        if not self._store.is_here:
-            for name in shard_names_in(self._folder.root):
+        if not self.store.is_here:
+            for name in shard_names_in(self.folder.root):
                 self._send(name)
 
     def publish(self, note: ShardNote) -> ShardNote | None:
@@ -250,12 +280,12 @@ class PublishedShards:
             The published note; None if another worker publishes or published it, or it grows.
         """
         name = note.shard.name
-        if self._folder.shard(name).exists():  # else another machine, or process, has sent it
-            note_shard(self._folder, note)
-        return note if self._store.is_here else self._send(name)
+        if self.folder.shard(name).exists():  # else another machine, or process, has sent it
+            note_shard(self.folder, note)
+        return note if self.store.is_here else self._send(name)
 
     def _send(self, name: str) -> ShardNote | None:
-        folder = self._folder
+        folder = self.folder
         path = folder.shard(name)
         with hold_lock(folder.staging / "sending" / f"{name}.claim") as ours:
             head = read_head(folder.manifest)
@@ -267,8 +297,8 @@ class PublishedShards:
             if note is None:
                 return None
             self._mark_sent(name)
-            if note.shard == made.shard and isinstance(self._store, RemoteStore):
-                shard_cache().keep(path, self._store.url.child(name), made.shard.sha256)
+            if note.shard == made.shard and isinstance(self.store, RemoteStore):
+                shard_cache().keep(path, self.store.url.child(name), made.shard.sha256)
             path.unlink(missing_ok=True)
         return note
 
@@ -280,75 +310,75 @@ class PublishedShards:
         smaller one; None if another machine is replacing it.
         """
         name = made.shard.name
-        folder = self._folder
+        folder = self.folder
         log = folder.root / log_name(name)
         note = name_of_note(name)
-        first = self._store.create_if_absent(name, folder.shard(name))
+        first = self.store.create_if_absent(name, folder.shard(name))
         theirs = None if first else self._read_note(name)
         if not first and theirs is None:
-            assert isinstance(self._store, RemoteStore)
-            url = self._store.url.child(name)
+            assert isinstance(self.store, RemoteStore)
+            url = self.store.url.child(name)
             with shard_cache().open(url, num_bytes=None, sha256=None) as stream:
                 theirs = dataclasses.replace(made, shard=index_stream(stream, Path(name).name))
             if theirs.shard.num_samples < made.shard.num_samples:
                 theirs = dataclasses.replace(theirs, scenes=0)
-            elif not self._store.create_if_absent(note, encode_note(theirs)):
+            elif not self.store.create_if_absent(note, encode_note(theirs)):
                 theirs = self._read_note(name)
         if theirs and (theirs.scenes is None or theirs.scenes >= (made.scenes or MOST_SCENES)):
             note_shard(folder, theirs)
             return theirs
-        with self._store.hold_lock(note) if theirs else contextlib.nullcontext(True) as ours:
+        with self.store.hold_lock(note) if theirs else contextlib.nullcontext(True) as ours:
             if theirs and not (ours and self._read_note(name) in (theirs, None)):
                 return None
             if theirs:
-                self._store.put(name, folder.shard(name))
+                self.store.put(name, folder.shard(name))
                 self._list_again(made.shard)
             if log.exists():
-                self._store.put(self._folder.name_of(log), log)
-            self._store.put(note, encode_note(made))
+                self.store.put(self.folder.name_of(log), log)
+            self.store.put(note, encode_note(made))
         return made
 
     def _list_again(self, shard: ShardEntry) -> None:
         """Update the entry of a shard in the bucket's manifest, if it is listed there."""
-        theirs = published_manifest(self._store)
+        theirs = published_manifest(self.store)
         if theirs.with_grown(shard) != theirs:
-            path = self._folder.staging / "relisted.json"
+            path = self.folder.staging / "relisted.json"
             write_manifest(path, theirs.with_grown(shard))
-            self._store.put("manifest.json", path)
+            self.store.put("manifest.json", path)
 
     def read_published_head(self) -> Manifest | None:
         """Return the published manifest without shards, with the digest of the published lock."""
-        place = f"{self._folder.display_name}/manifest.json"
-        start = self._store.get("manifest.json", _HEAD_BYTES)
+        place = f"{self.folder.display_name}/manifest.json"
+        start = self.store.get("manifest.json", _HEAD_BYTES)
         if start is None:
             return None
         try:
             head = decode_head(io.BytesIO(start), place)
         except TrilightError:  # the head is longer, or malformed: read it all
-            head = decode_head(io.BytesIO(self._store.get("manifest.json") or b""), place)
+            head = decode_head(io.BytesIO(self.store.get("manifest.json") or b""), place)
         if head.objects_lock_sha256:
             return head
-        lock = self._store.get(self._folder.objects_lock.name)
+        lock = self.store.get(self.folder.objects_lock.name)
         return dataclasses.replace(head, objects_lock_sha256=sha256_hex(lock) if lock else "")
 
     def fetch(self, path: Path) -> None:
         """Take over a published file that is not in the folder."""
-        if not path.exists() and (data := self._store.get(self._folder.name_of(path))) is not None:
+        if not path.exists() and (data := self.store.get(self.folder.name_of(path))) is not None:
             write_atomically(path, data)
 
     def fetch_lock(self, sha256: str) -> None:
         """Take over the published lock, of a digest, and its index, unless it is here."""
-        lock = self._folder.objects_lock
+        lock = self.folder.objects_lock
         if not sha256 or (lock.exists() and sha256_of_file(lock) == sha256):
             return
-        for path in (lock, self._folder.staged_index):
-            if (data := self._store.get(self._folder.name_of(path))) is not None:
+        for path in (lock, self.folder.staged_index):
+            if (data := self.store.get(self.folder.name_of(path))) is not None:
                 write_atomically(path, data)
 
     def merge_failures(self) -> None:
         """Add the published rejections to the folder's; call while holding the manifest's mutex."""
-        theirs = decode_failures(self._store.get(self._folder.failures.name) or b"")
-        write_failures(self._folder.failures, [*read_failures(self._folder.failures), *theirs])
+        theirs = decode_failures(self.store.get(self.folder.failures.name) or b"")
+        write_failures(self.folder.failures, [*read_failures(self.folder.failures), *theirs])
 
     def adopt(self) -> None:
         """Give the folder before a bucket the bucket's state; call while no other process uses it.
@@ -358,63 +388,32 @@ class PublishedShards:
         theirs = self.read_published_head()
         own_head = None
         with contextlib.suppress(TrilightError):
-            own_head = read_head(self._folder.manifest)
+            own_head = read_head(self.folder.manifest)
         if not (theirs and own_head and own_head.identity == theirs.identity):
             own_head = None
-            self._folder.clear()
-        shutil.rmtree(self._folder.staged_sent, ignore_errors=True)  # it is looked at again
+            self.folder.clear()
+        shutil.rmtree(self.folder.staged_sent, ignore_errors=True)  # it is looked at again
         if theirs is None:
             return
-        self._store.put(f"{PLANNED}{theirs.num_scenes:012d}", b"\n")
+        self.store.put(f"{PLANNED}{theirs.num_scenes:012d}", b"\n")
         if own_head:  # as the shards here were packed
             theirs = dataclasses.replace(
                 theirs, num_scenes=own_head.num_scenes, growing=own_head.growing
             )
         self.fetch_lock(theirs.objects_lock_sha256)
-        if not theirs.objects_lock_sha256:
-            self.merge_failures()
-        write_manifest(self._folder.manifest, theirs)
+        write_manifest(self.folder.manifest, theirs)
 
     def _read_note(self, name: str) -> ShardNote | None:
-        data = self._store.get(note := name_of_note(name))
+        data = self.store.get(note := name_of_note(name))
         if data is None:
             return None
-        return fetch_notes(lambda _: data, [note], self._folder.display_name)[0]
+        return fetch_notes(lambda _: data, [note], self.folder.display_name)[0]
 
     def _mark_sent(self, name: str) -> None:
-        path = self._folder.staged_sent / name
+        path = self.folder.staged_sent / name
         path.parent.mkdir(parents=True, exist_ok=True)
         path.touch()
         self._unpacked.discard(name)
-
-
-def hold_dataset_lock(folder: DatasetFolder) -> contextlib.AbstractContextManager[None]:
-    """Hold the lock that a dataset's workers share; one that is alone updates the folder.
-
-    Before a bucket it gets the bucket's state. Elsewhere, the manifest of a dataset without any
-    object, scene or shard is deleted: it begins again.
-
-    Raises:
-        TrilightError: the folder cannot be written, or the bucket not be read.
-    """
-    store = folder.store()
-    return folder.hold_shared_lock(
-        partial(_forget_unused, folder) if store.is_here else PublishedShards(folder, store).adopt
-    )
-
-
-def _forget_unused(folder: DatasetFolder) -> None:
-    """Delete the manifest of a dataset without any frozen object, scene or shard.
-
-    A run that ended that early, over its objects, must not bind the next one to its settings. Call
-    while alone in the folder; a worker that missed this notices it (`DatasetWriter.refresh`).
-    """
-    with contextlib.suppress(TrilightError):  # a later reader reports an unreadable manifest
-        if read_head(folder.manifest).objects_lock_sha256:
-            return
-        folder.objects_lock.unlink(missing_ok=True)  # a kill came before the manifest named it
-        if not any(shard_names_in(folder.root)) and not any(folder.staged_samples.rglob("*.tar")):
-            folder.manifest.unlink()
 
 
 log = logging.getLogger("trilight.scenes")

@@ -15,6 +15,7 @@ from typing import Any
 
 from storage.atomic import write_atomically
 from storage.digests import canonical_json
+from storage.errors import Rejected
 from storage.records.safe_read import name_unreadable, open_plain, read_plain
 from storage.typed_json import read_json, read_json_lines
 
@@ -103,6 +104,14 @@ class Failure:
     message: str
     attempt: int = 0
     """Number of the attempt at the item, from 0."""
+
+
+def failure_of(stage: str, item: str, rejection: Rejected, attempt: int = 0) -> Failure:
+    """Return the row of a rejection."""
+    reason = rejection.reason
+    return Failure(
+        stage=stage, item=item, reason=reason, message=rejection.message, attempt=attempt
+    )
 
 
 def encode_objects_lock(objects: Iterable[LockedObject]) -> bytes:

@@ -25,6 +25,7 @@ from pipeline.generation.scene_origins import (
 from pipeline.isolation import ChildPool
 from pipeline.presets.registry import preset_settings
 from pipeline.presets.settings import DatasetSettings
+from pipeline.shards.pack_shards import PublishedShards
 from storage.dataset.layout import DatasetFolder
 from storage.dataset.manifest import read_manifest
 from storage.errors import Rejected, TrilightError
@@ -95,7 +96,7 @@ def _scene(files: SceneFiles, scene_index: int, settings: DatasetSettings) -> Sc
 
 def _accept(folder: Path, out: Path, licence: str | None = None) -> object:
     found, settings = find_scene_files(str(folder)), _settings(folder)
-    publication = begin_or_resume_dataset(DatasetFolder(out), settings, {}, 1)
+    publication = begin_or_resume_dataset(PublishedShards(DatasetFolder(out)), settings, {}, 1)
     return accept_scene_files(found, licence, settings, publication).origin
 
 

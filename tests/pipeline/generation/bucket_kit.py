@@ -12,7 +12,7 @@ import pytest
 from pipeline.generation import dataset_writer
 from pipeline.generation.dataset_writer import DatasetWriter, begin_or_resume_dataset
 from pipeline.presets.registry import preset_settings
-from pipeline.shards.pack_shards import hold_dataset_lock, pack_shard
+from pipeline.shards.pack_shards import PublishedShards, pack_shard
 from storage.dataset.layout import dataset_folder
 from storage.dataset.staging import stage_scene
 from storage.records.objects import Failure
@@ -90,8 +90,8 @@ class Machines:
         self.use(name)
         folder = dataset_folder(OUT)
         build = preset_settings("smoke", changes=changes) if changes else _build()
-        with hold_dataset_lock(folder):
-            yield begin_or_resume_dataset(folder, build, ENVIRONMENT, scenes)
+        with PublishedShards(folder).hold_lock():
+            yield begin_or_resume_dataset(PublishedShards(folder), build, ENVIRONMENT, scenes)
 
 
 def other_shard(writer: DatasetWriter) -> Any:

@@ -12,12 +12,12 @@ import pytest
 
 from pipeline.assets.stage import PreparedObject
 from pipeline.generation import object_batches
-from pipeline.generation.accept_maps import AcceptedMaps
 from pipeline.generation.dataset_writer import DatasetWriter, begin_or_resume_dataset
-from pipeline.generation.freeze_objects import ObjectLock
+from pipeline.generation.freeze_objects import AcceptedMaps, ObjectLock
 from pipeline.generation.prepare_isolated import asset_store
 from pipeline.generation.scene_origins import AcceptedObjects
 from pipeline.presets.registry import preset_settings
+from pipeline.shards.pack_shards import PublishedShards
 from storage.dataset.layout import DatasetFolder
 from storage.digests import sha256_hex
 from storage.records.asset import encode_asset
@@ -59,7 +59,7 @@ def prepared(number: int) -> PreparedObject:
 
 def begun(root: Path) -> DatasetWriter:
     """Begin a dataset of four scenes."""
-    return begin_or_resume_dataset(DatasetFolder(root), BUILD, ENVIRONMENT, 4)
+    return begin_or_resume_dataset(PublishedShards(DatasetFolder(root)), BUILD, ENVIRONMENT, 4)
 
 
 def asked(writer: DatasetWriter, source: str = SOURCE, licence: str | None = None) -> ObjectLock:

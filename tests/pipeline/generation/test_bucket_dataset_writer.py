@@ -14,10 +14,11 @@ import pytest
 from pipeline.executors.slurm_and_kubernetes import array_job
 from pipeline.generation import dataset_writer
 from pipeline.generation.dataset_writer import DatasetWriter
-from pipeline.generation.frozen_pool import AssetMissing, ComposedScenes, SplitPool
 from pipeline.generation.generate_options import GenerateOptions
 from pipeline.generation.pipeline import prepare_dataset
 from pipeline.generation.prepare_isolated import asset_store
+from pipeline.generation.scene_origins import ComposedScenes
+from pipeline.generation.scene_worker import AssetMissing, SplitPool
 from pipeline.shards import pack_shards as pack
 from pipeline.shards.pack_shards import pack_shard
 from storage.dataset.dataset import open_dataset

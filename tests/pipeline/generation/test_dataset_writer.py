@@ -13,7 +13,7 @@ from pipeline.objects.generated import generate_objects
 from pipeline.presets.registry import preset_settings
 from pipeline.presets.settings import DatasetSettings
 from pipeline.renders.mitsuba_variant import Device, Variant, _ProbeResult, device_of, environment
-from pipeline.shards.pack_shards import pack_shard
+from pipeline.shards.pack_shards import PublishedShards, pack_shard
 from storage.dataset import layout
 from storage.dataset.dataset import open_dataset
 from storage.dataset.layout import DatasetFolder
@@ -45,9 +45,9 @@ def begin_tiny(
     root: Path, scenes: int = 4, accept_environment: bool = False, **environment: str
 ) -> DatasetWriter:
     """Begin a dataset of tiny scenes, four to a shard, two views each."""
-    folder, made_in = DatasetFolder(root), {**ENVIRONMENT, **environment}
+    shards, made_in = PublishedShards(DatasetFolder(root)), {**ENVIRONMENT, **environment}
     accepted = accept_environment
-    return begin_or_resume_dataset(folder, _build(), made_in, scenes, accept_environment=accepted)
+    return begin_or_resume_dataset(shards, _build(), made_in, scenes, accept_environment=accepted)
 
 
 def _sample(index: int) -> Sample:
@@ -98,7 +98,7 @@ def test_other_settings_and_another_environment_are_refused_by_name(tmp_path: Pa
     other = preset_settings("smoke", resolution=32, seed=3)
     other = dataclasses.replace(other, scenes=_build().scenes)
     with pytest.raises(TrilightError, match=r"renders.resolution was 16, now 32 \(and 1 more\)"):
-        begin_or_resume_dataset(DatasetFolder(tmp_path), other, ENVIRONMENT, 4)
+        begin_or_resume_dataset(PublishedShards(DatasetFolder(tmp_path)), other, ENVIRONMENT, 4)
     with pytest.raises(TrilightError, match="mitsuba_variant was 'llvm_ad_rgb', now 'scalar_rgb'"):
         begin_tiny(tmp_path, mitsuba_variant="scalar_rgb")
     begin_tiny(tmp_path, accept_environment=True, mitsuba_variant="scalar_rgb")

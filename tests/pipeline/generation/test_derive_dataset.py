@@ -23,7 +23,7 @@ from pipeline.generation.derive_dataset import (
     derive_shards,
 )
 from pipeline.shards.finished_dataset import open_finished
-from pipeline.shards.pack_shards import pack_shard
+from pipeline.shards.pack_shards import PublishedShards, pack_shard
 from storage.dataset import layout
 from storage.dataset.dataset import Dataset, open_dataset
 from storage.dataset.derived import derivation_of
@@ -459,7 +459,7 @@ def test_arguments_that_make_nothing_are_refused(
     tmp_path: Path, derive: DeriveOptions, expected: str
 ) -> None:
     assert expected in refused(tmp_path / "c", derive, finished(tmp_path / "a", scenes(0)))
-    with pytest.raises(TrilightError, match="--split is 'tset'"):
+    with pytest.raises(TrilightError, match="split is 'tset'; expected"):
         Selection(split="tset")
 
 
@@ -470,7 +470,7 @@ def test_nothing_is_overwritten_and_nothing_grows(tmp_path: Path) -> None:
     with pytest.raises(TrilightError, match="is there already"):
         derive_dataset([str(a)], derive, out)
     with pytest.raises(TrilightError, match=r"made by `trilight shards reshard`.*cannot grow"):
-        begin_or_resume_dataset(DatasetFolder(out), _build(), ENVIRONMENT, 4)
+        begin_or_resume_dataset(PublishedShards(DatasetFolder(out)), _build(), ENVIRONMENT, 4)
 
 
 KILLED = """

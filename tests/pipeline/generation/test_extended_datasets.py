@@ -16,9 +16,10 @@ from pipeline.generation.derive_dataset import _extensions
 from pipeline.generation.freeze_objects import ObjectLock
 from pipeline.generation.generate_options import GenerateOptions
 from pipeline.generation.pipeline import make_dataset, make_task, prepare_dataset
+from pipeline.generation.scene_origins import AcceptedObjects
 from pipeline.isolation import NO_FILES, IsolatedChild, call_with_retries
 from pipeline.presets.registry import DATASET_PRESETS, preset_settings, resolve_dataset_preset
-from pipeline.shards.pack_shards import hold_dataset_lock
+from pipeline.shards.pack_shards import PublishedShards
 from scene_templates.families import FAMILIES
 from storage.dataset.dataset import open_dataset
 from storage.dataset.layout import DatasetFolder
@@ -46,7 +47,7 @@ TRAP = "from pathlib import Path\nPath(__file__).with_suffix('.ran').touch()\n"
 
 def _begin(root: Path) -> None:
     build = preset_settings("smoke")
-    begin_or_resume_dataset(DatasetFolder(root), build, ENVIRONMENT, 4)
+    begin_or_resume_dataset(PublishedShards(DatasetFolder(root)), build, ENVIRONMENT, 4)
 
 
 def test_the_manifest_records_what_had_part_in_a_dataset(tmp_path: Path) -> None:
@@ -304,7 +305,7 @@ def test_what_was_only_begun_is_begun_anew_and_what_has_objects_or_scenes_is_not
     without_rendering(monkeypatch)
     folder = DatasetFolder(tmp_path / "set")
     with folder.hold_shared_lock():
-        begin_or_resume_dataset(folder, preset_settings("smoke", seed=5), {}, 24)
+        begin_or_resume_dataset(PublishedShards(folder), preset_settings("smoke", seed=5), {}, 24)
     order = tiny_order(out=str(folder.root), scenes=4, seed=7)
     run = prepare_dataset(order)  # its objects are frozen, no more
     assert run.publication.manifest.settings["seed"] == 7
@@ -324,11 +325,13 @@ def test_the_command_is_there_while_objects_are_prepared(
     without_rendering(monkeypatch)
     place = str(tmp_path / "set")
     asked: list[list[str] | None] = []
+    freeze = ObjectLock.accept
 
-    def look(lock: ObjectLock) -> None:
+    def look(lock: ObjectLock) -> AcceptedObjects:
         asked.append(read_asked(open_dataset(place)))
+        return freeze(lock)
 
-    monkeypatch.setattr(ObjectLock, "prepare", look)
+    monkeypatch.setattr(ObjectLock, "accept", look)
     for objects in ("builtin:9", "builtin:8"):
         prepare_dataset(tiny_order(build="tiny", out=place, scenes=4, objects=objects))
     assert asked[0] is not None and asked[0][:4] == ["generate", "tiny", "--objects", "builtin:9"]
@@ -337,19 +340,20 @@ def test_the_command_is_there_while_objects_are_prepared(
 
 def test_nobody_forgets_while_another_is_at_work(tmp_path: Path) -> None:
     folder = DatasetFolder(tmp_path / "set")
-    with hold_dataset_lock(folder):
-        begin_or_resume_dataset(folder, preset_settings("smoke", seed=5), {}, 4)
-        with hold_dataset_lock(folder):
+    with PublishedShards(folder).hold_lock():
+        begin_or_resume_dataset(PublishedShards(folder), preset_settings("smoke", seed=5), {}, 4)
+        with PublishedShards(folder).hold_lock():
             assert read_manifest(folder.manifest).settings["seed"] == 5
 
 
 def test_who_was_replaced_all_the_same_stops(tmp_path: Path) -> None:
     """Locks do not reach every machine: a maker whose manifest has become another's says so."""
     folder = DatasetFolder(tmp_path / "set")
+    shards = PublishedShards(folder)
     with folder.hold_shared_lock():
-        mine = begin_or_resume_dataset(folder, preset_settings("smoke", seed=5), {}, 4)
+        mine = begin_or_resume_dataset(shards, preset_settings("smoke", seed=5), {}, 4)
         folder.manifest.unlink()
-        begin_or_resume_dataset(folder, preset_settings("smoke", seed=7), {}, 4)
+        begin_or_resume_dataset(shards, preset_settings("smoke", seed=7), {}, 4)
         with pytest.raises(TrilightError, match="another dataset has been begun here"):
             mine.lock_objects([])
 

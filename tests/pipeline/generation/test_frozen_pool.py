@@ -7,26 +7,19 @@ import shutil
 from collections.abc import Iterator
 from pathlib import Path
 from types import SimpleNamespace
+from typing import Any
 
 import numpy as np
 import pytest
 
 from pipeline.documents.rights import encode_attribution
-from pipeline.generation import accept_maps as accepting
-from pipeline.generation import freeze_objects, frozen_pool, pipeline, render_workers
-from pipeline.generation.accept_maps import AcceptedMaps, accept_maps, map_folders
+from pipeline.generation import freeze_objects, pipeline, render_workers, scene_worker
 from pipeline.generation.dataset_writer import DatasetWriter
-from pipeline.generation.frozen_pool import (
-    AssetMissing,
-    ComposedScenes,
-    SplitPool,
-    require_same,
-    user_maps,
-)
+from pipeline.generation.freeze_objects import AcceptedMaps, ObjectLock, map_folders
 from pipeline.generation.generate_options import GenerateOptions
 from pipeline.generation.prepare_isolated import asset_store
-from pipeline.generation.scene_origins import AcceptedObjects
-from pipeline.generation.scene_worker import SceneAttempt
+from pipeline.generation.scene_origins import AcceptedObjects, ComposedScenes, require_same
+from pipeline.generation.scene_worker import AssetMissing, SceneAttempt, SplitPool, user_maps
 from pipeline.objects.maps.prepared import prepare_map
 from pipeline.presets.registry import preset_settings
 from pipeline.presets.settings import DatasetSettings
@@ -112,14 +105,14 @@ def test_scenes_of_opened_objects_are_those_of_objects_in_memory(
 def test_only_a_few_objects_are_open(
     made: tuple[DatasetWriter, AcceptedObjects], monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(frozen_pool, "_MOST_OPEN", 3)
+    monkeypatch.setattr(scene_worker, "_MOST_OPEN", 3)
     read: list[bytes] = []
 
     def counted(data: bytes) -> Asset:
         read.append(data)
         return decode_asset(data)
 
-    monkeypatch.setattr(frozen_pool, "decode_asset", counted)
+    monkeypatch.setattr(scene_worker, "decode_asset", counted)
     pool = _opened(made[1])
     assert not read
     for row in (0, 1, 2, 0, 3, 0, 1):
@@ -141,10 +134,10 @@ def test_a_second_start_looks_at_no_object(
         raise LookupError(source)
 
     monkeypatch.setattr(freeze_objects, "list_objects", look)
-    assert asked(writer).freeze() == accepted
+    assert asked(writer).accept() == accepted
     for source, licence in (("another", None), (SOURCE, "MIT")):
         with pytest.raises(LookupError):
-            asked(writer, source, licence).freeze()
+            asked(writer, source, licence).accept()
     index, lock = writer.folder.staged_index, writer.folder.objects_lock
     for path in (index, lock):
         was = path.read_bytes()
@@ -261,8 +254,16 @@ def accepted(settings: DatasetSettings, tmp_path_factory: pytest.TempPathFactory
     folders = {TEXTURE: str(root / "textures"), SKY: str(root / "skies")}
     with pytest.MonkeyPatch.context() as patch:
         patch.setenv("TRILIGHT_CACHE", str(root / "cache"))
-        patch.setattr(accepting, "IsolatedChild", ChildHere)
-        return accept_maps(folders, None, settings, workers=1)
+        patch.setattr(freeze_objects, "IsolatedChild", ChildHere)
+        writer: Any = None
+        return ObjectLock(
+            source="",
+            licence=None,
+            settings=settings,
+            writer=writer,
+            workers=1,
+            map_folders=folders,
+        ).accept_maps()
 
 
 def test_rows_have_splits_by_content_and_copies_stay_together(accepted: AcceptedMaps) -> None:
@@ -362,10 +363,11 @@ def test_share_alike_licences_never_meet() -> None:
 
 
 def test_folders_and_shares_belong_together() -> None:
+    textures_alone = {TEXTURE: "t", SKY: None}
     with pytest.raises(TrilightError, match="--skies is not given"):
-        map_folders(GenerateOptions(textures="t"), preset_settings("smoke", changes=SHARES))
+        map_folders(textures_alone, preset_settings("smoke", changes=SHARES).scenes)
     with pytest.raises(TrilightError, match=r"--textures is given, but .*own_share 0"):
-        map_folders(GenerateOptions(textures="t"), preset_settings("smoke"))
+        map_folders(textures_alone, preset_settings("smoke").scenes)
     with pytest.raises(TrilightError, match="--scenes-from scenes was given with --textures"):
         GenerateOptions(textures="t", scenes_from="scenes")
     with pytest.raises(TrilightError, match="only with --textures or --skies"):

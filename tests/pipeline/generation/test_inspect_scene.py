@@ -19,9 +19,10 @@ from pipeline.exchange.open_scene import SceneSource
 from pipeline.exchange.reader import SceneReader
 from pipeline.exchange.usd.write_usd import write_usd
 from pipeline.generation import inspect_scene as inspecting
-from pipeline.generation import render_sample as rendering
+from pipeline.generation import scene_worker as rendering
 from pipeline.generation.inspect_scene import ROWS, VIEWS, inspect_scene, seen_into, turntable_poses
-from pipeline.generation.render_sample import RenderInput, ViewProgress, render_sample
+from pipeline.generation.scene_origins import RenderInput
+from pipeline.generation.scene_worker import ViewProgress, render_sample
 from pipeline.presets.registry import preset_settings
 from pipeline.presets.settings import DatasetSettings
 from pipeline.renders.mitsuba_variant import Device, Variant, activate, choose_variant

@@ -9,10 +9,9 @@ import pytest
 
 from pipeline.executors.threads import ThreadRunner
 from pipeline.generation.freeze_objects import ObjectLock
-from pipeline.generation.frozen_pool import ComposedScenes
 from pipeline.generation.generate_options import GenerateOptions
 from pipeline.generation.generation_run import ShardJob
-from pipeline.generation.scene_origins import AcceptedObjects
+from pipeline.generation.scene_origins import AcceptedObjects, ComposedScenes
 from pipeline.renders.mitsuba_variant import Variant
 from storage.dataset.layout import DatasetFolder
 from storage.dataset.statistics import Statistics
@@ -58,7 +57,7 @@ def without_rendering(
     """
     scenes: list[tuple[str, int]] = []
 
-    def freeze(lock: ObjectLock, *more: Any) -> AcceptedObjects:
+    def freeze(lock: ObjectLock) -> AcceptedObjects:
         if not lock.writer.manifest.objects_lock_sha256:
             lock.writer.lock_objects([LOCKED])
         return dataclasses.replace(NO_OBJECTS, num_found=1)
@@ -68,8 +67,7 @@ def without_rendering(
         made(scene)
         return dataclasses.replace(tiny_sample(seed=scene), key=sample_key(scene)), []
 
-    monkeypatch.setattr(ObjectLock, "prepare", lambda lock: None)
-    monkeypatch.setattr(ObjectLock, "freeze", freeze)
+    monkeypatch.setattr(ObjectLock, "accept", freeze)
     monkeypatch.setattr("pipeline.generation.pipeline.make_scene", make)
     without_probe(monkeypatch)
     return scenes

@@ -9,9 +9,8 @@ from typing import Any, cast
 import numpy as np
 import pytest
 
-from pipeline.presets.frozen_v1 import PRESETS_FOR_JUDGING
+from pipeline.presets.frozen_v1 import PRESETS_FOR_JUDGING, RENDERFORMER_PRESETS
 from pipeline.presets.registry import DATASET_PRESETS, frozen_note, object_source, preset_settings
-from pipeline.presets.renderformer import RENDERFORMER_PRESETS
 from pipeline.presets.settings import DatasetSettings, differences
 from scene_templates import placement
 from scene_templates import sample_lights as emitters
@@ -279,8 +278,7 @@ def test_a_default_that_is_changed_later_changes_no_frozen_set() -> None:
             pass
         else:
             raise AssertionError("a default is still there")
-        from pipeline.presets.frozen_v1 import PRESETS_FOR_JUDGING
-        from pipeline.presets.renderformer import RENDERFORMER_PRESETS
+        from pipeline.presets.frozen_v1 import PRESETS_FOR_JUDGING, RENDERFORMER_PRESETS
         DATASET_PRESETS = PRESETS_FOR_JUDGING | RENDERFORMER_PRESETS
         """)
     assert found == {name: DATASET_PRESETS[name].settings().digest for name in FROZEN}

@@ -10,7 +10,8 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from pipeline.generation.render_sample import RenderInput, ViewProgress, render_sample
+from pipeline.generation.scene_origins import RenderInput
+from pipeline.generation.scene_worker import ViewProgress, render_sample
 from pipeline.presets.registry import preset_settings
 from pipeline.renders.renderer import SceneRenderer
 from pipeline.renders.settings import RenderSettings

@@ -12,7 +12,7 @@ import pytest
 
 from pipeline.generation.dataset_writer import begin_or_resume_dataset
 from pipeline.generation.generate_options import GenerateOptions
-from pipeline.shards.pack_shards import hold_dataset_lock
+from pipeline.shards.pack_shards import PublishedShards
 from storage.dataset.dataset import Dataset, open_dataset
 from storage.dataset.layout import dataset_folder
 from storage.dataset.training_data import open_training_data
@@ -198,9 +198,9 @@ def test_a_server_that_ignores_the_condition_is_refused_before_anything_is_begun
     folder = dataset_folder("gs://shards/made")
     with (
         pytest.raises(TrilightError, match="^out 'gs://shards/made': .*conditional writes"),
-        hold_dataset_lock(folder),
+        PublishedShards(folder).hold_lock(),
     ):
-        begin_or_resume_dataset(folder, _build(), ENVIRONMENT, 8)
+        begin_or_resume_dataset(PublishedShards(folder), _build(), ENVIRONMENT, 8)
     assert RemoteStore(place("gs://shards/made")).list_all() == {".staging/once"}
     assert not folder.manifest.exists()
 
