@@ -15,7 +15,7 @@ from collections.abc import Iterable, Iterator, Mapping
 from pathlib import Path
 from typing import Any
 
-from pipeline.presets.settings import DatasetSettings, differences
+from pipeline.presets.settings import DatasetSettings
 from pipeline.renders.mitsuba_variant import device_of
 from pipeline.shards.pack_shards import (
     PLANNED,
@@ -56,6 +56,7 @@ from storage.records.objects import (
 )
 from storage.remote.store import Store
 from storage.settings.described import from_record
+from storage.settings.overrides import differences
 
 _LISTING = ".staging/listing/"
 _LISTED = ".staging/listed/"

@@ -57,8 +57,7 @@ def planckian_rgb(mired: float) -> Numbers:
     xyz = (x / y, 1.0, (1 - x - y) / y)
     linear = [row[0] * xyz[0] + row[1] * xyz[1] + row[2] * xyz[2] for row in _TO_REC709]
     rgb = np.array([max(0.0, channel) for channel in linear])
-    result: Numbers = rgb / ((rgb[0] + rgb[1] + rgb[2]) / 3)
-    return result
+    return rgb / _mean(rgb)
 
 
 class SkyDraws(RecordedSampler):
@@ -94,8 +93,7 @@ class SkyDraws(RecordedSampler):
 
     def _any_colour(self, name: str) -> Numbers:
         rgb = self.colour(f"{name}: any colour", (PALEST,) * 3, (1.0,) * 3)
-        result: Numbers = rgb / ((rgb[0] + rgb[1] + rgb[2]) / 3)
-        return result
+        return rgb / _mean(rgb)
 
 
 LOW_SUN_MIRED = 420.0
@@ -191,8 +189,7 @@ def _with_ground(draws: SkyDraws, texels: SkyTexels, sky: Numbers) -> Numbers:
 
 
 def _above(sky: Numbers, texels: SkyTexels) -> Numbers:
-    result: Numbers = sky * _above_share(texels)[..., None]
-    return result
+    return sky * _above_share(texels)[..., None]
 
 
 def _above_share(texels: SkyTexels) -> Numbers:
@@ -208,8 +205,7 @@ def shared_flux(texels: SkyTexels, one: Numbers, other: Numbers, share: float) -
     """Return the sum of two maps of which the first has `share` of the flux."""
     first = _mean(texels.flux(one))
     second = _mean(texels.flux(other))
-    result: Numbers = one * (share / first) + other * ((1 - share) / second)
-    return result
+    return one * (share / first) + other * ((1 - share) / second)
 
 
 def constant(draws: SkyDraws, texels: SkyTexels) -> Numbers:

@@ -214,8 +214,7 @@ def read_header(data: bytes) -> Header:
         parts = OpenEXR.File(io.BytesIO(data), header_only=True, num_threads=0).parts
     if len(parts) != 1:
         raise TrilightError(f"picture: the file has {len(parts)} parts; expected one.")
-    header: Header = parts[0].header
-    return header
+    return parts[0].header
 
 
 def find_header_end(data: bytes) -> int:

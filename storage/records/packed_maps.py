@@ -85,8 +85,7 @@ class HeldMaps:
         with self._lock:
             if key in self._maps:
                 self._maps.move_to_end(key)
-                known: Map = self._maps[key]
-                return known
+                return self._maps[key]
         made = unpack()
         array = _array(made)
         array.flags.writeable = False

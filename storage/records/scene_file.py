@@ -16,17 +16,13 @@ import os
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Annotated, Any, TypeVar, cast
+from typing import Annotated, Any, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
 from safetensors.numpy import save
 
-from storage.conventions import (
-    MAPS_VERSION,
-    READABLE_VERSIONS,
-    SCHEMA_VERSION,
-)
+from storage.conventions import MAPS_VERSION, READABLE_VERSIONS, SCHEMA_VERSION
 from storage.digests import canonical_json, sha256_hex
 from storage.errors import TrilightError, prefix_errors
 from storage.records.material import chosen_columns, completed_rows, stored_columns, stored_names
@@ -265,7 +261,7 @@ def read_scene_record(
             f"{MAPS_VERSION} exactly where there are any."
         )
     with_texts = {name: raw[name] for name in ("objects", "provenance", "maps") if name in raw}
-    return cast(Record, _as_stored(record, with_texts))
+    return _as_stored(record, with_texts)
 
 
 def _as_stored(checked: Any, raw: Any) -> Any:

@@ -207,12 +207,10 @@ class RemoteStore:
 
         def read() -> bytes | None:
             with contextlib.suppress(FileNotFoundError):
-                start: bytes = shared_driver(self.url).cat_file(url.root, start=0, end=num_bytes)
-                return start
+                return shared_driver(self.url).cat_file(url.root, start=0, end=num_bytes)
             return None
 
-        start: bytes | None = self._retry(read, "read")
-        return start
+        return self._retry(read, "read")
 
     def put(self, name: str, content: Path | bytes) -> None:
         self._retry(lambda: self._upload(name, content, mode="overwrite"), "written")
@@ -227,8 +225,7 @@ class RemoteStore:
                 return False
             return True
 
-        created: bool = self._retry(create_file, "written")
-        return created
+        return self._retry(create_file, "written")
 
     def list(self, folder: str = "") -> set[str]:
         def list_files(driver: Any, place: str) -> Iterable[str]:
@@ -309,8 +306,7 @@ class RemoteStore:
     def num_bytes(self, name: str) -> int | None:
         url = self.url.child(name)
         try:
-            size: int | None = facts_of(url).get("size")
-            return size
+            return facts_of(url).get("size")
         except TransferFailed as error:
             if error.__cause__ is not None and is_missing(error.__cause__):
                 raise ShardMissing(f"{url.display_url}: the shard is missing.") from error
