@@ -1,5 +1,6 @@
 """`trilight shards`: makes new datasets from finished ones."""
 
+import dataclasses
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Annotated, Literal
@@ -22,6 +23,7 @@ from pipeline.generation.derive_dataset import list_scenes as read_scene_rows
 from pipeline.shards.finished_dataset import open_finished
 from storage.errors import TrilightError
 from storage.settings.described import checked
+from storage.settings.overrides import option_words
 from storage.settings.ranges import Within
 
 app = App(name="shards", help_epilogue="", help_flags=HELP_FLAGS, group_commands=Group("Commands"))
@@ -65,12 +67,8 @@ class SelectOptions:
     @property
     def selection(self) -> Selection:
         """The conditions as the selection of a derived dataset."""
-        return Selection(
-            split=self.split,
-            template=self.template,
-            min_noise_floor_db=self.min_noise_floor_db,
-            where=self.where,
-        )
+        names = [field.name for field in dataclasses.fields(Selection)]
+        return Selection(**{name: getattr(self, name) for name in names})
 
 
 @checked()
@@ -118,7 +116,7 @@ def list_scenes(chosen: SelectOptions) -> None:
         note(f"the first {_MOST_LISTED} are shown; --json lists all")
     if rows:
         words = ["shards", "select", str(chosen.dataset), "--out", f"{chosen.dataset}-selected"]
-        next_step([*words, *chosen.selection.words])
+        next_step([*words, *option_words(chosen.selection)])
 
 
 @app.command(help="Repack the scenes of every split into shards of another size.")

@@ -33,6 +33,7 @@ from storage.errors import TrilightError, expected_one_of
 from storage.records.exr import decode_exr
 from storage.records.profiles import PACKED, PLAIN
 from storage.remote.safe_url import safe_url
+from storage.settings.overrides import option_words
 
 MOST_SCENES = 500_000
 """Maximum number of rows; a larger dataset is cut."""
@@ -260,7 +261,7 @@ class DatasetHandlers(SceneListHandlers):
                 "of": len(every),
                 "total": len(matching),
                 "rows": [row.columns for row in page],
-                "command": self._command(selection.words),
+                "command": self._command(option_words(selection)),
             }
         )
 

@@ -71,18 +71,6 @@ class Selection:
         """Return the parsed `where`, or None; raises TrilightError if it is malformed."""
         return None if self.where is None else condition(self.where)
 
-    @property
-    def words(self) -> list[str]:
-        """Options of `trilight shards select` that state the conditions."""
-        options = {
-            "--split": self.split,
-            "--template": self.template,
-            "--min-noise-floor": self.min_noise_floor_db,
-            "--where": self.where,
-        }
-        stated = [(name, str(value)) for name, value in options.items() if value is not None]
-        return [word for pair in stated for word in pair]
-
     def takes(self, facts: SceneFacts) -> bool:
         return (
             self.split in (None, facts.shard.split)

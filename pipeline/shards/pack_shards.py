@@ -48,8 +48,7 @@ from storage.dataset.manifest import (
     write_manifest,
 )
 from storage.dataset.planned import planned_scenes_of
-from storage.dataset.progress import count_given_up
-from storage.dataset.scene_logs import log_name, log_scene
+from storage.dataset.progress import count_given_up, log_name, log_scene
 from storage.dataset.settings import MOST_SCENES, SplitSettings
 from storage.dataset.shard import ShardReader, write_shard
 from storage.dataset.shard_notes import (

@@ -1,5 +1,7 @@
 """Planned shards of a dataset, from its manifest alone."""
 
+import contextlib
+
 from storage.dataset.derived import derivation_of
 from storage.dataset.manifest import Manifest, ShardEntry, number_of_shard
 from storage.dataset.settings import SplitSettings
@@ -54,12 +56,10 @@ def is_whole(manifest: Manifest, num_listed: int) -> bool:
 
 def num_planned(manifest: Manifest) -> int:
     """Return how many shards there will be; of settings that do not say, those that are listed."""
-    try:
-        if derivation_of(manifest.settings):
-            return len(manifest.shards)
-        return shards_for(manifest.num_scenes, _splits(manifest))
-    except TrilightError:
-        return len(manifest.shards)
+    with contextlib.suppress(TrilightError):
+        if not derivation_of(manifest.settings):
+            return shards_for(manifest.num_scenes, _splits(manifest))
+    return len(manifest.shards)
 
 
 def _splits(manifest: Manifest) -> SplitSettings:
