@@ -11,7 +11,7 @@ from dataclasses import fields
 from typing import Annotated, Any, ClassVar, Literal, NoReturn
 
 from storage.errors import TrilightError
-from storage.records.material import COLUMNS, PUBLISHED_COLUMNS
+from storage.records.material import PUBLISHED_COLUMNS, column_places
 from storage.registry import Registry
 from storage.settings.described import checked
 from storage.settings.ranges import Within
@@ -259,11 +259,12 @@ ModelConfig.PRESETS = SIZES
 
 
 def _check_columns(names: tuple[str, ...]) -> None:
-    known = isinstance(names, tuple) and all(name in COLUMNS for name in names)
+    declared = column_places()
+    known = isinstance(names, tuple) and all(name in declared for name in names)
     if not names or not known or len(set(names)) != len(names):
         _wrong(
             f"material_columns {names!r}",
-            f"some of {', '.join(COLUMNS)}, each once; a column that is not among them has to be "
+            f"some of {', '.join(declared)}, each once; a column that is not among them has to be "
             "declared first (docs/how-to/material_column.md)",
         )
 

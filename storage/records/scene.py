@@ -20,10 +20,10 @@ from numpy.typing import NDArray
 from storage.records.environment import Environment
 from storage.records.lookup import texture_values
 from storage.records.material import (
-    COLUMNS,
     DIFFUSE,
     EMISSION,
     SPECULAR,
+    column_places,
     laid_out,
     material_width,
 )
@@ -237,7 +237,7 @@ def _check_columns(scene: Scene) -> None:
     if got[1] != expected:
         broken_law(
             f"materials has shape {got}",
-            f"(None, {expected}), since its columns are {', '.join(COLUMNS)}",
+            f"(None, {expected}), since its columns are {', '.join(column_places())}",
         )
     for column, part in laid_out():
         holds = np.ones(got, np.bool_)
