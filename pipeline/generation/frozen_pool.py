@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 from pipeline.assets.asset_store import AssetStore
 from pipeline.objects.maps.prepared import decode_prepared
 from pipeline.scenes.triangle_budget import FitTable, PooledAsset, least_triangles
-from scene_templates.user_maps import OwnMaps, UserMap, UserTexture
+from scene_templates.textures import OwnMaps, UserMap, UserTexture
 from storage.digests import sha256_hex
 from storage.errors import TrilightError
 from storage.records.asset import decode_asset

@@ -19,7 +19,7 @@ from pipeline.renders.renderer import set_threads
 from pipeline.scenes.compose import compose_scene
 from pipeline.scenes.triangle_budget import PooledAsset
 from scene_templates.settings import SceneSettings
-from scene_templates.user_maps import OwnMaps
+from scene_templates.textures import OwnMaps
 from storage.dataset.layout import DatasetFolder
 from storage.errors import Rejected
 from storage.records.objects import Failure

@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 
 from scene_templates.exact import cosine, sine
 from scene_templates.skies.procedural_skies import SkySettings, draw_sky
-from scene_templates.user_maps import UserMap, draw_user_map
+from scene_templates.textures import UserMap, draw_user_map
 from storage.records.environment import Environment
 from storage.records.texture import MapSource
 from storage.seeds import SceneKey, rng_for
