@@ -3,7 +3,7 @@
 import dataclasses
 from collections.abc import Sequence
 from pathlib import Path
-from typing import Annotated, Literal
+from typing import Annotated
 
 from cyclopts import App, Group
 
@@ -49,20 +49,11 @@ class MergeOptions:
 
 
 @checked()
-class SelectOptions:
+class SelectOptions(Selection):
     """Source and conditions."""
 
     dataset: Path
     """Folder of a finished dataset."""
-    split: Literal["train", "validation", "test"] | None = None
-    """Keep only the scenes of this split; by default all."""
-    template: str | None = None
-    """Keep only the scenes of this layout, such as plane; by default all."""
-    min_noise_floor_db: Annotated[float | None, Within(-100, 200, unit="dB")] = None
-    """Keep only scenes whose views all have this stated error (psnr_log_db); by default all."""
-    where: str | None = None
-    """Keep only scenes that meet a condition such as "max(roughness) < 0.3"; by default all. The
-    reference page Quantities has the names."""
 
     @property
     def selection(self) -> Selection:

@@ -15,7 +15,7 @@ import shutil
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, Literal
+from typing import Annotated, Any, Literal
 
 import numpy as np
 
@@ -48,22 +48,25 @@ from storage.records.objects import (
 )
 from storage.records.quantities import QUANTITIES
 from storage.records.sample import sample_key
+from storage.settings.described import checked
+from storage.settings.ranges import Within
 
 
-@dataclass(frozen=True, kw_only=True)
+@checked()
 class Selection:
     """Conditions that a selected scene must meet; by default none."""
 
-    split: str | None = None  # take only scenes of this split
-    template: str | None = None  # take only scenes of this layout
-    min_noise_floor_db: float | None = None
-    """Take only scenes whose views all have at least this stated error (psnr_log_db)."""
+    split: Literal["train", "validation", "test"] | None = None
+    """Keep only the scenes of this split; by default all."""
+    template: str | None = None
+    """Keep only the scenes of this layout, such as plane; by default all."""
+    min_noise_floor_db: Annotated[float | None, Within(-100, 200, unit="dB")] = None
+    """Keep only scenes whose views all have this stated error (psnr_log_db); by default all."""
     where: str | None = None
-    """Take only scenes for which this condition holds (pipeline.shards.expression)."""
+    """Keep only scenes that meet a condition such as "max(roughness) < 0.3"; by default all. The
+    reference page Quantities has the names."""
 
     def __post_init__(self) -> None:
-        if self.split not in (None, *SPLITS):
-            raise TrilightError(f"--split is {self.split!r}; expected one of {', '.join(SPLITS)}.")
         if self.where is not None:
             self.condition()
 

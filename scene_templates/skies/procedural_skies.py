@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from scene_templates.checks import Range, require
 from scene_templates.exact import Numbers, dot, lerp, smoothstep
 from scene_templates.recorded_sampler import RecordedSampler
-from scene_templates.skies.texels import SkyTexels
+from scene_templates.skies.texels import SkyTexels, texels_of
 from storage.registry import Registry
 from storage.settings.described import checked
 from storage.settings.ranges import Share, Within
@@ -349,7 +349,7 @@ def draw_sky(rng: np.random.Generator, settings: SkyMapSettings) -> SkyMap:
         settings: the ranges.
     """
     name = settings.families[int(rng.integers(len(settings.families)))]
-    texels = SkyTexels(settings.height)
+    texels = texels_of(settings.height)
     draws = SkyDraws(rng, settings)
     mean = draws.uniform("mean radiance", *settings.mean_radiance)
     shape = SKIES[name](draws, texels)

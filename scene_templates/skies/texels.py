@@ -38,20 +38,30 @@ class SkyTexels:
     height: int
     """Rows; a row is pi / height high."""
 
-    @property
+    @functools.cached_property
     def directions(self) -> Numbers:
         """[H, 2H, 3] unit vectors at the centres; read-only."""
-        return _directions(self.height)
+        height = self.height
+        elevation = (0.5 - (np.arange(height)[:, None] + 0.5) / height) * np.pi
+        azimuth = (0.5 - (np.arange(2 * height)[None, :] + 0.5) / (2 * height)) * 2 * np.pi
+        flat = np.zeros((height, 2 * height))
+        across = cosine(elevation)
+        directions = np.stack(
+            [across * cosine(azimuth), across * sine(azimuth), sine(elevation) + flat], axis=-1
+        )
+        directions.setflags(write=False)
+        return directions
 
     @property
     def z(self) -> Numbers:
         """[H, 1] sine of the elevation."""
         return self.directions[:, :1, 2]
 
-    @property
+    @functools.cached_property
     def solid_angle(self) -> Numbers:
         """[H, 1] steradians of each texel of a row; those of all texels sum to 4 pi."""
-        return _solid_angle(self.height)
+        edges = sine((0.5 - np.arange(self.height + 1) / self.height) * np.pi)
+        return ((edges[:-1] - edges[1:]) * np.pi / self.height)[:, None]
 
     def flux(self, radiance: NDArray) -> Numbers:
         """Return the integral over the sphere of a map [H, 2H] or [H, 2H, 3]."""
@@ -129,25 +139,8 @@ class SkyTexels:
         return shape / flux if flux > 0 else self.spot(towards)
 
 
-@functools.lru_cache(maxsize=2)
-def _directions(height: int) -> Numbers:
-    elevation = (0.5 - (np.arange(height)[:, None] + 0.5) / height) * np.pi
-    azimuth = (0.5 - (np.arange(2 * height)[None, :] + 0.5) / (2 * height)) * 2 * np.pi
-    flat = np.zeros((height, 2 * height))
-    across = cosine(elevation)
-    directions = np.stack(
-        [across * cosine(azimuth), across * sine(azimuth), sine(elevation) + flat], axis=-1
-    )
-    directions.setflags(write=False)
-    return directions
-
-
-@functools.lru_cache(maxsize=2)
-def _solid_angle(height: int) -> Numbers:
-    edges = sine((0.5 - np.arange(height + 1) / height) * np.pi)
-    solid_angle_sr: Numbers = ((edges[:-1] - edges[1:]) * np.pi / height)[:, None]
-    solid_angle_sr.setflags(write=False)
-    return solid_angle_sr
+texels_of = functools.lru_cache(maxsize=2)(SkyTexels)
+"""Returns the texels of a height, the same ones while few heights are asked for."""
 
 
 def _sum(values: NDArray) -> Numbers:

@@ -228,13 +228,7 @@ class RemoteStore:
         return self._retry(create_file, "written")
 
     def list(self, folder: str = "") -> set[str]:
-        def list_files(driver: Any, place: str) -> Iterable[str]:
-            with contextlib.suppress(FileNotFoundError):
-                rows = driver.ls(place, detail=True)
-                return [row["name"] for row in rows if row["type"] == "file"]
-            return ()
-
-        return self._list_paths(folder, list_files)
+        return self._list_paths(folder, lambda driver, place: driver.ls(place, detail=True))
 
     def list_all(self) -> set[str]:
         """Return the names of all files, however deep; a thousand names are a request.
@@ -244,20 +238,22 @@ class RemoteStore:
         if self.url.scheme not in WRITABLE:
             return set()
         with contextlib.suppress(TrilightError):
-            return self._list_paths("", lambda driver, place: driver.find(place))
+            return self._list_paths("", lambda drv, place: drv.find(place, detail=True).values())
         return set()
 
-    def _list_paths(self, folder: str, find: Callable[[Any, str], Iterable[str]]) -> set[str]:
-        root = self.url.root
-        place = f"{root}/{folder}".rstrip("/")
+    def _list_paths(self, folder: str, find: Callable[[Any, str], Iterable[Any]]) -> set[str]:
+        root = f"{self.url.root}/"
 
-        def find_paths() -> Iterable[str]:
+        def find_files() -> list[str]:
             driver = shared_driver(self.url)
             driver.invalidate_cache()
-            return find(driver, place)
+            with contextlib.suppress(FileNotFoundError):
+                rows = find(driver, f"{root}{folder}".rstrip("/"))
+                return [row["name"] for row in rows if row["type"] == "file"]
+            return []
 
-        paths = self._retry(find_paths, "listed")
-        return {path.removeprefix(f"{root}/") for path in paths if path.startswith(f"{root}/")}
+        paths = self._retry(find_files, "listed")
+        return {path.removeprefix(root) for path in paths if path.startswith(root)}
 
     @contextlib.contextmanager
     def hold_lock(self, name: str) -> Iterator[bool]:

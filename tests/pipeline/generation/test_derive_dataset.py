@@ -459,7 +459,7 @@ def test_arguments_that_make_nothing_are_refused(
     tmp_path: Path, derive: DeriveOptions, expected: str
 ) -> None:
     assert expected in refused(tmp_path / "c", derive, finished(tmp_path / "a", scenes(0)))
-    with pytest.raises(TrilightError, match="--split is 'tset'"):
+    with pytest.raises(TrilightError, match="split is 'tset'"):
         Selection(split="tset")
 
 
