@@ -51,7 +51,6 @@ def user_surface(
         diffuse_rgb=diffuse_rgb,
         specular_rgb=specular_rgb,
         roughness=np.clip(rough, *roughness_clip).astype(np.float32),
-        parameters={},
         source=chosen.source,
     )
 

@@ -62,10 +62,8 @@ def scene_sky(
     place = scene_key.rng("own sky")
     chosen = draw_user_map(place, user_skies, settings.own_share, licences)
     if chosen is None:
-        drawn = draw_sky(rng, settings.maps)
-        family = drawn.family
-        radiance = drawn.radiance_rgb
-        source = MapSource(name=drawn.family)
+        family, radiance = draw_sky(rng, settings.maps)
+        source = MapSource(name=family)
     else:
         family = "own"
         radiance = chosen.load()

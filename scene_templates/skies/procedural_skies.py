@@ -5,9 +5,9 @@ to a factor, which `draw_sky` chooses. All that it draws has a name and a stated
 noises take streams of their own, so that the same seed gives the same sky at every size.
 """
 
-from collections.abc import Callable, Mapping
-from dataclasses import dataclass, field
-from typing import Annotated, Any
+from collections.abc import Callable
+from dataclasses import field
+from typing import Annotated
 
 import numpy as np
 from numpy.typing import NDArray
@@ -301,17 +301,6 @@ OUR_SKIES = tuple(SKIES)
 it."""
 
 
-@dataclass(frozen=True, kw_only=True, eq=False)
-class SkyMap:
-    """A latitude-longitude map of linear radiance; scene_templates.skies.texels orients it."""
-
-    family: str
-    radiance_rgb: NDArray[np.float32]
-    """[H, 2H, 3], the top row first, the middle of the picture +X, a quarter from the left +Y."""
-    parameters: Mapping[str, tuple[Any, ...]]
-    """Drawn values; the names are those of the reference page of surfaces and skies."""
-
-
 @checked("sky settings")
 class SkyMapSettings:
     """What procedural skies are drawn from."""
@@ -338,8 +327,11 @@ class SkyMapSettings:
             SKIES.find(name)
 
 
-def draw_sky(rng: np.random.Generator, settings: SkyMapSettings) -> SkyMap:
-    """Draw a sky of one of the families.
+def draw_sky(rng: np.random.Generator, settings: SkyMapSettings) -> tuple[str, NDArray[np.float32]]:
+    """Draw a sky of one of the families, and return its name and the map.
+
+    The map holds linear radiance [H, 2H, 3], the top row first, the middle of the picture +X, a
+    quarter from the left +Y (scene_templates.skies.texels).
 
     Equal generators and settings give equal bytes on every processor with IEEE arithmetic
     (scene_templates.exact). A sky of 256 rows takes 0.03 to 0.5 core-seconds.
@@ -355,11 +347,7 @@ def draw_sky(rng: np.random.Generator, settings: SkyMapSettings) -> SkyMap:
     shape = SKIES[name](draws, texels)
     red, green, blue = texels.flux(shape)
     scale = mean * 4 * np.pi * 3 / float(red + green + blue)
-    return SkyMap(
-        family=name,
-        radiance_rgb=(shape * scale).astype(np.float32),
-        parameters=draws.parameters(),
-    )
+    return name, (shape * scale).astype(np.float32)
 
 
 @checked("scene settings")

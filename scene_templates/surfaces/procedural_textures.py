@@ -490,5 +490,4 @@ def draw_surface(rng: np.random.Generator, settings: SurfaceMapSettings) -> Surf
         diffuse_rgb=(made_of.diffuse_rgb + full_size).astype(np.float32),
         specular_rgb=(made_of.specular_rgb + full_size).astype(np.float32),
         roughness=roughness.astype(np.float32),
-        parameters=draws.parameters(),
     )
