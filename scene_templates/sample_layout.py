@@ -98,6 +98,6 @@ def sample_layout(
             faces=PATCH_FACES[:, ::-1] if name == "wall2" and wall2_faces_out else PATCH_FACES,
             surface=surface,
         )
-        for name, vertices, surface in zip(room.parts, room.positions, surfaces, strict=True)
+        for name, vertices, surface in zip(template.parts, room.positions, surfaces, strict=True)
     )
     return Layout(shell=shell, objects=objects, emitters=emitters)

@@ -124,12 +124,7 @@ def read_objects_lock(path: Path) -> list[LockedObject]:
         TrilightError: missing, or a line that is not a locked object.
     """
     with name_unreadable(path):
-        return decode_objects_lock(read_plain(path), str(path))
-
-
-def decode_objects_lock(data: bytes, place: str) -> list[LockedObject]:
-    """Return the objects of the bytes of a lock; raises as `read_objects_lock`, naming `place`."""
-    return read_json_lines(data, LockedObject, place)
+        return read_json_lines(read_plain(path), LockedObject, str(path))
 
 
 def encode_failures(failures: Iterable[Failure]) -> bytes:

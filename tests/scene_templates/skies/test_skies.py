@@ -189,9 +189,7 @@ def test_ours_are_drawn_with_brightness_and_colours_as_stated() -> None:
     coloured = [draws["coloured lights"] == (True,) for _, draws in found]
     require_plausible(
         {
-            "families": choices(
-                [family for (family, _), _ in found], dict.fromkeys(OUR_SKIES, 1.0)
-            ),
+            "families": choices(families, dict.fromkeys(OUR_SKIES, 1.0)),
             "coloured": share(coloured, 0.4),
             "mean": uniform([float(sky.mean()) for (_, sky), _ in found], 1.0, 3.0),
         }
