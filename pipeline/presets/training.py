@@ -26,7 +26,7 @@ from pipeline.assets.settings import AssetSettings, OwnMaterialSettings
 from pipeline.objects.licences import DEFAULT_ALLOWED
 from pipeline.presets.settings import DatasetPreset, DatasetSettings
 from pipeline.renders.settings import CALIBRATED_LOOKS, RenderSettings
-from scene_templates.families import ALONE, DEFAULT_FAMILIES
+from scene_templates.families import DEFAULT_FAMILIES, alone
 from scene_templates.placement import PlacementSettings
 from scene_templates.sample_camera import CameraSettings
 from scene_templates.sample_lights import LightSettings
@@ -106,7 +106,7 @@ def object_views() -> DatasetSettings:
             own_materials=OwnMaterialSettings(normal_maps=True),
         ),
         scenes=SceneSettings(
-            families=(ALONE,),
+            families=(alone(),),
             max_triangles=16_384,
             enough_error=0.001,
             num_views=24,

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from scene_templates.families import ALONE, Family
+from scene_templates.families import Family, alone
 from scene_templates.sample_camera import CameraPath, CameraSettings, path_position, sample_camera
 from scene_templates.settings import SceneSettings
 from scene_templates.skies.procedural_skies import SkySettings
@@ -78,7 +78,7 @@ def test_records_of_random_cameras_say_nothing_of_a_path() -> None:
 
 
 def test_an_object_alone_stands_in_the_middle() -> None:
-    settings = SceneSettings(families=(ALONE,))
+    settings = SceneSettings(families=(alone(),))
     settings = dataclasses.replace(
         settings, placement=dataclasses.replace(settings.placement, orientation="kept")
     )
@@ -91,7 +91,7 @@ def test_an_object_alone_stands_in_the_middle() -> None:
 
 def test_a_layout_without_a_room_holds_one_object() -> None:
     with pytest.raises(TrilightError, match=r"\(1, 2\); expected \(1, 1\) for alone"):
-        Family(**{**vars(ALONE), "num_objects": (1, 2)})
+        Family(**{**vars(alone()), "num_objects": (1, 2)})
 
 
 def test_no_lamps_need_a_sky_in_every_scene() -> None:
