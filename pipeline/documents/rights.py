@@ -12,7 +12,7 @@ from dataclasses import dataclass
 from typing import Any
 
 from pipeline.documents.pages import render_markdown
-from storage.dataset.derived import derivation_of
+from storage.dataset.planned import derivation_of
 from storage.licences import DUTIES, duties_of, licence_url, union_of_duties
 from storage.markdown import inert
 from storage.records.asset import AssetRow

@@ -24,7 +24,6 @@ from pipeline.shards.pack_shards import (
 )
 from storage.atomic import write_atomically
 from storage.dataset.dataset import Dataset, published_manifest
-from storage.dataset.derived import derivation_of
 from storage.dataset.layout import DatasetFolder, in_parts, parts_of, place_of_part, shard_names_in
 from storage.dataset.manifest import (
     Manifest,
@@ -34,6 +33,7 @@ from storage.dataset.manifest import (
     read_manifest,
     write_manifest,
 )
+from storage.dataset.planned import derivation_of
 from storage.dataset.settings import SplitSettings
 from storage.dataset.shard_notes import ShardNote, noted_names, rejections_of_shard
 from storage.dataset.splits import (

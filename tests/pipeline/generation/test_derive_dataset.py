@@ -26,9 +26,9 @@ from pipeline.shards.finished_dataset import open_finished
 from pipeline.shards.pack_shards import pack_shard
 from storage.dataset import layout
 from storage.dataset.dataset import Dataset, open_dataset
-from storage.dataset.derived import derivation_of
 from storage.dataset.layout import DatasetFolder
 from storage.dataset.manifest import Manifest, index_shard, write_manifest
+from storage.dataset.planned import derivation_of
 from storage.dataset.shard import open_shard, write_shard
 from storage.dataset.staging import read_staged_scene, stage_scene
 from storage.dataset.verify import verify_dataset
