@@ -54,8 +54,6 @@ def scene_sky(
         user_skies: the user's own maps.
         licences: of what is in the scene already.
     """
-    if not settings.share:
-        return None
     if rng_for(scene_key.seed, "has sky", scene_key.index).random() >= settings.share:
         return None
     rng = scene_key.rng("sky")
@@ -83,13 +81,12 @@ def scene_sky(
         is_seen=is_seen,
         source=source,
     )
-    origin = {
-        "family": family,
-        "over_lamps": over_lamps,
-        "azimuth_deg": math.degrees(azimuth_rad),
-    }
-    uid = chosen.uid if chosen else ""
-    return SceneSky(environment=environment, origin=origin, uid=uid)
+    azimuth_deg = math.degrees(azimuth_rad)
+    return SceneSky(
+        environment=environment,
+        origin={"family": family, "over_lamps": over_lamps, "azimuth_deg": azimuth_deg},
+        uid=chosen.uid if chosen else "",
+    )
 
 
 def lamp_irradiance(emitters: NDArray[np.float64], radiance_rgb: NDArray[np.float64]) -> float:

@@ -30,7 +30,7 @@ from storage.dataset.layout import DatasetFolder
 from storage.dataset.manifest import Manifest, index_shard, write_manifest
 from storage.dataset.planned import derivation_of
 from storage.dataset.shard import open_shard, write_shard
-from storage.dataset.staging import read_staged_scene, stage_scene
+from storage.dataset.staging import read_staged_scene
 from storage.dataset.verify import verify_dataset
 from storage.digests import sha256_hex
 from storage.errors import TrilightError
@@ -49,6 +49,7 @@ from storage.records.scene import Scene
 from tests.for_each import for_each
 from tests.pipeline.documents.dataset_by_hand import furnished, locked, sample
 from tests.pipeline.generation.test_dataset_writer import ENVIRONMENT, _build
+from tests.scenes_by_hand import stage_scene
 from tests.textured_by_hand import (
     colour_texture,
     number_texture,
@@ -460,7 +461,7 @@ def test_arguments_that_make_nothing_are_refused(
 ) -> None:
     assert expected in refused(tmp_path / "c", derive, finished(tmp_path / "a", scenes(0)))
     with pytest.raises(TrilightError, match="split is 'tset'"):
-        Selection(split="tset")
+        Selection(split="tset")  # type: ignore[arg-type]
 
 
 def test_nothing_is_overwritten_and_nothing_grows(tmp_path: Path) -> None:
