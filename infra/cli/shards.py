@@ -1,6 +1,5 @@
 """`trilight shards`: makes new datasets from finished ones."""
 
-import dataclasses
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Annotated
@@ -58,8 +57,7 @@ class SelectOptions(Selection):
     @property
     def selection(self) -> Selection:
         """The conditions as the selection of a derived dataset."""
-        names = [field.name for field in dataclasses.fields(Selection)]
-        return Selection(**{name: getattr(self, name) for name in names})
+        return Selection(**{name: each for name, each in vars(self).items() if name != "dataset"})
 
 
 @checked()

@@ -24,14 +24,13 @@ MOST_SCENES = 20_000
 half a point (binomial, 95 %), and they take minutes."""
 
 
-def described_shards(dataset: Dataset, most_scenes: int | None = None) -> list[ShardEntry]:
+def described_shards(dataset: Dataset) -> list[ShardEntry]:
     """Return the shards by which a dataset is described, in its order.
 
-    They are all where those hold no more than `most_scenes` (MOST_SCENES); else every n-th of each
-    split, its first one among them.
+    They are all where those hold no more than MOST_SCENES; else every n-th of each split, its first
+    one among them.
     """
-    most_scenes = MOST_SCENES if most_scenes is None else most_scenes
-    every = -(-dataset.manifest.num_samples // most_scenes)
+    every = -(-dataset.manifest.num_samples // MOST_SCENES)
     if every <= 1:
         return list(dataset.manifest.shards)
     chosen = {shard.name for split in SPLITS for shard in dataset.shards_of(split)[::every]}
