@@ -115,13 +115,14 @@ def sun_and_sky(draws: SkyDraws, texels: SkyTexels) -> Numbers:
     brightening = draws.uniform("horizon over zenith", 1.5, 5.0)
     haze = draws.uniform("share of the glow around the sun", 0.02, 0.3)
     sharpness = draws.uniform("sharpness of the glow", 4.0, 60.0)
-    sun = planckian_rgb(_sun_mired(float(towards[2])))
+    s = min(max(float(towards[2]), 0.0), 1.0)
+    sun = planckian_rgb(LOW_SUN_MIRED + (HIGH_SUN_MIRED - LOW_SUN_MIRED) * s * (2 - s))
     low = 1 - np.clip(texels.z, 0, 1)
     near = low * low * low
     sky = lerp(zenith, brightening * horizon, near[..., None]) + np.zeros((1, 2 * texels.height, 1))
     glow = texels.lobe(towards, sharpness)[..., None] * sun
     sky = sky * (1 - haze) + glow * (haze * _mean(texels.flux(sky)))
-    from_sky = _mean(texels.irradiance(_above(sky, texels)))
+    from_sky = _mean(texels.irradiance(sky * _above_share(texels)[..., None]))
     disk = _spot_above(texels, towards)[..., None] * sun * (ratio * from_sky)
     return _with_ground(draws, texels, sky + disk)
 
@@ -131,11 +132,6 @@ def _spot_above(texels: SkyTexels, towards: NDArray) -> Numbers:
     spot = texels.spot(towards)
     seen = float(texels.flux(spot * _above_share(texels)))
     return spot / seen if seen > 0 else np.zeros_like(spot)
-
-
-def _sun_mired(height: float) -> float:
-    s = min(max(height, 0.0), 1.0)
-    return LOW_SUN_MIRED + (HIGH_SUN_MIRED - LOW_SUN_MIRED) * s * (2 - s)
 
 
 def clouds(draws: SkyDraws, texels: SkyTexels) -> Numbers:
@@ -184,12 +180,9 @@ def _with_ground(draws: SkyDraws, texels: SkyTexels, sky: Numbers) -> Numbers:
     """Return a sky above ground that reflects, as a Lambert surface, what the sky sends onto it."""
     albedo = draws.uniform("albedo of the ground", 0.05, 0.5)
     tint = draws.colour("tint of the ground", (0.75, 0.7, 0.5), (1.0, 1.0, 0.9))
-    ground = albedo * tint * texels.irradiance(_above(sky, texels)) / np.pi
-    return lerp(ground, sky, _above_share(texels)[..., None])
-
-
-def _above(sky: Numbers, texels: SkyTexels) -> Numbers:
-    return sky * _above_share(texels)[..., None]
+    above = _above_share(texels)[..., None]
+    ground = albedo * tint * texels.irradiance(sky * above) / np.pi
+    return lerp(ground, sky, above)
 
 
 def _above_share(texels: SkyTexels) -> Numbers:
