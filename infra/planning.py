@@ -22,8 +22,7 @@ from pipeline.presets.settings import DatasetSettings
 from pipeline.renders.mitsuba_variant import visible_gpus
 from storage.dataset.layout import DatasetFolder
 from storage.dataset.manifest import read_manifest
-from storage.dataset.progress import read_progress
-from storage.dataset.scene_logs import sample_logs
+from storage.dataset.progress import read_progress, sample_logs
 from storage.dataset.shard import open_shard
 from storage.dataset.splits import (
     keeps_scenes,
@@ -186,7 +185,7 @@ def describe_run(options: GenerateOptions, folder: DatasetFolder) -> str:
     size = size_note = ""
     if folder.manifest.exists():
         manifest = read_manifest(folder.manifest)
-        last = sample_logs(folder).last
+        last, _ = sample_logs(folder)
         size_note = keeps_scenes(manifest.num_scenes, options.scenes, settings.splits)
         scenes = max(scenes, manifest.num_scenes)
         remaining = max(scenes - read_progress(folder).scenes_done, 0)

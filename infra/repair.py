@@ -11,15 +11,15 @@ from pipeline.generation.generate_options import GenerateOptions
 from pipeline.generation.pipeline import make_dataset, prepare_dataset
 from pipeline.objects.licences import BY_USER
 from pipeline.presets.registry import preset_settings
-from pipeline.presets.settings import differences
 from storage.dataset.dataset import Dataset, open_dataset
-from storage.dataset.derived import derivation_of
 from storage.dataset.manifest import Manifest
+from storage.dataset.planned import derivation_of
 from storage.dataset.progress import read_asked, value_of
 from storage.errors import TrilightError
 from storage.extensions import extension_digests, require_same_extensions
 from storage.records.objects import OBJECT, SKY, TEXTURE
 from storage.remote.url import parse_url
+from storage.settings.overrides import differences
 
 ASIDE = ".bad"
 """Suffix of a bad shard until its replacement is finished."""

@@ -11,7 +11,7 @@ from dataclasses import fields
 from typing import Annotated, Any, ClassVar, Literal, NoReturn
 
 from storage.errors import TrilightError
-from storage.records.material import PUBLISHED_COLUMNS, material_columns
+from storage.records.material import PUBLISHED_COLUMNS, column_places
 from storage.registry import Registry
 from storage.settings.described import checked
 from storage.settings.ranges import Within
@@ -259,7 +259,7 @@ ModelConfig.PRESETS = SIZES
 
 
 def _check_columns(names: tuple[str, ...]) -> None:
-    declared = [column.name for column in material_columns()]
+    declared = column_places()
     known = isinstance(names, tuple) and all(name in declared for name in names)
     if not names or not known or len(set(names)) != len(names):
         _wrong(

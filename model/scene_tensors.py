@@ -26,7 +26,7 @@ from model.hits.traced import Traced, stack_traced
 from storage.conventions import log10_radiance
 from storage.errors import TrilightError
 from storage.records.environment import Environment
-from storage.records.material import PUBLISHED_COLUMNS, chosen_columns, laid_out, material_columns
+from storage.records.material import PUBLISHED_COLUMNS, chosen_columns, column_places, laid_out
 from storage.records.scene import Scene
 
 if TYPE_CHECKING:  # it loads pydantic
@@ -143,7 +143,7 @@ def scene_tensors(scene: Scene, columns: tuple[str, ...] | None = None) -> Scene
         )
     faces = scene.faces.astype(np.int64)
     if columns is None:
-        columns = tuple(column.name for column in material_columns())
+        columns = tuple(column_places())
     material = chosen_columns(scene.materials, columns)
     for column, part in laid_out(columns):
         if column.is_log_encoded:

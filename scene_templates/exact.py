@@ -12,6 +12,13 @@ from numpy.typing import ArrayLike, NDArray
 
 Numbers = NDArray[np.float64]
 
+TEXELS_PER_CELL = 4
+"""Fewest texels across a cell of noise, of a sky at the equator: octaves that are finer are left
+out, so that none aliases."""
+
+NOISE_SCALE = 2.0
+"""Brings one octave of gradient noise to a standard deviation of about 0.4; it stays within 2."""
+
 _TERMS = 12
 """Of the series of the sine: the first one left out is below 1e-19 up to a right angle."""
 
@@ -24,8 +31,7 @@ def sine(angle_rad: ArrayLike) -> Numbers:
     total = np.ones_like(square)
     for term in range(_TERMS, 0, -1):
         total = 1 - total * square / ((2 * term) * (2 * term + 1))
-    result: Numbers = folded * total
-    return result
+    return folded * total
 
 
 def cosine(angle_rad: ArrayLike) -> Numbers:
@@ -36,8 +42,12 @@ def cosine(angle_rad: ArrayLike) -> Numbers:
 def smoothstep(share: ArrayLike) -> Numbers:
     """Return 3 s^2 - 2 s^3 of numbers clamped to [0, 1]: from 0 to 1 without a kink."""
     s = np.clip(np.asarray(share, np.float64), 0, 1)
-    result: Numbers = s * s * (3 - 2 * s)
-    return result
+    return s * s * (3 - 2 * s)
+
+
+def fade(x: NDArray) -> Numbers:
+    """Return Perlin's curve of numbers in [0, 1], with two vanishing derivatives at both ends."""
+    return x * x * x * (x * (6 * x - 15) + 10)
 
 
 def ramp(distance_px: ArrayLike) -> Numbers:
@@ -52,13 +62,9 @@ def ramp(distance_px: ArrayLike) -> Numbers:
 def lerp(one: ArrayLike, other: ArrayLike, share: ArrayLike) -> Numbers:
     """Return `one` where `share` is 0 and `other` where it is 1."""
     first = np.asarray(one, np.float64)
-    result: Numbers = first + (np.asarray(other, np.float64) - first) * np.asarray(share)
-    return result
+    return first + (np.asarray(other, np.float64) - first) * np.asarray(share)
 
 
 def dot(one: NDArray, other: NDArray) -> Numbers:
     """Return the products [...] of vectors [..., 3] and [3], summed in one order everywhere."""
-    result: Numbers = (
-        one[..., 0] * other[..., 0] + one[..., 1] * other[..., 1] + one[..., 2] * other[..., 2]
-    )
-    return result
+    return one[..., 0] * other[..., 0] + one[..., 1] * other[..., 1] + one[..., 2] * other[..., 2]

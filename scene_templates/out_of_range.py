@@ -7,7 +7,7 @@ colours, and from which side the camera looks.
 
 import dataclasses
 import math
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from typing import Any
 
 from scene_templates.checks import Range
@@ -76,56 +76,56 @@ def median_settings(max_triangles: int) -> SceneSettings:
     )
 
 
+_Axes = tuple[tuple[str, tuple[float, ...], Callable[[float], dict[str, Any]]], ...]
+"""Name and values of each axis, and the settings that a value changes."""
+
+_FACTORS = (0.1, 0.3, 3.0, 10.0)
+
+_AXES: _Axes = (
+    # finer triangles of the same surfaces: a difference is the number's and not the shape's
+    ("triangles", (6144, 8192, 12288, 16384), lambda v: {"max_triangles": v, "fill_to": v}),
+    ("fov_deg", (10.0, 20.0, 75.0, 90.0, 110.0), lambda v: {"cameras.fov_deg": _point(v)}),
+    ("distance", (1.0, 1.25, 2.5, 3.0, 4.0), lambda v: {"cameras.distance": _point(v)}),
+    ("lights", (9, 16, 24, 32), lambda v: {"lights.count": _point(v)}),
+    ("lights_inside", (1, 2), lambda v: {"lights.num_inside": v}),
+    ("light_size", _FACTORS, lambda v: {"lights.scale": _point(v * _MEDIAN_SIZE)}),
+    ("light_strength", _FACTORS, lambda v: {"lights.total_emission": _point(v * _MEDIAN_EMISSION)}),
+    # so many objects of median size do not fit without overlap; published ones overlap too
+    (
+        "objects",
+        (4, 5, 6, 7, 8),
+        lambda v: {"families.num_objects": _point(v), "placement.overlap_share": 1.0},
+    ),
+    ("roughness", (0.01, 0.02, 0.03, 0.04), lambda v: {"materials.roughness_clip": _point(v)}),
+)
+
+_BELOW_SUN = {**_BELOW_SKY, "skies.maps.families": ("sun_and_sky",)}
+
+_AXES_OF_MAPS: _Axes = (
+    ("textured", (0.5, 1.0), lambda v: {**_TEXTURED, "textures.share": v}),
+    ("texture_tile_m", (0.1, 0.4, 1.6, 6.4), lambda v: {**_TEXTURED, "textures.tile_m": _point(v)}),
+    ("sky", (0.1, 1.0, 10.0), lambda v: {**_BELOW_SKY, "skies.over_lamps_log": _point(v)}),
+    ("sky_seen", (1,), lambda v: {**_BELOW_SKY, "skies.seen_share": float(v)}),
+    ("sun_to_sky", (8.0, 64.0), lambda v: {**_BELOW_SUN, "skies.maps.sun_to_sky": _point(v)}),
+)
+
+
 def out_of_range_settings(max_triangles: int) -> SceneSettings:
     """Return the median scenes with every excursion; a whole turn is 37 values of nine axes."""
-    return dataclasses.replace(
-        median_settings(max_triangles),
-        excursions=(
-            *(_triangles(count) for count in (6144, 8192, 12288, 16384)),
-            *(_one("fov_deg", v, "cameras.fov_deg") for v in (10.0, 20.0, 75.0, 90.0, 110.0)),
-            *(_one("distance", v, "cameras.distance") for v in (1.0, 1.25, 2.5, 3.0, 4.0)),
-            *(_one("lights", v, "lights.count") for v in (9, 16, 24, 32)),
-            *(_excursion("lights_inside", v, {"lights.num_inside": v}) for v in (1, 2)),
-            *(
-                _one(axis, factor, name, factor * median)
-                for axis, name, median in (
-                    ("light_size", "lights.scale", _MEDIAN_SIZE),
-                    ("light_strength", "lights.total_emission", _MEDIAN_EMISSION),
-                )
-                for factor in (0.1, 0.3, 3.0, 10.0)
-            ),
-            *(_objects(count) for count in (4, 5, 6, 7, 8)),
-            *(_one("roughness", v, "materials.roughness_clip") for v in (0.01, 0.02, 0.03, 0.04)),
-        ),
-    )
+    return dataclasses.replace(median_settings(max_triangles), excursions=_excursions(_AXES))
 
 
 def out_of_range_2_settings(max_triangles: int) -> SceneSettings:
     """Return the same with excursions of what came later: 12 values of five axes of maps."""
-    before = out_of_range_settings(max_triangles)
-    below_sun = {**_BELOW_SKY, "skies.maps.families": ("sun_and_sky",)}
-    return dataclasses.replace(
-        before,
-        excursions=(
-            *before.excursions,
-            *(
-                _excursion("textured", share, {**_TEXTURED, "textures.share": share})
-                for share in (0.5, 1.0)
-            ),
-            *(
-                _excursion("texture_tile_m", v, {**_TEXTURED, "textures.tile_m": _point(v)})
-                for v in (0.1, 0.4, 1.6, 6.4)
-            ),
-            *(
-                _excursion("sky", v, {**_BELOW_SKY, "skies.over_lamps_log": _point(v)})
-                for v in (0.1, 1.0, 10.0)
-            ),
-            _excursion("sky_seen", 1, {**_BELOW_SKY, "skies.seen_share": 1.0}),
-            *(
-                _excursion("sun_to_sky", v, {**below_sun, "skies.maps.sun_to_sky": _point(v)})
-                for v in (8.0, 64.0)
-            ),
-        ),
+    excursions = _excursions(_AXES + _AXES_OF_MAPS)
+    return dataclasses.replace(median_settings(max_triangles), excursions=excursions)
+
+
+def _excursions(axes: _Axes) -> tuple[Excursion, ...]:
+    return tuple(
+        Excursion(axis=axis, value=value, changes=tuple(changes(value).items()))
+        for axis, values, changes in axes
+        for value in values
     )
 
 
@@ -138,23 +138,3 @@ def _median_family(family: Family) -> Family:
 
 def _point(value: float) -> Range:
     return (value, value)
-
-
-def _excursion(axis: str, value: float, changes: dict[str, Any]) -> Excursion:
-    return Excursion(axis=axis, value=value, changes=tuple(changes.items()))
-
-
-def _one(axis: str, value: float, name: str, at: float | None = None) -> Excursion:
-    """One setting, a range, at one number: the value itself by default."""
-    return _excursion(axis, value, {name: _point(value if at is None else at)})
-
-
-def _triangles(count: int) -> Excursion:
-    """Finer triangles of the same surfaces: a difference is the number's and not the shape's."""
-    return _excursion("triangles", count, {"max_triangles": count, "fill_to": count})
-
-
-def _objects(count: int) -> Excursion:
-    """So many objects of median size do not fit without overlap; published ones overlap too."""
-    changes = {"families.num_objects": (count, count), "placement.overlap_share": 1.0}
-    return _excursion("objects", count, changes)

@@ -106,7 +106,7 @@ def _sample_pose(
     """Draw a place for an object clear of others, or None where none was found."""
     rotation = sample_rotation(rng, settings.orientation)
     rests = bool(rng.random() < settings.resting_share)
-    if not room.parts:
+    if not room.patches:
         pose = Pose(centre=np.zeros(3), radius=radius, rotation=rotation)
         return None if any(shape.overlaps(pose, other, at) for other, at in obstacles) else pose
     points = radius * rotate_points(shape.points, rotation)

@@ -11,7 +11,7 @@ X, Y, Z, scale per axis, move, halve.
 """
 
 import math
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from types import MappingProxyType
@@ -101,10 +101,8 @@ PATCH_FACES.setflags(write=False)
 class Room:
     """The shell parts in their places, and the space between them for objects."""
 
-    parts: tuple[str, ...]
-    """Names of the shell parts that exist, the floor first."""
-    patches: tuple[PatchPlacement, ...]
-    """One placement for each shell part."""
+    patches: Mapping[str, PatchPlacement]
+    """Placements of the shell parts that exist, by name, the floor first."""
     low: NDArray[np.float64]
     """[3] the lower corner of the upright room, world units."""
     high: NDArray[np.float64]
@@ -115,8 +113,7 @@ class Room:
     @cached_property
     def positions(self) -> list[NDArray[np.float64]]:
         """Vertices [81, 3] of each part."""
-        placed = zip(self.parts, self.patches, strict=True)
-        return [patch(SIDES[name], placement) for name, placement in placed]
+        return [patch(SIDES[name], placement) for name, placement in self.patches.items()]
 
     @cached_property
     def planes(self) -> list[Plane]:
@@ -132,7 +129,7 @@ class Room:
         """
         low = np.clip(self.low, -0.5, 0.5) + radius / 2
         high = np.clip(self.high, -0.5, 0.5) - radius / 2
-        for name in self.parts:
+        for name in self.patches:
             axis = SIDES[name].axis
             if SIDES[name].sign > 0:
                 high[axis] = self.high[axis] - self.lean - points[:, axis].max()
@@ -171,22 +168,19 @@ class SharedRoom:
         translation = np.array([*shift, rng.uniform(*self.raise_z)])
         square = rng.random() < self.square_share
         tilt_deg = 0.0 if square else self.tilt_deg
-        patches = []
+        patches = {}
         for name in names:
             spin_deg = 90.0 * rng.integers(4) if square else rng.uniform(-180, 180)
             angles_deg = rng.uniform(-tilt_deg, tilt_deg, size=3)
             angles_deg[SIDES[name].axis] = spin_deg
-            patches.append(
-                PatchPlacement(
-                    rotation_deg=tuple(angles_deg),
-                    reach=1.0 if square else _covering_reach(spin_deg, tilt_deg),
-                    scale=tuple(scale),
-                    translation=tuple(translation),
-                )
+            patches[name] = PatchPlacement(
+                rotation_deg=tuple(angles_deg),
+                reach=1.0 if square else _covering_reach(spin_deg, tilt_deg),
+                scale=tuple(scale),
+                translation=tuple(translation),
             )
         return Room(
-            parts=tuple(names),
-            patches=tuple(patches),
+            patches=patches,
             low=(translation - scale) / 2,
             high=(translation + scale) / 2,
             lean=math.tan(math.radians(tilt_deg)) * float(scale.max()),
@@ -266,11 +260,7 @@ class SeparateSides:
 
     def sample_room(self, rng: np.random.Generator, names: Sequence[str]) -> Room:
         """Draw the sides `names`; the space between them is the nominal room."""
-        patches = [getattr(self, name).sample_placement(rng, SIDES[name].axis) for name in names]
-        return Room(
-            parts=tuple(names),
-            patches=tuple(patches),
-            low=np.full(3, -0.5),
-            high=np.full(3, 0.5),
-            lean=0.0,
-        )
+        patches = {
+            name: getattr(self, name).sample_placement(rng, SIDES[name].axis) for name in names
+        }
+        return Room(patches=patches, low=np.full(3, -0.5), high=np.full(3, 0.5), lean=0.0)

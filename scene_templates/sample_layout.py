@@ -41,8 +41,8 @@ def scene_plan(settings: SceneSettings, *, seed: int, scene_index: int) -> Scene
     family = _sample_family(rng, settings, round_number)
     return ScenePlan(
         family=family,
-        num_objects=_sample_count(rng, family.num_objects),
-        num_lights=_sample_count(rng, settings.lights.count),
+        num_objects=int(rng.integers(*family.num_objects, endpoint=True)),
+        num_lights=int(rng.integers(*settings.lights.count, endpoint=True)),
         overlaps=bool(rng.random() < settings.placement.overlap_share),
     )
 
@@ -55,10 +55,6 @@ def _sample_family(rng: np.random.Generator, settings: SceneSettings, round_numb
     position = rng.random() * weights.sum()
     row = int(np.searchsorted(np.cumsum(weights), position, side="right"))
     return settings.families[min(row, len(weights) - 1)]
-
-
-def _sample_count(rng: np.random.Generator, bounds: tuple[int, int]) -> int:
-    return int(rng.integers(bounds[0], bounds[1] + 1))
 
 
 def sample_layout(
@@ -102,6 +98,6 @@ def sample_layout(
             faces=PATCH_FACES[:, ::-1] if name == "wall2" and wall2_faces_out else PATCH_FACES,
             surface=surface,
         )
-        for name, vertices, surface in zip(room.parts, room.positions, surfaces, strict=True)
+        for name, vertices, surface in zip(template.parts, room.positions, surfaces, strict=True)
     )
     return Layout(shell=shell, objects=objects, emitters=emitters)

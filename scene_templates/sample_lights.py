@@ -75,10 +75,11 @@ def sample_lights(
     for _ in range(count):
         directions.append(_spaced_direction(rng, sector, directions, settings.spacing))
     inside = list(object_centres)[: settings.num_inside]
-    outside = []
-    for towards in directions[len(inside) :]:
-        target = rng.uniform(-settings.target_jitter, settings.target_jitter, size=3)
-        outside.append(target + rng.uniform(*settings.distance) * towards)
+    jitter = settings.target_jitter
+    outside = [
+        rng.uniform(-jitter, jitter, size=3) + rng.uniform(*settings.distance) * towards
+        for towards in directions[len(inside) :]
+    ]
     return tuple(_sample_emitter(rng, settings, centre, count) for centre in [*inside, *outside])
 
 

@@ -120,7 +120,20 @@ class SceneSettings:
         require(len(self.families) > 0, "families", self.families, "at least one")
         names = [family.name for family in self.families]
         require(len(set(names)) == len(names), "families", names, "unique names")
-        self._check_budget()
+        for family in self.families:
+            shell = family.shell_triangles
+            lights = self.lights.count[1]
+            objects = family.num_objects[1]
+            least = shell + lights + 4 * objects
+            require(
+                self.max_triangles >= least,
+                "max_triangles",
+                self.max_triangles,
+                f"at least {least} for {family.name}: a shell of {shell}, {lights} emitters, and "
+                f"four triangles for each of {objects} objects",
+            )
+        fits = self.fill_to is None or self.fill_to <= self.max_triangles
+        require(fits, "fill_to", self.fill_to, "at most max_triangles")
         is_lit = self.lights.count[0] > 0 or self.skies.share == 1
         require(is_lit, "lights.count", self.lights.count, "at least 1, or skies.share of 1")
         for excursion in self.excursions:
@@ -138,18 +151,3 @@ class SceneSettings:
     def _after(self, excursion: Excursion) -> "SceneSettings":
         plain = dataclasses.replace(self, excursions=())
         return apply_overrides(plain, dict(excursion.changes))
-
-    def _check_budget(self) -> None:
-        for family in self.families:
-            lights = self.lights.count[1]
-            objects = family.num_objects[1]
-            least = family.shell_triangles + lights + 4 * objects
-            require(
-                self.max_triangles >= least,
-                "max_triangles",
-                self.max_triangles,
-                f"at least {least} for {family.name}: a shell of {family.shell_triangles}, "
-                f"{lights} emitters, and four triangles for each of {objects} objects",
-            )
-        fits = self.fill_to is None or self.fill_to <= self.max_triangles
-        require(fits, "fill_to", self.fill_to, "at most max_triangles")

@@ -117,8 +117,7 @@ def in_camera(positions: ArrayLike, c2w: ArrayLike) -> NDArray[np.float64]:
     """Return world positions [..., 3] in the axes of a camera, which looks along -Z, in metres."""
     pose = np.asarray(c2w, np.float64)
     offset = np.asarray(positions, np.float64) - pose[:3, 3]
-    local: NDArray[np.float64] = offset @ np.linalg.inv(pose[:3, :3]).T
-    return local
+    return offset @ np.linalg.inv(pose[:3, :3]).T
 
 
 def pixel_places(

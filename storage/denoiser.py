@@ -67,11 +67,7 @@ def set_denoiser_device(device: DenoiserDevice) -> None:
 
 
 def denoise(
-    radiance_rgb: NDArray[np.float32],
-    features: Features,
-    quality: Quality,
-    threads: int | None = None,
-    device: DenoiserDevice | None = None,
+    radiance_rgb: NDArray[np.float32], features: Features, quality: Quality
 ) -> NDArray[np.float32]:
     """Return the picture without noise, exactly black where no ray hit anything.
 
@@ -80,13 +76,11 @@ def denoise(
             filter without a trace: look for them before.
         features: albedo and normal, [R, R, 3] each, free of noise themselves.
         quality: of the network.
-        threads: of the processor; None is what `set_denoiser_threads` says.
-        device: of the filter; None is what `set_denoiser_device` says.
     """
     if not radiance_rgb.any():
         return np.zeros_like(radiance_rgb)  # the filter would paint the albedo, up to 0.003 bright
     inputs = (radiance_rgb, features.albedo, features.normal)
-    opened = open_filter(radiance_rgb.shape[0], quality, threads, device)
+    opened = open_filter(radiance_rgb.shape[0], quality)
     picture = opened.run(dict(zip(INPUTS, inputs, strict=True)))
     covered = np.any(features.normal != 0, axis=-1) | np.any(radiance_rgb != 0, axis=-1)
     return np.where(covered[..., None], np.maximum(picture, 0), np.float32(0))
@@ -182,7 +176,10 @@ def open_filter(
     threads: int | None = None,
     device: DenoiserDevice | None = None,
 ) -> Filter:
-    """Return this thread's filter; arguments are as of `denoise`."""
+    """Return this thread's filter of square pictures, `resolution` pixels wide.
+
+    None is what `set_denoiser_threads` and `set_denoiser_device` say.
+    """
     threads = _threads if threads is None else threads
     return _filter(resolution, quality, device or _device, threads, threading.get_ident())
 

@@ -3,9 +3,7 @@
 import hashlib
 import json
 from pathlib import Path
-from typing import Any, BinaryIO
-
-_PIECE_BYTES = 1 << 20
+from typing import Any, BinaryIO, cast
 
 
 def sha256_hex(data: bytes) -> str:
@@ -21,10 +19,7 @@ def sha256_of_file(path: Path) -> str:
 
 def sha256_of_stream(stream: BinaryIO) -> str:
     """Return the sha256 of an open file from where it stands to its end, read in pieces."""
-    digest = hashlib.sha256()
-    while piece := stream.read(_PIECE_BYTES):
-        digest.update(piece)
-    return digest.hexdigest()
+    return hashlib.file_digest(cast(Any, stream), "sha256").hexdigest()
 
 
 def seal_of(data: bytes, sha256: str) -> str:

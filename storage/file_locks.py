@@ -157,10 +157,11 @@ def _acquire_lock(path: Path, wait: bool) -> int | None:
                 return None
             with _announce_wait(path):
                 take_lock(descriptor, wait=True)
-        if _is(path, descriptor):
-            _write_holder(descriptor)
-            return descriptor
-        os.close(descriptor)  # its last owner deleted it while we waited
+        with contextlib.suppress(FileNotFoundError):  # its last owner deleted it while we waited
+            if os.path.samestat(path.stat(), os.fstat(descriptor)):
+                _write_holder(descriptor)
+                return descriptor
+        os.close(descriptor)
 
 
 @contextlib.contextmanager
@@ -194,17 +195,8 @@ def _write_holder(descriptor: int) -> None:
 
 def _read_holder(path: Path) -> list[str]:
     """Return host, process and time of a claim's holder; nothing where the file does not say it."""
-    try:
+    with contextlib.suppress(OSError):
         descriptor = os.open(path, os.O_RDONLY | os.O_NONBLOCK)
-    except OSError:
-        return []
-    with os.fdopen(descriptor, "rb", buffering=0) as stream, contextlib.suppress(OSError):
-        return stream.read(_HOLDER_BYTES).decode(errors="replace").split(" ")
+        with os.fdopen(descriptor, "rb", buffering=0) as stream:
+            return stream.read(_HOLDER_BYTES).decode(errors="replace").split(" ")
     return []
-
-
-def _is(path: Path, descriptor: int) -> bool:
-    try:
-        return os.path.samestat(path.stat(), os.fstat(descriptor))
-    except FileNotFoundError:
-        return False

@@ -9,7 +9,7 @@ The type is a dataclass, or made of dataclasses; ranges and spellings are notes 
 import json
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from typing import Annotated, Any, TypeVar, cast
+from typing import Annotated, Any, TypeVar
 
 from storage.conventions import require_readable
 from storage.errors import TrilightError
@@ -80,7 +80,7 @@ def read_json(data: bytes | str, kind: type[T], source: str) -> T:
     value = parse_strictly(data, kind, source)
     if value is None:
         raise TrilightError(f"{source}: null; expected the file as it was written.")
-    return cast(T, value)
+    return value
 
 
 def read_versioned(data: bytes | str, kind: type[T], source: str, versions: Sequence[int]) -> T:

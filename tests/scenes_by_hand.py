@@ -1,12 +1,16 @@
 """Small scenes made by hand, for tests that need a valid scene and not a sampled one."""
 
+from pathlib import Path
 from typing import Any
 
 import numpy as np
 
 from storage.conventions import look_at_c2w
+from storage.dataset.staging import stage_members
 from storage.records.material import completed_rows
-from storage.records.sample import Sample, ViewRecord
+from storage.records.objects import Failure
+from storage.records.profiles import Profile
+from storage.records.sample import Sample, ViewRecord, encode_sample
 from storage.records.scene import Scene, SceneObject
 
 FLOOR, LIGHT = 0, 1
@@ -70,3 +74,14 @@ def tiny_sample(key: str = "000000000", resolution: int = 16, seed: int = 0) -> 
         radiance_rgb=radiance.astype(np.float32),
         views=(view,) * scene.num_views,
     )
+
+
+def stage_scene(
+    folder: Path,
+    scene_index: int,
+    sample: Sample | None,
+    failures: list[Failure],
+    profile: Profile,
+) -> None:
+    """Stage what became of a scene, as a worker does."""
+    stage_members(folder, scene_index, encode_sample(sample, profile) if sample else {}, failures)

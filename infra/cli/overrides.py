@@ -97,7 +97,9 @@ def merge_overrides(
     filed = {} if base.settings is None else read_settings_file(base.settings)
     values = {name: value for name, (value, _) in filed.items()}
     merged: dict[str, Any] = {}
-    for layer in (differences(settings_record(settings), liked), values, stated):
+    before = {name: each for name, each in settings_record(settings).items() if name in liked}
+    like = {name: new for name, _, new in differences(before, liked, alike=True)}
+    for layer in (like, values, stated):
         for name, value in layer.items():  # a whole group replaces the values within it
             unchanged = [old for old in merged if not f"{old}.".startswith(f"{name}.")]
             merged = {old: merged[old] for old in unchanged} | {name: value}

@@ -20,8 +20,7 @@ from infra.cli.options import command
 from pipeline.generation.generate_options import CorePrice
 from storage.aliases import PRESET_ALIASES, name_for_people
 from storage.dataset.dataset import open_dataset
-from storage.dataset.derived import derivation_of
-from storage.dataset.planned import num_planned
+from storage.dataset.planned import derivation_of, num_planned
 from storage.dataset.progress import (
     DatasetStatus,
     missing_shards,

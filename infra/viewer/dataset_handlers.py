@@ -5,10 +5,8 @@ import functools
 import json
 import re
 import shlex
-import struct
 import threading
 import time
-import zlib
 from array import array
 from collections.abc import Mapping, Sequence
 from pathlib import Path
@@ -32,6 +30,7 @@ from storage.dataset.shard import Member, ShardReader
 from storage.errors import TrilightError, expected_one_of
 from storage.records.exr import decode_exr
 from storage.records.profiles import PACKED, PLAIN
+from storage.records.safe_read import safetensors_header, unpack_gzip
 from storage.remote.safe_url import safe_url
 from storage.settings.overrides import option_words
 
@@ -152,10 +151,8 @@ def _num_triangles(opened: ShardReader, members: Mapping[str, Member]) -> int:
     num_bytes = min(members[suffix].num_bytes, _MOST_HEADER)
     head = opened.read(dataclasses.replace(members[suffix], num_bytes=num_bytes))
     if suffix == PACKED:
-        head = zlib.decompressobj(31).decompress(head, _MOST_HEADER)
-    (length,) = struct.unpack("<Q", head[:8])
-    shapes = json.loads(head[8 : 8 + length])
-    return int(shapes["faces"]["shape"][0])
+        head = unpack_gzip(head, _MOST_HEADER, suffix, is_whole=False)
+    return int(safetensors_header(head, name=suffix)["faces"]["shape"][0])
 
 
 def selection_of(query: Mapping[str, str]) -> Selection:

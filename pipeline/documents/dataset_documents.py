@@ -17,9 +17,9 @@ from pipeline.documents.rights import Rights, encode_attribution, hub_licence, r
 from pipeline.documents.sheets import write_contact_sheet
 from storage.atomic import write_atomically
 from storage.dataset.dataset import Dataset
-from storage.dataset.derived import derivation_of
 from storage.dataset.layout import DatasetFolder
 from storage.dataset.manifest import Manifest, read_manifest, write_manifest
+from storage.dataset.planned import derivation_of
 from storage.dataset.statistics import Statistics, dataset_statistics
 from storage.digests import sha256_hex, sha256_of_file
 from storage.markdown import front_matter

@@ -12,7 +12,7 @@ from dataclasses import dataclass
 from types import MappingProxyType
 from typing import Any
 
-from storage.dataset.derived import derivation_of
+from storage.dataset.planned import derivation_of
 from storage.licences import duties_of, union_of_duties
 from storage.markdown import inert
 from storage.records.asset import AssetRow

@@ -15,12 +15,11 @@ from collections.abc import Iterable, Iterator, Mapping
 from pathlib import Path
 from typing import Any
 
-from pipeline.presets.settings import DatasetSettings, differences
+from pipeline.presets.settings import DatasetSettings
 from pipeline.renders.mitsuba_variant import device_of
 from pipeline.shards.pack_shards import PLANNED, PublishedShards, unpack_here
 from storage.atomic import write_atomically
 from storage.dataset.dataset import Dataset, published_manifest
-from storage.dataset.derived import derivation_of
 from storage.dataset.layout import DatasetFolder, in_parts, parts_of, place_of_part, shard_names_in
 from storage.dataset.manifest import (
     Manifest,
@@ -30,6 +29,7 @@ from storage.dataset.manifest import (
     read_manifest,
     write_manifest,
 )
+from storage.dataset.planned import derivation_of
 from storage.dataset.settings import SplitSettings
 from storage.dataset.shard_notes import ShardNote, noted_names, rejections_of_shard
 from storage.dataset.splits import (
@@ -52,6 +52,7 @@ from storage.records.objects import (
 )
 from storage.remote.store import Store
 from storage.settings.described import from_record
+from storage.settings.overrides import differences
 
 _LISTING = ".staging/listing/"
 _LISTED = ".staging/listed/"

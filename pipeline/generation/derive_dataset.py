@@ -25,15 +25,15 @@ from pipeline.shards.finished_dataset import FinishedDataset, SceneFacts, open_f
 from storage.atomic import write_error
 from storage.conventions import MANIFEST_VERSION, SPLITS
 from storage.dataset.dataset import open_dataset
-from storage.dataset.derived import (
+from storage.dataset.layout import DatasetFolder
+from storage.dataset.manifest import Manifest, ShardEntry, index_shard, write_manifest
+from storage.dataset.planned import (
     Derivation,
     common,
     derivation_of,
     derived_settings,
     source_record,
 )
-from storage.dataset.layout import DatasetFolder
-from storage.dataset.manifest import Manifest, ShardEntry, index_shard, write_manifest
 from storage.dataset.shard import write_shard
 from storage.dataset.splits import named_shard
 from storage.dataset.statistics import Statistics

@@ -20,7 +20,6 @@ from pipeline.generation.scene_origins import ComposedScenes, changed_error
 from pipeline.generation.scene_worker import SceneWorker
 from pipeline.isolation import ChildLimits, ChildPool, IsolatedChild, call_with_retries, reach
 from pipeline.objects.sources import ListedObjects, list_objects
-from pipeline.presets.settings import differences
 from pipeline.renders.mitsuba_variant import choose_variant, environment, visible_gpus
 from storage.atomic import write_atomically
 from storage.digests import sha256_of_file
@@ -30,6 +29,7 @@ from storage.machine import available_cores
 from storage.records.objects import LockRows, ObjectRecord
 from storage.records.scene import Scene
 from storage.remote.safe_url import safe_url
+from storage.settings.overrides import differences
 
 _RENDER_LIMITS = ChildLimits(memory_bytes=16 << 30, wall_s=3600, calls_per_child=200)
 """A scene at 4096 samples and 512 pixels takes minutes, and a render child holds below 1 GiB: the

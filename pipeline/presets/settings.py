@@ -1,7 +1,7 @@
 """`DatasetSettings`: all settings that decide the contents of a dataset, except its size."""
 
 import dataclasses
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Annotated, Any, Literal
 
@@ -159,16 +159,3 @@ class DatasetPreset:
     dataset has `num_scenes` scenes."""
     device: Device = "auto"
     """Device that renders a new dataset by default: `cpu` where a digest of pictures is known."""
-
-
-def differences(
-    before: Mapping[str, Any], now: Mapping[str, Any], prefix: str = ""
-) -> Iterator[tuple[str, Any, Any]]:
-    """Yield (dotted name, value before, value now) for each setting that differs."""
-    for name in sorted({*before, *now}):
-        old = before.get(name)
-        new = now.get(name)
-        if isinstance(old, Mapping) and isinstance(new, Mapping):
-            yield from differences(old, new, f"{prefix}{name}.")
-        elif old != new:
-            yield f"{prefix}{name}", old, new

@@ -38,7 +38,7 @@ from scene_templates.rotations import rotate_points
 from scene_templates.sample_layout import ScenePlan, sample_layout, scene_plan
 from scene_templates.settings import SceneSettings
 from scene_templates.skies.drawn_scene import scene_sky
-from scene_templates.user_maps import NO_OWN_MAPS, OwnMaps
+from scene_templates.textures import NO_OWN_MAPS, OwnMaps
 from storage.errors import Rejected, TrilightError
 from storage.records.asset import Level
 from storage.records.material import EMISSION

@@ -32,8 +32,14 @@ from pipeline.scenes.triangle_budget import PooledAsset
 from scene_templates.layout import Emitter, Layout, ShellPart, SurfaceLook
 from scene_templates.sample_material import MaterialSettings
 from scene_templates.surfaces.maps import SurfaceMaps
-from scene_templates.textures import MOST_TEXTURED, TexturedLook, TextureSettings, draw_look
-from scene_templates.user_maps import UserMap, UserTexture
+from scene_templates.textures import (
+    MOST_TEXTURED,
+    TexturedLook,
+    TextureSettings,
+    UserMap,
+    UserTexture,
+    draw_look,
+)
 from storage.conventions import linear_from_srgb8, srgb8
 from storage.errors import Rejected, TrilightError
 from storage.records.asset import Level, LevelSkin

@@ -10,13 +10,14 @@ from storage.dataset.manifest import Manifest, ShardEntry
 from storage.dataset.planned import is_whole, num_planned
 from storage.digests import sha256_hex
 from storage.errors import TrilightError
-from storage.records.objects import LockedObject, decode_objects_lock, locked_uids
+from storage.records.objects import LockedObject, locked_uids
 from storage.records.profiles import PACKED, PLAIN, unpack_arrays
 from storage.records.quantities import QUANTITIES
 from storage.records.sample import SceneRecord, decode_scene
 from storage.records.scene_facts import scene_values
 from storage.remote.safe_url import safe_url
 from storage.remote.store import Store
+from storage.typed_json import read_json_lines
 
 
 class FinishedDataset(Dataset):
@@ -67,7 +68,7 @@ def open_finished(path: str) -> FinishedDataset:
             "differs); run `trilight verify`."
         )
     objects: dict[str, list[LockedObject]] = {}
-    for entry in decode_objects_lock(lock, "objects.lock.jsonl"):
+    for entry in read_json_lines(lock, LockedObject, "objects.lock.jsonl"):
         objects.setdefault(entry.uid, []).append(entry)
     return FinishedDataset(listed.store, manifest, objects)
 

@@ -48,8 +48,7 @@ from storage.dataset.manifest import (
     write_manifest,
 )
 from storage.dataset.planned import planned_scenes_of
-from storage.dataset.progress import count_given_up
-from storage.dataset.scene_logs import log_name, log_scene
+from storage.dataset.progress import count_given_up, log_name, log_scene
 from storage.dataset.settings import MOST_SCENES, SplitSettings
 from storage.dataset.shard import ShardReader, write_shard
 from storage.dataset.shard_notes import (
@@ -63,14 +62,14 @@ from storage.dataset.shard_notes import (
     rejections_of_shard,
 )
 from storage.dataset.splits import cut_splits, scenes_of_shard, shard_name, split_of_shard
-from storage.dataset.staging import is_staged, read_staged_scene, stage_members, stage_scene
+from storage.dataset.staging import is_staged, read_staged_scene, stage_members
 from storage.digests import sha256_hex, sha256_of_file
 from storage.errors import EnvironmentFailure, ShardMissing, TrilightError
 from storage.file_locks import hold_lock, is_locked
 from storage.records.objects import Failure, decode_failures, read_failures, write_failures
 from storage.records.packed_maps import MAP_NAME
 from storage.records.profiles import Profile
-from storage.records.sample import Sample, sample_key
+from storage.records.sample import Sample, encode_sample, sample_key
 from storage.remote.shard_cache import shard_cache
 from storage.remote.store import RemoteStore
 
@@ -454,14 +453,15 @@ class UnfinishedShard:
         began: float,
         cores: int,
     ) -> None:
-        """Stage a finished or given-up scene as `stage_scene`, and log its cost.
+        """Stage a finished or given-up scene, and log its cost.
 
         Args:
             sample: the finished scene; None if it was given up.
             began: start of the work on it, by `time.monotonic`.
             cores: number of cores that the work kept busy.
         """
-        stage_scene(self._staged, scene_index, sample, failures, profile)
+        members = encode_sample(sample, profile) if sample else {}
+        stage_members(self._staged, scene_index, members, failures)
         seconds = time.monotonic() - began
         outcome = "made" if sample else "given up"
         log.info("%s: scene %09d %s in %.1f s", self.name, scene_index, outcome, seconds)

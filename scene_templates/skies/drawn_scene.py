@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 
 from scene_templates.exact import cosine, sine
 from scene_templates.skies.procedural_skies import SkySettings, draw_sky
-from scene_templates.user_maps import UserMap, draw_user_map
+from scene_templates.textures import UserMap, draw_user_map
 from storage.records.environment import Environment
 from storage.records.texture import MapSource
 from storage.seeds import SceneKey, rng_for
@@ -54,18 +54,14 @@ def scene_sky(
         user_skies: the user's own maps.
         licences: of what is in the scene already.
     """
-    if not settings.share:
-        return None
     if rng_for(scene_key.seed, "has sky", scene_key.index).random() >= settings.share:
         return None
     rng = scene_key.rng("sky")
     place = scene_key.rng("own sky")
     chosen = draw_user_map(place, user_skies, settings.own_share, licences)
     if chosen is None:
-        drawn = draw_sky(rng, settings.maps)
-        family = drawn.family
-        radiance = drawn.radiance_rgb
-        source = MapSource(name=drawn.family)
+        family, radiance = draw_sky(rng, settings.maps)
+        source = MapSource(name=family)
     else:
         family = "own"
         radiance = chosen.load()
@@ -85,13 +81,12 @@ def scene_sky(
         is_seen=is_seen,
         source=source,
     )
-    origin = {
-        "family": family,
-        "over_lamps": over_lamps,
-        "azimuth_deg": math.degrees(azimuth_rad),
-    }
-    uid = chosen.uid if chosen else ""
-    return SceneSky(environment=environment, origin=origin, uid=uid)
+    azimuth_deg = math.degrees(azimuth_rad)
+    return SceneSky(
+        environment=environment,
+        origin={"family": family, "over_lamps": over_lamps, "azimuth_deg": azimuth_deg},
+        uid=chosen.uid if chosen else "",
+    )
 
 
 def lamp_irradiance(emitters: NDArray[np.float64], radiance_rgb: NDArray[np.float64]) -> float:

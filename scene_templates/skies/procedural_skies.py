@@ -5,9 +5,9 @@ to a factor, which `draw_sky` chooses. All that it draws has a name and a stated
 noises take streams of their own, so that the same seed gives the same sky at every size.
 """
 
-from collections.abc import Callable, Mapping
-from dataclasses import dataclass, field
-from typing import Annotated, Any
+from collections.abc import Callable
+from dataclasses import field
+from typing import Annotated
 
 import numpy as np
 from numpy.typing import NDArray
@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from scene_templates.checks import Range, require
 from scene_templates.exact import Numbers, dot, lerp, smoothstep
 from scene_templates.recorded_sampler import RecordedSampler
-from scene_templates.skies.texels import SkyTexels
+from scene_templates.skies.texels import SkyTexels, texels_of
 from storage.registry import Registry
 from storage.settings.described import checked
 from storage.settings.ranges import Share, Within
@@ -57,8 +57,7 @@ def planckian_rgb(mired: float) -> Numbers:
     xyz = (x / y, 1.0, (1 - x - y) / y)
     linear = [row[0] * xyz[0] + row[1] * xyz[1] + row[2] * xyz[2] for row in _TO_REC709]
     rgb = np.array([max(0.0, channel) for channel in linear])
-    result: Numbers = rgb / ((rgb[0] + rgb[1] + rgb[2]) / 3)
-    return result
+    return rgb / _mean(rgb)
 
 
 class SkyDraws(RecordedSampler):
@@ -94,8 +93,7 @@ class SkyDraws(RecordedSampler):
 
     def _any_colour(self, name: str) -> Numbers:
         rgb = self.colour(f"{name}: any colour", (PALEST,) * 3, (1.0,) * 3)
-        result: Numbers = rgb / ((rgb[0] + rgb[1] + rgb[2]) / 3)
-        return result
+        return rgb / _mean(rgb)
 
 
 LOW_SUN_MIRED = 420.0
@@ -117,13 +115,14 @@ def sun_and_sky(draws: SkyDraws, texels: SkyTexels) -> Numbers:
     brightening = draws.uniform("horizon over zenith", 1.5, 5.0)
     haze = draws.uniform("share of the glow around the sun", 0.02, 0.3)
     sharpness = draws.uniform("sharpness of the glow", 4.0, 60.0)
-    sun = planckian_rgb(_sun_mired(float(towards[2])))
+    s = min(max(float(towards[2]), 0.0), 1.0)
+    sun = planckian_rgb(LOW_SUN_MIRED + (HIGH_SUN_MIRED - LOW_SUN_MIRED) * s * (2 - s))
     low = 1 - np.clip(texels.z, 0, 1)
     near = low * low * low
     sky = lerp(zenith, brightening * horizon, near[..., None]) + np.zeros((1, 2 * texels.height, 1))
     glow = texels.lobe(towards, sharpness)[..., None] * sun
     sky = sky * (1 - haze) + glow * (haze * _mean(texels.flux(sky)))
-    from_sky = _mean(texels.irradiance(_above(sky, texels)))
+    from_sky = _mean(texels.irradiance(sky * _above_share(texels)[..., None]))
     disk = _spot_above(texels, towards)[..., None] * sun * (ratio * from_sky)
     return _with_ground(draws, texels, sky + disk)
 
@@ -133,11 +132,6 @@ def _spot_above(texels: SkyTexels, towards: NDArray) -> Numbers:
     spot = texels.spot(towards)
     seen = float(texels.flux(spot * _above_share(texels)))
     return spot / seen if seen > 0 else np.zeros_like(spot)
-
-
-def _sun_mired(height: float) -> float:
-    s = min(max(height, 0.0), 1.0)
-    return LOW_SUN_MIRED + (HIGH_SUN_MIRED - LOW_SUN_MIRED) * s * (2 - s)
 
 
 def clouds(draws: SkyDraws, texels: SkyTexels) -> Numbers:
@@ -186,13 +180,9 @@ def _with_ground(draws: SkyDraws, texels: SkyTexels, sky: Numbers) -> Numbers:
     """Return a sky above ground that reflects, as a Lambert surface, what the sky sends onto it."""
     albedo = draws.uniform("albedo of the ground", 0.05, 0.5)
     tint = draws.colour("tint of the ground", (0.75, 0.7, 0.5), (1.0, 1.0, 0.9))
-    ground = albedo * tint * texels.irradiance(_above(sky, texels)) / np.pi
-    return lerp(ground, sky, _above_share(texels)[..., None])
-
-
-def _above(sky: Numbers, texels: SkyTexels) -> Numbers:
-    result: Numbers = sky * _above_share(texels)[..., None]
-    return result
+    above = _above_share(texels)[..., None]
+    ground = albedo * tint * texels.irradiance(sky * above) / np.pi
+    return lerp(ground, sky, above)
 
 
 def _above_share(texels: SkyTexels) -> Numbers:
@@ -208,8 +198,7 @@ def shared_flux(texels: SkyTexels, one: Numbers, other: Numbers, share: float) -
     """Return the sum of two maps of which the first has `share` of the flux."""
     first = _mean(texels.flux(one))
     second = _mean(texels.flux(other))
-    result: Numbers = one * (share / first) + other * ((1 - share) / second)
-    return result
+    return one * (share / first) + other * ((1 - share) / second)
 
 
 def constant(draws: SkyDraws, texels: SkyTexels) -> Numbers:
@@ -305,17 +294,6 @@ OUR_SKIES = tuple(SKIES)
 it."""
 
 
-@dataclass(frozen=True, kw_only=True, eq=False)
-class SkyMap:
-    """A latitude-longitude map of linear radiance; scene_templates.skies.texels orients it."""
-
-    family: str
-    radiance_rgb: NDArray[np.float32]
-    """[H, 2H, 3], the top row first, the middle of the picture +X, a quarter from the left +Y."""
-    parameters: Mapping[str, tuple[Any, ...]]
-    """Drawn values; the names are those of the reference page of surfaces and skies."""
-
-
 @checked("sky settings")
 class SkyMapSettings:
     """What procedural skies are drawn from."""
@@ -342,8 +320,11 @@ class SkyMapSettings:
             SKIES.find(name)
 
 
-def draw_sky(rng: np.random.Generator, settings: SkyMapSettings) -> SkyMap:
-    """Draw a sky of one of the families.
+def draw_sky(rng: np.random.Generator, settings: SkyMapSettings) -> tuple[str, NDArray[np.float32]]:
+    """Draw a sky of one of the families, and return its name and the map.
+
+    The map holds linear radiance [H, 2H, 3], the top row first, the middle of the picture +X, a
+    quarter from the left +Y (scene_templates.skies.texels).
 
     Equal generators and settings give equal bytes on every processor with IEEE arithmetic
     (scene_templates.exact). A sky of 256 rows takes 0.03 to 0.5 core-seconds.
@@ -353,17 +334,13 @@ def draw_sky(rng: np.random.Generator, settings: SkyMapSettings) -> SkyMap:
         settings: the ranges.
     """
     name = settings.families[int(rng.integers(len(settings.families)))]
-    texels = SkyTexels(settings.height)
+    texels = texels_of(settings.height)
     draws = SkyDraws(rng, settings)
     mean = draws.uniform("mean radiance", *settings.mean_radiance)
     shape = SKIES[name](draws, texels)
     red, green, blue = texels.flux(shape)
     scale = mean * 4 * np.pi * 3 / float(red + green + blue)
-    return SkyMap(
-        family=name,
-        radiance_rgb=(shape * scale).astype(np.float32),
-        parameters=draws.parameters(),
-    )
+    return name, (shape * scale).astype(np.float32)
 
 
 @checked("scene settings")

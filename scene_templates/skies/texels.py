@@ -13,16 +13,19 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from scene_templates.exact import Numbers, cosine, dot, ramp, sine
-
-TEXELS_PER_CELL = 4
-"""Fewest texels, at the equator, across a cell of noise; finer octaves are left out."""
+from scene_templates.exact import (
+    NOISE_SCALE,
+    TEXELS_PER_CELL,
+    Numbers,
+    cosine,
+    dot,
+    fade,
+    ramp,
+    sine,
+)
 
 LATTICE = 32
 """Cells after which noise in space repeats; the coarse octaves do not reach it."""
-
-NOISE_SCALE = 2.0
-"""Brings one octave of noise to a standard deviation of about 0.4."""
 
 SPOT_RADIUS = 1.5
 """Radius of a spot in rows: the nearest texel centre is always inside."""
@@ -35,20 +38,30 @@ class SkyTexels:
     height: int
     """Rows; a row is pi / height high."""
 
-    @property
+    @functools.cached_property
     def directions(self) -> Numbers:
         """[H, 2H, 3] unit vectors at the centres; read-only."""
-        return _directions(self.height)
+        height = self.height
+        elevation = (0.5 - (np.arange(height)[:, None] + 0.5) / height) * np.pi
+        azimuth = (0.5 - (np.arange(2 * height)[None, :] + 0.5) / (2 * height)) * 2 * np.pi
+        flat = np.zeros((height, 2 * height))
+        across = cosine(elevation)
+        directions = np.stack(
+            [across * cosine(azimuth), across * sine(azimuth), sine(elevation) + flat], axis=-1
+        )
+        directions.setflags(write=False)
+        return directions
 
     @property
     def z(self) -> Numbers:
         """[H, 1] sine of the elevation."""
         return self.directions[:, :1, 2]
 
-    @property
+    @functools.cached_property
     def solid_angle(self) -> Numbers:
         """[H, 1] steradians of each texel of a row; those of all texels sum to 4 pi."""
-        return _solid_angle(self.height)
+        edges = sine((0.5 - np.arange(self.height + 1) / self.height) * np.pi)
+        return ((edges[:-1] - edges[1:]) * np.pi / self.height)[:, None]
 
     def flux(self, radiance: NDArray) -> Numbers:
         """Return the integral over the sphere of a map [H, 2H] or [H, 2H, 3]."""
@@ -126,31 +139,13 @@ class SkyTexels:
         return shape / flux if flux > 0 else self.spot(towards)
 
 
-@functools.lru_cache(maxsize=2)
-def _directions(height: int) -> Numbers:
-    elevation = (0.5 - (np.arange(height)[:, None] + 0.5) / height) * np.pi
-    azimuth = (0.5 - (np.arange(2 * height)[None, :] + 0.5) / (2 * height)) * 2 * np.pi
-    flat = np.zeros((height, 2 * height))
-    across = cosine(elevation)
-    directions = np.stack(
-        [across * cosine(azimuth), across * sine(azimuth), sine(elevation) + flat], axis=-1
-    )
-    directions.setflags(write=False)
-    return directions
-
-
-@functools.lru_cache(maxsize=2)
-def _solid_angle(height: int) -> Numbers:
-    edges = sine((0.5 - np.arange(height + 1) / height) * np.pi)
-    solid_angle_sr: Numbers = ((edges[:-1] - edges[1:]) * np.pi / height)[:, None]
-    solid_angle_sr.setflags(write=False)
-    return solid_angle_sr
+texels_of = functools.lru_cache(maxsize=2)(SkyTexels)
+"""Returns the texels of a height, the same ones while few heights are asked for."""
 
 
 def _sum(values: NDArray) -> Numbers:
     """Return the sum over rows and columns, by rows first: the same order on every processor."""
-    result: Numbers = np.add.accumulate(np.add.accumulate(values, axis=1)[:, -1], axis=0)[-1]
-    return result
+    return np.add.accumulate(np.add.accumulate(values, axis=1)[:, -1], axis=0)[-1]
 
 
 def _axes(towards: NDArray, roll_rad: float) -> tuple[Numbers, Numbers]:
@@ -176,15 +171,15 @@ def _noise_in_space(points: NDArray, rng: np.random.Generator) -> Numbers:
     axes = [np.ascontiguousarray(points[..., axis]) for axis in range(3)]
     corners = [np.floor(axis) for axis in axes]
     insides = [axis - corner for axis, corner in zip(axes, corners, strict=True)]
-    fades = [x * x * x * (x * (6 * x - 15) + 10) for x in insides]
+    fades = [fade(x) for x in insides]
     total = np.zeros(points.shape[:-1])
     for steps in itertools.product((0, 1), repeat=3):
         place = np.zeros(total.shape, np.int64)
         weight = np.ones_like(total)
         height = np.zeros_like(total)
-        for corner, step, fade in zip(corners, steps, fades, strict=True):
+        for corner, step, faded in zip(corners, steps, fades, strict=True):
             place = place * LATTICE + (corner.astype(np.int64) + step) % LATTICE
-            weight = weight * (fade if step else 1 - fade)
+            weight = weight * (faded if step else 1 - faded)
         for slope, inside, step in zip(slopes, insides, steps, strict=True):
             height = height + slope[place] * (inside - step)
         total = total + height * weight

@@ -1,8 +1,7 @@
 """`SurfaceMaps`: what a textured surface is, and `Finish`, what its parts are mixed from."""
 
-from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
-from typing import Any, TypedDict
+from typing import TypedDict
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -32,8 +31,6 @@ class SurfaceMaps:
     """[H, W, 3] specular albedo."""
     roughness: NDArray[np.float32]
     """[H, W, 1] roughness; the GGX width is its square."""
-    parameters: Mapping[str, tuple[Any, ...]]
-    """Drawn values; the names are those of the reference page of surfaces and skies."""
     source: MapSource = field(default_factory=MapSource)
     """Whose it is; what is drawn is ours."""
 

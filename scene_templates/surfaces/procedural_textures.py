@@ -15,7 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from scene_templates.checks import Range, require
-from scene_templates.exact import Numbers, ramp, smoothstep
+from scene_templates.exact import TEXELS_PER_CELL, Numbers, ramp, smoothstep
 from scene_templates.layout import RGB
 from scene_templates.surfaces.maps import (
     MOST_ALBEDO,
@@ -24,7 +24,7 @@ from scene_templates.surfaces.maps import (
     SurfaceDraws,
     SurfaceMaps,
 )
-from scene_templates.surfaces.texels import TEXELS_PER_CELL, Texels, stones
+from scene_templates.surfaces.texels import Texels, stones
 from storage.registry import Registry
 from storage.settings.described import checked
 from storage.settings.ranges import Share, Within
@@ -490,5 +490,4 @@ def draw_surface(rng: np.random.Generator, settings: SurfaceMapSettings) -> Surf
         diffuse_rgb=(made_of.diffuse_rgb + full_size).astype(np.float32),
         specular_rgb=(made_of.specular_rgb + full_size).astype(np.float32),
         roughness=roughness.astype(np.float32),
-        parameters=draws.parameters(),
     )

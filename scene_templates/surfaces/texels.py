@@ -11,14 +11,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from scene_templates.exact import Numbers
-
-TEXELS_PER_CELL = 4
-"""Fewest texels across a cell of noise: octaves that are finer are left out, so that none aliases.
-"""
-
-NOISE_SCALE = 2.0
-"""Brings one octave of gradient noise to a standard deviation of about 0.4; it stays within 2."""
+from scene_templates.exact import NOISE_SCALE, TEXELS_PER_CELL, Numbers, fade
 
 
 @dataclass(frozen=True)
@@ -80,23 +73,16 @@ def _gradient_noise(
     y = y - floor_y
     column = floor_x.astype(np.int64)
     row = floor_y.astype(np.int64)
-    across = _fade(x)
-    up = _fade(y)
+    across = fade(x)
+    up = fade(y)
 
     def corner(dx: int, dy: int) -> Numbers:
         slope = slopes[(row + dy) % cells[1], (column + dx) % cells[0]]
-        result: Numbers = slope[..., 0] * (x - dx) + slope[..., 1] * (y - dy)
-        return result
+        return slope[..., 0] * (x - dx) + slope[..., 1] * (y - dy)
 
     low = corner(0, 0) + (corner(1, 0) - corner(0, 0)) * across
     high = corner(0, 1) + (corner(1, 1) - corner(0, 1)) * across
     return low + (high - low) * up
-
-
-def _fade(x: NDArray) -> Numbers:
-    """Return Perlin's curve with two vanishing derivatives at both ends."""
-    result: Numbers = x * x * x * (x * (6 * x - 15) + 10)
-    return result
 
 
 @dataclass(frozen=True, eq=False)

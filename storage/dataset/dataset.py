@@ -12,7 +12,7 @@ from storage.dataset.layout import DatasetFolder
 from storage.dataset.manifest import Manifest, ShardEntry, decode_manifest, missing_manifest
 from storage.dataset.shard import ShardReader
 from storage.errors import EnvironmentFailure, ShardMissing, TrilightError, Unreadable
-from storage.records.objects import Failure, LockedObject, decode_failures, decode_objects_lock
+from storage.records.objects import Failure, LockedObject, decode_failures
 from storage.records.packed_maps import HeldMaps
 from storage.records.sample import (
     Sample,
@@ -23,6 +23,7 @@ from storage.records.sample import (
 )
 from storage.remote.store import WRITABLE, LocalStore, RemoteStore, Store
 from storage.remote.url import parse_url
+from storage.typed_json import read_json_lines
 
 Record = TypeVar("Record", bound=SceneRecord)
 
@@ -203,8 +204,7 @@ class Dataset:
 
     def objects_lock(self) -> list[LockedObject]:
         """Return the objects that were used; none where the dataset has no lock."""
-        data = self.lock_bytes()
-        return [] if data is None else decode_objects_lock(data, "objects.lock.jsonl")
+        return read_json_lines(self.lock_bytes() or b"", LockedObject, "objects.lock.jsonl")
 
     def failures(self) -> list[Failure]:
         """Return what was rejected; none where the dataset does not say."""

@@ -1,11 +1,91 @@
-"""Planned shards of a dataset, from its manifest alone."""
+"""Planned shards of a dataset, and what it is made of, from its manifest alone.
 
-from storage.dataset.derived import derivation_of
+The settings of a dataset that is made of finished ones are those that all of its sources agree on,
+and one group `derived`: what was done, and each source's build, settings, digest and what was added
+to its keys.
+"""
+
+import contextlib
+from collections.abc import Mapping, Sequence
+from dataclasses import asdict, dataclass
+from typing import Any
+
 from storage.dataset.manifest import Manifest, ShardEntry, number_of_shard
 from storage.dataset.settings import SplitSettings
 from storage.dataset.splits import cut_splits, scenes_of_shard, shard_name, shards_for
 from storage.errors import TrilightError, prefix_errors
 from storage.settings.described import from_record
+
+_GROUP = "derived"
+_SOURCE_FIELDS = {"build", "digest", "key_offset", "num_scenes", "settings"}
+
+
+@dataclass(frozen=True, kw_only=True)
+class Derivation:
+    """Operation and sources of a dataset that was made of others."""
+
+    operation: str
+    """One of merge, select and reshard."""
+    arguments: Mapping[str, Any]
+    sources: Sequence[Mapping[str, Any]]
+    """Per source: build, num_scenes, digest, key_offset, settings."""
+
+
+def derivation_of(settings: Mapping[str, Any]) -> Derivation | None:
+    """Return what the settings of a dataset say of its sources; None where it was generated.
+
+    Raises:
+        TrilightError: they say it in another way.
+    """
+    if _GROUP not in settings:
+        return None
+    try:
+        derivation = Derivation(**settings[_GROUP])
+        for source in derivation.sources:
+            if set(source) != _SOURCE_FIELDS or not isinstance(source["settings"], Mapping):
+                raise ValueError(f"a source with {sorted(source)}")
+    except (TypeError, ValueError) as error:
+        raise TrilightError(f"manifest: settings.derived is not readable ({error}).") from error
+    return derivation
+
+
+def source_record(manifest: Manifest, *, key_offset: int) -> dict[str, Any]:
+    """Return what a derivation says of one source; `key_offset` is added to the keys of it."""
+    return {
+        "build": manifest.build,
+        "digest": manifest.dataset_digest,
+        "key_offset": key_offset,
+        "num_scenes": manifest.num_samples,
+        "settings": dict(manifest.settings),
+    }
+
+
+def derived_settings(derivation: Derivation, *, scenes_per_shard: int | None) -> dict[str, Any]:
+    """Return the settings of a derived dataset.
+
+    Args:
+        derivation: how it was made.
+        scenes_per_shard: of its own shards, where they are not those of the sources.
+    """
+    of_sources = [source["settings"] for source in derivation.sources]
+    shared = common(of_sources)
+    shared.pop(_GROUP, None)  # the one of a source stands in the record of that source
+    if scenes_per_shard is not None:
+        shared["splits"] = {**shared.get("splits", {}), "scenes_per_shard": scenes_per_shard}
+    return {**shared, _GROUP: asdict(derivation)}
+
+
+def common(mappings: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
+    """Return the entries that all mappings agree on, group by group."""
+    first, *rest = mappings
+    agreed: dict[str, Any] = {}
+    for name, value in first.items():
+        values = [value, *(other.get(name) for other in rest)]
+        if all(isinstance(entry, Mapping) for entry in values):
+            agreed[name] = common(values)
+        elif all(name in other for other in rest) and all(entry == value for entry in values):
+            agreed[name] = value
+    return agreed
 
 
 def planned_shards(manifest: Manifest) -> dict[str, int]:
@@ -54,12 +134,10 @@ def is_whole(manifest: Manifest, num_listed: int) -> bool:
 
 def num_planned(manifest: Manifest) -> int:
     """Return how many shards there will be; of settings that do not say, those that are listed."""
-    try:
-        if derivation_of(manifest.settings):
-            return len(manifest.shards)
-        return shards_for(manifest.num_scenes, _splits(manifest))
-    except TrilightError:
-        return len(manifest.shards)
+    with contextlib.suppress(TrilightError):
+        if not derivation_of(manifest.settings):
+            return shards_for(manifest.num_scenes, _splits(manifest))
+    return len(manifest.shards)
 
 
 def _splits(manifest: Manifest) -> SplitSettings:

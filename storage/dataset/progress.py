@@ -1,36 +1,36 @@
 """Progress of a dataset, from its files alone: counts, rate of the last scenes, time left (ETA).
 
-Any process may read it. The rate is that of the logs (storage.dataset.scene_logs).
+Any process may read it. The rate is that of the logs, with a row for each scene that is made, in
+`logs/<shard>.jsonl`. They hold what must not be in a dataset: times, hosts, retries. Of very many
+logs, a look reads those that were written last, and evenly spaced ones that stand for all.
 """
 
 import contextlib
 import dataclasses
 import functools
+import heapq
 import itertools
 import json
 import os
+import socket
 import time
-from collections.abc import Collection, Mapping, Sequence
+from collections.abc import Collection, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Annotated
 
-from storage.atomic import write_atomically, write_error
+from storage.atomic import append_line, write_atomically, write_error
 from storage.dataset.dataset import Dataset, open_listed
 from storage.dataset.layout import DatasetFolder, numbered_path, shard_names_in
 from storage.dataset.manifest import Manifest, read_manifest
 from storage.dataset.planned import expected_scenes, is_whole, listed_scenes, planned_shards
-from storage.dataset.scene_logs import (
-    LogSample,
-    SceneLog,
-    decode_scene_log,
-    log_name,
-    sample_logs,
-)
 from storage.dataset.shard_notes import name_of_note, noted_names, noted_shard
 from storage.errors import TrilightError
 from storage.extensions import is_reference
 from storage.records.objects import Failure, count_by_reason
 from storage.records.safe_read import read_plain
+from storage.records.sample import sample_key
+from storage.settings.ranges import Within
 from storage.typed_json import T, read_json
 
 _NAME = "logs/asked.json"
@@ -269,6 +269,98 @@ def _num_waiting(folder: DatasetFolder) -> int:
     return sum(name.endswith(".tar") for _, _, names in walked for name in names)
 
 
+LAST_SCENES = 200
+"""Scenes over which a rate is taken."""
+MOST_LOGS = 1024
+"""Maximum number of logs that stand for all."""
+
+
+Seconds = Annotated[float, Within(0, 1e12, unit="seconds")]
+
+
+@dataclass(frozen=True, kw_only=True)
+class SceneLog:
+    """Log row of one finished scene."""
+
+    scene: str = ""
+    seconds: Seconds
+    cores: Annotated[int, Within(0, 10**6, unit="cores")] = 1
+    """Cores that the worker used for it; earlier versions did not say."""
+    rejected_attempts: int = 0
+    host: str = ""
+    pid: int = 0
+    finished_unix_s: Seconds
+    """Time of completion by the worker's clock."""
+
+
+def log_scene(
+    folder: DatasetFolder,
+    shard: str,
+    scene_index: int,
+    *,
+    seconds: float,
+    cores: int,
+    num_rejected: int,
+) -> None:
+    """Append the row of a scene that is made.
+
+    Raises:
+        TrilightError: the disk is full or the folder cannot be written.
+    """
+    row = SceneLog(
+        scene=sample_key(scene_index),
+        seconds=round(seconds, 3),
+        cores=cores,
+        rejected_attempts=num_rejected,
+        host=socket.gethostname(),
+        pid=os.getpid(),
+        finished_unix_s=round(time.time(), 1),
+    )
+    append_line(folder.root / log_name(shard), json.dumps(dataclasses.asdict(row)))
+
+
+def log_name(shard: str) -> str:
+    """Return the name of a shard's log, relative to the dataset."""
+    return f"logs/{shard}.jsonl"
+
+
+def decode_scene_log(text: str) -> Iterator[SceneLog]:
+    """Yield the rows of a log; those that a kill has cut are left out."""
+    for line in text.splitlines():
+        with contextlib.suppress(TrilightError):
+            yield read_json(line, SceneLog, "log")
+
+
+def sample_logs(folder: DatasetFolder) -> tuple[list[SceneLog], float | None]:
+    """Return what the logs say, reading few of them however many there are.
+
+    That is the rows of the LAST_SCENES that were made last, by time, and the core-seconds of all
+    scenes: where there are more than MOST_LOGS, from as many of them, evenly spaced. They are None
+    without a log.
+    """
+    logs = sorted(_logs(folder.logs))
+    if not logs:
+        return [], None
+    # a log that was written before LAST_SCENES others has none of the last scenes
+    newest = heapq.nlargest(LAST_SCENES, logs, key=lambda log: log[1])
+    rows = sorted(_rows_of(path for path, _ in newest), key=lambda row: row.finished_unix_s)
+    spaced = logs[:: -(-len(logs) // MOST_LOGS)]
+    core_s = sum(row.seconds * row.cores for row in _rows_of(path for path, _ in spaced))
+    return rows[-LAST_SCENES:], core_s * len(logs) / len(spaced)
+
+
+def _rows_of(paths: Iterator[str]) -> Iterator[SceneLog]:
+    for path in paths:
+        yield from decode_scene_log(Path(path).read_text())
+
+
+def _logs(folder: Path | str) -> Iterator[tuple[str, int]]:
+    """Yield path and time of each log, of the folder and of its parts."""
+    for place, _, names in os.walk(folder):
+        for path in (os.path.join(place, name) for name in names if name.endswith(".jsonl")):
+            yield path, os.stat(path).st_mtime_ns
+
+
 _LOGS_READ = 64
 """Maximum number of logs fetched from a remote dataset, evenly spaced over its shards."""
 
@@ -325,8 +417,7 @@ def read_status(url: str) -> DatasetStatus:
     names = _finished_names(dataset, planned)
     objects = _count_objects(local) if local else _Counts()
     counts = _count_scenes(objects, manifest, planned, names, local)
-    looked, share = (sample_logs(local), 1.0) if local else _sampled_logs(dataset)
-    last = looked.last
+    last, core_s, share = (*sample_logs(local), 1.0) if local else _sampled_logs(dataset)
     finished = _is_finished(dataset)
     listed = [entry.name for entry in manifest.shards]
     scenes_left = counts.scenes_planned - counts.scenes_done - counts.scenes_given_up
@@ -342,7 +433,7 @@ def read_status(url: str) -> DatasetStatus:
         at_work=local is not None and local.is_at_work,
         views_per_hour=views_per_hour,
         remaining_s=remaining_s,
-        core_hours=None if looked.core_s is None else looked.core_s / 3600,
+        core_hours=None if core_s is None else core_s / 3600,
         last_scene_unix_s=last[-1].finished_unix_s if last else None,
         failures=count_by_reason([*dataset.failures(), *(_noted_failures(local) if local else ())]),
         digest=dataset.digest if finished else "",
@@ -362,7 +453,7 @@ def _noted_failures(folder: DatasetFolder) -> list[Failure]:
     return [failure for note in notes for failure in note.failures]
 
 
-def _sampled_logs(dataset: Dataset) -> tuple[LogSample, float]:
+def _sampled_logs(dataset: Dataset) -> tuple[list[SceneLog], float | None, float]:
     """Return what logs on a server say, and of what share of the listed scenes they are.
 
     A sample of the logs stands for all; where the first is missing, the dataset has none.
@@ -380,7 +471,7 @@ def _sampled_logs(dataset: Dataset) -> tuple[LogSample, float]:
     share = scenes / max(dataset.manifest.num_samples, 1)
     core_s = sum(row.seconds * row.cores for row in rows) / share if share else None
     rows.sort(key=lambda row: row.finished_unix_s)
-    return LogSample(last=rows, core_s=core_s), share
+    return rows, core_s, share
 
 
 def _rate(

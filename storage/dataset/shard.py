@@ -14,6 +14,7 @@ import os
 import re
 import tarfile
 from collections.abc import Callable, Iterable, Iterator, Mapping
+from contextlib import AbstractContextManager
 from dataclasses import dataclass
 from pathlib import Path
 from typing import BinaryIO
@@ -148,7 +149,7 @@ def scan_samples(
         yield current, members
 
 
-class ShardReader:
+class ShardReader(AbstractContextManager["ShardReader"]):
     """An open shard, which gives any of its samples, in any order and to several threads."""
 
     def __init__(self, stream: BinaryIO, name: str, held: HeldMaps | None = None) -> None:
@@ -235,9 +236,6 @@ class ShardReader:
     def close(self) -> None:
         """Let go of the file; a cache may then remove it."""
         self._stream.close()
-
-    def __enter__(self) -> "ShardReader":
-        return self
 
     def __exit__(self, *error: object) -> None:
         self.close()

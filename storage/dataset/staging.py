@@ -12,8 +12,7 @@ from storage.atomic import write_atomically
 from storage.dataset.layout import numbered_path
 from storage.dataset.shard import open_shard, write_tar
 from storage.records.objects import Failure, decode_failures, encode_failures
-from storage.records.profiles import Profile
-from storage.records.sample import Sample, encode_sample, sample_key
+from storage.records.sample import sample_key
 
 _FAILURES = "failures"
 
@@ -27,21 +26,13 @@ class StagedScene:
     failures: list[Failure]
 
 
-def stage_scene(
-    folder: Path,
-    scene_index: int,
-    sample: Sample | None,
-    failures: list[Failure],
-    profile: Profile,
-) -> None:
-    """Write what became of a scene into the staging folder of its shard, packed as it will stay."""
-    stage_members(folder, scene_index, encode_sample(sample, profile) if sample else {}, failures)
-
-
 def stage_members(
     folder: Path, scene_index: int, members: dict[str, bytes], failures: list[Failure]
 ) -> None:
-    """Write a finished scene as `stage_scene`, from the members of its sample."""
+    """Write what became of a scene into the staging folder of its shard.
+
+    The members of its sample are packed as they will stay; there are none where it was given up.
+    """
     stream = io.BytesIO()
     write_tar(
         stream, [(sample_key(scene_index), {**members, _FAILURES: encode_failures(failures)})]

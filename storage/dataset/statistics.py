@@ -24,14 +24,13 @@ MOST_SCENES = 20_000
 half a point (binomial, 95 %), and they take minutes."""
 
 
-def described_shards(dataset: Dataset, most_scenes: int | None = None) -> list[ShardEntry]:
+def described_shards(dataset: Dataset) -> list[ShardEntry]:
     """Return the shards by which a dataset is described, in its order.
 
-    They are all where those hold no more than `most_scenes` (MOST_SCENES); else every n-th of each
-    split, its first one among them.
+    They are all where those hold no more than MOST_SCENES; else every n-th of each split, its first
+    one among them.
     """
-    most_scenes = MOST_SCENES if most_scenes is None else most_scenes
-    every = -(-dataset.manifest.num_samples // most_scenes)
+    every = -(-dataset.manifest.num_samples // MOST_SCENES)
     if every <= 1:
         return list(dataset.manifest.shards)
     chosen = {shard.name for split in SPLITS for shard in dataset.shards_of(split)[::every]}
@@ -79,34 +78,28 @@ class Statistics:
         return len(self.spp)
 
     def lines(self) -> Sequence[tuple[str, str]]:
-        """Return (name, value) rows to print."""
+        """Return (name, value) rows to print, without what there is none of."""
         if not self.num_views:
             return [("scenes", "0")]
-        excursions = _counts(self.scenes_by_excursion)
-        beyond = [("beyond the range", excursions)] if excursions else []
-        sample = of_how_many(self.num_scenes_read, self.num_scenes)
-        expected_db = self.expected_error_db
-        expected = (
-            [] if expected_db is None else [("expected error", _spread(expected_db, "psnr_log_db"))]
-        )
         kb_per_scene = self.num_bytes / max(self.num_scenes, 1) / 1e3
-        return [
+        rows = [
             ("scenes", f"{self.num_scenes} ({_counts(self.scenes_by_split)})"),
             ("templates", _counts(self.scenes_by_template)),
-            *beyond,
-            *([("what follows is", sample)] if sample else []),
+            ("beyond the range", _counts(self.scenes_by_excursion)),
+            ("what follows is", of_how_many(self.num_scenes_read, self.num_scenes)),
             ("views", f"{self.num_views}"),
-            ("stated error", _spread(self.noise_floor_db, "psnr_log_db")),
-            *expected,
+            ("stated error", _spread(self.noise_floor_db)),
+            ("expected error", _spread(self.expected_error_db)),
             *(
-                (f"stated error, {part}", _spread(floors_db, "psnr_log_db"))
+                (f"stated error, {part}", _spread(floors_db))
                 for part, floors_db in self.part_noise_floor_db.items()
             ),
             ("views at the cap", f"{100 * self.at_cap.mean():.1f} %"),
             ("samples per pixel", f"median {np.median(self.spp):.0f}, most {self.spp.max()}"),
-            *([("scene digest", self.scene_digest)] if self.scene_digest else []),
+            ("scene digest", self.scene_digest),
             ("size", f"{self.num_bytes / 1e6:.1f} MB, {kb_per_scene:.0f} kB a scene"),
         ]
+        return [row for row in rows if row[1]]
 
 
 def dataset_statistics(dataset: Dataset) -> Statistics:
@@ -194,9 +187,11 @@ def digest_of_scenes(members: Mapping[str, str]) -> str:
     return sha256_hex("\n".join(lines).encode())
 
 
-def _spread(floors_db: NDArray[np.float64], metric: str) -> str:
+def _spread(floors_db: NDArray[np.float64] | None) -> str:
+    if floors_db is None:
+        return ""
     median, low = np.percentile(floors_db, [50, 5])
-    return f"median {median:.1f} dB, 5th percentile {low:.1f} dB ({metric})"
+    return f"median {median:.1f} dB, 5th percentile {low:.1f} dB (psnr_log_db)"
 
 
 def _counts(counts: Mapping[str, int]) -> str:

@@ -21,7 +21,7 @@ from storage.errors import EnvironmentFailure, ShardMissing, TrilightError, Unre
 from storage.licences import mixed_share_alike
 from storage.machine import available_cores
 from storage.records.lights import part_names, sum_of_lights, sum_of_parts
-from storage.records.objects import LockedObject, decode_objects_lock, locked_uids
+from storage.records.objects import LockedObject, locked_uids
 from storage.records.packed_maps import HeldMaps
 from storage.records.passes.pictures import decode_passes_exr, passes_in_file, picture_passes
 from storage.records.sample import Sample, decode_sample
@@ -29,6 +29,7 @@ from storage.records.scene import Scene
 from storage.remote.fetch import download
 from storage.remote.retries import TransferFailed
 from storage.remote.store import RemoteStore
+from storage.typed_json import read_json_lines
 
 REMOTE_THREADS = 8
 """Shards of a server that are fetched, or asked for, at the same time."""
@@ -84,7 +85,7 @@ def verify_dataset(
     manifest = dataset.manifest
     lock = dataset.lock_bytes()
     problems = list(_check_lock(lock, dataset))
-    rows = [] if problems else decode_objects_lock(lock or b"", "objects.lock.jsonl")
+    rows = [] if problems else read_json_lines(lock or b"", LockedObject, "objects.lock.jsonl")
     locked = None if problems else {row.uid: row for row in rows}
     problems += _check_manifest(dataset)
     names = sorted(shard_names_in(dataset.local.root)) if dataset.local else []

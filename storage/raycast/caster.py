@@ -98,8 +98,7 @@ class Triangles:
     ) -> NDArray[np.bool_]:
         """Return [N] whether rays meet nothing up to a distance [N], in lengths of directions."""
         occluder = self._embree.run(origins, directions, dists=distances_m, query="OCCLUDED")
-        free: NDArray[np.bool_] = np.asarray(occluder) < 0
-        return free
+        return np.asarray(occluder) < 0
 
 
 class Surfaces(Triangles):

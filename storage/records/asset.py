@@ -74,10 +74,9 @@ class LevelSkin:
 
     uv: NDArray[np.float32]
     """[F, 3, 2] texture coordinates of each corner of each face, within [0, 1], v up."""
-    packed: tuple[bytes, bytes, bytes]
-    """Encoded bytes of the three textures."""
-    packed_normal: bytes | None = None
-    """Encoded bytes of the normal map; None where the source has none, or it was not requested."""
+    packed: Mapping[str, bytes]
+    """Encoded bytes of the textures by name: TEXTURED, and NORMAL where the source has a normal map
+    and it was requested."""
     quality: SkinQuality
     emission: NDArray[np.float32] | None = None
     """[F, 3] what each face emits, in the units of the source; None where nothing does, or
@@ -86,19 +85,19 @@ class LevelSkin:
     @cached_property
     def textures(self) -> SkinTextures:
         """Diffuse, specular and roughness, unpacked."""
-        first, second, third = map(unpack_texture, self.packed, TEXTURED)
+        first, second, third = (unpack_texture(self.packed[name], name) for name in TEXTURED)
         return first, second, third
 
     @cached_property
     def normal(self) -> Texture | None:
         """The normal map, unpacked."""
-        return None if self.packed_normal is None else unpack_texture(self.packed_normal, NORMAL)
+        return unpack_texture(self.packed[NORMAL], NORMAL) if NORMAL in self.packed else None
 
     @property
     def num_bytes(self) -> int:
         """Bytes as they are stored."""
         glow = 0 if self.emission is None else self.emission.nbytes
-        return self.uv.nbytes + sum(map(len, (*self.packed, self.packed_normal or b""))) + glow
+        return self.uv.nbytes + sum(map(len, self.packed.values())) + glow
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -217,10 +216,7 @@ def encode_asset(asset: Asset) -> bytes:
     for level in asset.levels:
         of_level: dict[str, NDArray | None] = {"positions": level.positions, "faces": level.faces}
         if (skin := level.skin) is not None:
-            packed = zip((*TEXTURED, NORMAL), (*skin.packed, skin.packed_normal), strict=True)
-            of_level |= {
-                name: np.frombuffer(data, np.uint8) for name, data in packed if data is not None
-            }
+            of_level |= {name: np.frombuffer(data, np.uint8) for name, data in skin.packed.items()}
             of_level |= {"uv": skin.uv, "emission": skin.emission}
         for name, array in of_level.items():
             if array is not None:
@@ -260,11 +256,10 @@ def _level(
     of_level = {name.removesuffix(end): each for name, each in arrays.items() if name.endswith(end)}
     skin = None
     if (quality := skins.get(str(record.budget))) is not None:
-        first, second, third = (of_level[column].tobytes() for column in TEXTURED)
+        names = (*TEXTURED, NORMAL) if NORMAL in of_level else TEXTURED
         skin = LevelSkin(
             uv=of_level["uv"],
-            packed=(first, second, third),
-            packed_normal=of_level[NORMAL].tobytes() if NORMAL in of_level else None,
+            packed={name: of_level[name].tobytes() for name in names},
             quality=quality,
             emission=of_level.get("emission"),
         )

@@ -36,8 +36,7 @@ class Environment:
 
     def to_map(self, directions: ArrayLike) -> NDArray[np.float64]:
         """Return directions [..., 3] of the world in the axes of the map."""
-        turned: NDArray[np.float64] = np.positive(directions, dtype=np.float64) @ self.rotation
-        return turned
+        return np.positive(directions, dtype=np.float64) @ self.rotation
 
     def check(self, called: str = "environment") -> None:
         """Raise TrilightError at the first broken law; `called` stands for the map."""
@@ -59,8 +58,7 @@ class Environment:
 def row_solid_angles(height: int) -> NDArray[np.float64]:
     """Return the steradians [H] of a texel in each row of a map with 2 H columns."""
     edges = np.cos(np.pi * np.arange(height + 1) / height)
-    angles: NDArray[np.float64] = (edges[:-1] - edges[1:]) * np.pi / height
-    return angles
+    return (edges[:-1] - edges[1:]) * np.pi / height
 
 
 def texel_means(values: NDArray[np.float64]) -> NDArray[np.float64]:
@@ -68,7 +66,4 @@ def texel_means(values: NDArray[np.float64]) -> NDArray[np.float64]:
     wide = np.pad(values, ((1, 1), (0, 0)), mode="edge")
     tall = (wide[:-2] + 6 * wide[1:-1] + wide[2:]) / 8
     round_about = np.pad(tall, ((0, 0), (1, 1)), mode="wrap")
-    means: NDArray[np.float64] = (
-        round_about[:, :-2] + 6 * round_about[:, 1:-1] + round_about[:, 2:]
-    ) / 8
-    return means
+    return (round_about[:, :-2] + 6 * round_about[:, 1:-1] + round_about[:, 2:]) / 8

@@ -113,14 +113,12 @@ def encode_channels(
             raise TrilightError(  # OpenEXR would wrap it around, or make it infinite
                 f"picture: attribute {name} is {value!r}; expected a number {within}, or text."
             )
-    header: dict[str, object] = {"type": OpenEXR.scanlineimage}
-    if dwa_level is None:
-        header["compression"] = OpenEXR.ZIP_COMPRESSION
-    else:
-        header["compression"] = OpenEXR.DWAB_COMPRESSION
-        header["dwaCompressionLevel"] = float(dwa_level)  # an int would be another type
+    packing = {"compression": OpenEXR.ZIP_COMPRESSION}
+    if dwa_level is not None:  # an int would be another type
+        packing = {"compression": OpenEXR.DWAB_COMPRESSION, "dwaCompressionLevel": float(dwa_level)}
+    header = {"type": OpenEXR.scanlineimage, **packing, **(attributes or {})}
     stream = io.BytesIO()
-    OpenEXR.File({**header, **(attributes or {})}, dict(channels), num_threads=0).write(stream)
+    OpenEXR.File(header, dict(channels), num_threads=0).write(stream)
     return stream.getvalue()
 
 
@@ -214,8 +212,7 @@ def read_header(data: bytes) -> Header:
         parts = OpenEXR.File(io.BytesIO(data), header_only=True, num_threads=0).parts
     if len(parts) != 1:
         raise TrilightError(f"picture: the file has {len(parts)} parts; expected one.")
-    header: Header = parts[0].header
-    return header
+    return parts[0].header
 
 
 def find_header_end(data: bytes) -> int:

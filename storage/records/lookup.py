@@ -159,5 +159,4 @@ def _bilinear(
     across = (y - row)[..., None]
     low = (1 - along) * texels(row, column) + along * texels(row, column + 1)
     high = (1 - along) * texels(row + 1, column) + along * texels(row + 1, column + 1)
-    values: NDArray[np.float64] = (1 - across) * low + across * high
-    return values
+    return (1 - across) * low + across * high

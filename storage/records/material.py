@@ -101,11 +101,6 @@ PUBLISHED_COLUMNS = tuple(COLUMNS)
 """Names of the four columns of the published renderers, which every file and kernel knows."""
 
 
-def material_columns() -> tuple[MaterialColumn, ...]:
-    """Return the declared columns in the order of a scene's material rows."""
-    return tuple(COLUMNS.values())
-
-
 def laid_out(names: Sequence[str] | None = None) -> Iterator[tuple[MaterialColumn, slice]]:
     """Yield columns and where their numbers stand in a row that holds these, in this order.
 
@@ -140,7 +135,7 @@ def declared_column(name: str) -> MaterialColumn:
 
 def default_rows(count: int) -> NDArray[np.float32]:
     """Return `count` material rows [count, width] with every declared column at its default."""
-    row = np.concatenate([np.full(each.width, each.default) for each in material_columns()])
+    row = np.concatenate([np.full(each.width, each.default) for each in COLUMNS.values()])
     return np.tile(row.astype(np.float32), (count, 1))
 
 

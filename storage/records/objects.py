@@ -7,6 +7,7 @@
 import dataclasses
 import mmap
 import os
+from bisect import bisect_left
 from collections import Counter
 from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass
@@ -132,12 +133,7 @@ def read_objects_lock(path: Path) -> list[LockedObject]:
         TrilightError: missing, or a line that is not a locked object.
     """
     with name_unreadable(path):
-        return decode_objects_lock(read_plain(path), str(path))
-
-
-def decode_objects_lock(data: bytes, place: str) -> list[LockedObject]:
-    """Return the objects of the bytes of a lock; raises as `read_objects_lock`, naming `place`."""
-    return read_json_lines(data, LockedObject, place)
+        return read_json_lines(read_plain(path), LockedObject, str(path))
 
 
 def encode_failures(failures: Iterable[Failure]) -> bytes:
@@ -214,19 +210,14 @@ class LockRows:
         return read_json(line, LockedObject, f"{self._path}: row at byte {offset}")
 
     def find(self, uid: str) -> LockedObject | None:
-        """Return the row of a uid, or None: rows are sorted, so about 20 of a million are read."""
-        low = 0
-        high = self.num_bytes
-        while low < high:
-            start = self._lines.rfind(b"\n", low, (low + high) // 2) + 1 or low
-            row = self.at(start)
-            if row.uid == uid:
-                return row
-            if row.uid < uid:
-                low = self._end(start)
-            else:
-                high = start
-        return None
+        """Return the row of a uid, or None: rows are sorted, so about 30 of a million are read."""
+
+        def row_around(byte: int) -> LockedObject:
+            return self.at(self._lines.rfind(b"\n", 0, byte) + 1)
+
+        start = bisect_left(range(self.num_bytes), uid, key=lambda byte: row_around(byte).uid)
+        row = self.at(start) if start < self.num_bytes else None
+        return row if row and row.uid == uid else None
 
     def __iter__(self) -> Iterator[LockedObject]:
         """Yield all rows, sorted by uid."""

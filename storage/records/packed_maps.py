@@ -60,9 +60,8 @@ class HeldMaps:
     them.
     """
 
-    def __init__(self, most_bytes: int = HELD_BYTES) -> None:
-        """Hold nothing yet, and at most these bytes; a larger map is not held."""
-        self._most = most_bytes
+    def __init__(self) -> None:
+        """Hold nothing yet, and at most HELD_BYTES; a larger map is not held."""
         self._maps: OrderedDict[tuple[type, str, str], Any] = OrderedDict()
         self._lock = threading.Lock()
         self.num_bytes = 0
@@ -85,14 +84,13 @@ class HeldMaps:
         with self._lock:
             if key in self._maps:
                 self._maps.move_to_end(key)
-                known: Map = self._maps[key]
-                return known
+                return self._maps[key]
         made = unpack()
         array = _array(made)
         array.flags.writeable = False
         with self._lock:
-            if array.nbytes <= self._most and key not in self._maps:
-                while self.num_bytes + array.nbytes > self._most:
+            if array.nbytes <= HELD_BYTES and key not in self._maps:
+                while self.num_bytes + array.nbytes > HELD_BYTES:
                     _, oldest = self._maps.popitem(last=False)
                     self.num_bytes -= _array(oldest).nbytes
                 self._maps[key] = made

@@ -23,8 +23,8 @@ from storage.records.material import (
     DIFFUSE,
     EMISSION,
     SPECULAR,
+    column_places,
     laid_out,
-    material_columns,
     material_width,
 )
 from storage.records.scene_laws import broken_law, require_array, require_law, require_rotations
@@ -235,9 +235,9 @@ def _check_columns(scene: Scene) -> None:
     got = scene.materials.shape
     expected = material_width()
     if got[1] != expected:
-        names = ", ".join(column.name for column in material_columns())
         broken_law(
-            f"materials has shape {got}", f"(None, {expected}), since its columns are {names}"
+            f"materials has shape {got}",
+            f"(None, {expected}), since its columns are {', '.join(column_places())}",
         )
     for column, part in laid_out():
         holds = np.ones(got, np.bool_)

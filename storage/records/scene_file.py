@@ -16,17 +16,13 @@ import os
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Annotated, Any, TypeVar, cast
+from typing import Annotated, Any, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
 from safetensors.numpy import save
 
-from storage.conventions import (
-    MAPS_VERSION,
-    READABLE_VERSIONS,
-    SCHEMA_VERSION,
-)
+from storage.conventions import MAPS_VERSION, READABLE_VERSIONS, SCHEMA_VERSION
 from storage.digests import canonical_json, sha256_hex
 from storage.errors import TrilightError, prefix_errors
 from storage.records.material import chosen_columns, completed_rows, stored_columns, stored_names
@@ -50,8 +46,7 @@ from storage.records.scene import (
 )
 from storage.records.scene_laws import wrong_value
 from storage.records.texture import MAX_MAPS_BYTES, Texture
-from storage.settings.ranges import Law
-from storage.typed_json import FINITE, read_versioned
+from storage.typed_json import FINITE, Converted, read_versioned
 
 MAX_FILE_BYTES = (256 << 20) + MAX_MAPS_BYTES
 """A million triangles with three vertices each take 90 MB."""
@@ -184,11 +179,24 @@ def decode_scene_file(data: bytes, name: str) -> Scene:
         return scene
 
 
-class LawfulProvenance(Law):
-    """Law of `scene_provenance`."""
+def scene_provenance(value: Any) -> Mapping[str, Any]:
+    """Return the provenance of a JSON value.
 
-    def require(self, value: Any) -> Any:
-        return scene_provenance(value)
+    Raises:
+        TrilightError: it is no object, or its template or excursion is malformed.
+    """
+    if not isinstance(value, dict):
+        wrong_value("provenance", value, "a JSON object")
+    if not isinstance(value.get("template", ""), str):
+        wrong_value("provenance.template", value["template"], "text")
+    excursion = value.get("excursion")
+    if excursion and not (
+        isinstance(excursion, dict)
+        and isinstance(excursion.get("axis"), str)
+        and isinstance(excursion.get("value"), int | float)
+    ):
+        wrong_value("provenance.excursion", excursion, "an axis and a value")
+    return value
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -209,7 +217,7 @@ class SceneJson:
 
     schema_version: int
     objects: tuple[StatedObject, ...]
-    provenance: Annotated[Mapping[str, Any], FINITE, LawfulProvenance()]
+    provenance: Annotated[Mapping[str, Any], Converted(scene_provenance), FINITE]
     maps: Maps | None = None
     material_columns: str | None = None
     """Columns of the materials in a scene file (storage.records.material), if they are others than
@@ -265,7 +273,7 @@ def read_scene_record(
             f"{MAPS_VERSION} exactly where there are any."
         )
     with_texts = {name: raw[name] for name in ("objects", "provenance", "maps") if name in raw}
-    return cast(Record, _as_stored(record, with_texts))
+    return _as_stored(record, with_texts)
 
 
 def _as_stored(checked: Any, raw: Any) -> Any:
@@ -276,26 +284,6 @@ def _as_stored(checked: Any, raw: Any) -> Any:
         fields = {name: _as_stored(getattr(checked, name), raw[name]) for name in raw}
         return dataclasses.replace(checked, **fields)
     return raw
-
-
-def scene_provenance(value: Any) -> Mapping[str, Any]:
-    """Return the provenance of a JSON value.
-
-    Raises:
-        TrilightError: it is no object, or its template or excursion is malformed.
-    """
-    if not isinstance(value, dict):
-        wrong_value("provenance", value, "a JSON object")
-    if not isinstance(value.get("template", ""), str):
-        wrong_value("provenance.template", value["template"], "text")
-    excursion = value.get("excursion")
-    if excursion and not (
-        isinstance(excursion, dict)
-        and isinstance(excursion.get("axis"), str)
-        and isinstance(excursion.get("value"), int | float)
-    ):
-        wrong_value("provenance.excursion", excursion, "an axis and a value")
-    return value
 
 
 def _arrays(scene: Scene) -> dict[str, NDArray]:

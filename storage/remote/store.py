@@ -207,12 +207,10 @@ class RemoteStore:
 
         def read() -> bytes | None:
             with contextlib.suppress(FileNotFoundError):
-                start: bytes = shared_driver(self.url).cat_file(url.root, start=0, end=num_bytes)
-                return start
+                return shared_driver(self.url).cat_file(url.root, start=0, end=num_bytes)
             return None
 
-        start: bytes | None = self._retry(read, "read")
-        return start
+        return self._retry(read, "read")
 
     def put(self, name: str, content: Path | bytes) -> None:
         self._retry(lambda: self._upload(name, content, mode="overwrite"), "written")
@@ -227,17 +225,10 @@ class RemoteStore:
                 return False
             return True
 
-        created: bool = self._retry(create_file, "written")
-        return created
+        return self._retry(create_file, "written")
 
     def list(self, folder: str = "") -> set[str]:
-        def list_files(driver: Any, place: str) -> Iterable[str]:
-            with contextlib.suppress(FileNotFoundError):
-                rows = driver.ls(place, detail=True)
-                return [row["name"] for row in rows if row["type"] == "file"]
-            return ()
-
-        return self._list_paths(folder, list_files)
+        return self._list_paths(folder, lambda driver, place: driver.ls(place, detail=True))
 
     def list_all(self) -> set[str]:
         """Return the names of all files, however deep; a thousand names are a request.
@@ -247,20 +238,22 @@ class RemoteStore:
         if self.url.scheme not in WRITABLE:
             return set()
         with contextlib.suppress(TrilightError):
-            return self._list_paths("", lambda driver, place: driver.find(place))
+            return self._list_paths("", lambda drv, place: drv.find(place, detail=True).values())
         return set()
 
-    def _list_paths(self, folder: str, find: Callable[[Any, str], Iterable[str]]) -> set[str]:
-        root = self.url.root
-        place = f"{root}/{folder}".rstrip("/")
+    def _list_paths(self, folder: str, find: Callable[[Any, str], Iterable[Any]]) -> set[str]:
+        root = f"{self.url.root}/"
 
-        def find_paths() -> Iterable[str]:
+        def find_files() -> list[str]:
             driver = shared_driver(self.url)
             driver.invalidate_cache()
-            return find(driver, place)
+            with contextlib.suppress(FileNotFoundError):
+                rows = find(driver, f"{root}{folder}".rstrip("/"))
+                return [row["name"] for row in rows if row["type"] == "file"]
+            return []
 
-        paths = self._retry(find_paths, "listed")
-        return {path.removeprefix(f"{root}/") for path in paths if path.startswith(f"{root}/")}
+        paths = self._retry(find_files, "listed")
+        return {path.removeprefix(root) for path in paths if path.startswith(root)}
 
     @contextlib.contextmanager
     def hold_lock(self, name: str) -> Iterator[bool]:
@@ -309,8 +302,7 @@ class RemoteStore:
     def num_bytes(self, name: str) -> int | None:
         url = self.url.child(name)
         try:
-            size: int | None = facts_of(url).get("size")
-            return size
+            return facts_of(url).get("size")
         except TransferFailed as error:
             if error.__cause__ is not None and is_missing(error.__cause__):
                 raise ShardMissing(f"{url.display_url}: the shard is missing.") from error

@@ -86,16 +86,27 @@ def parse_url(source: str, *, what: str) -> RemoteUrl | Path:
     scheme = match[1].lower()
     rest = match[2]
     if scheme == "file":
-        return _local(rest, what, url_text)
+        host, slash, path = rest.partition("/")
+        if host not in ("", "localhost") or not slash:
+            raise TrilightError(
+                f"{what} {url_text!r}; expected file:///FOLDER, with three slashes."
+            )
+        return Path("/" + unquote(path))
     if scheme not in PACKAGES:
         raise TrilightError(
             f"{what} {url_text!r} has the scheme {printable(scheme)!r}; {_ADMITTED}."
         )
-    if not rest.partition("/")[0].rpartition("@")[2]:
+    _, at, host = rest.partition("/")[0].rpartition("@")
+    if not host:
         raise TrilightError(f"{what} {url_text!r} names no host or bucket; {_ADMITTED}.")
     if scheme in ("http", "https"):
         return _http(scheme, rest, what)
-    return _bucket(scheme, rest, what, url_text)
+    if at:
+        raise TrilightError(
+            f"{what} {url_text!r} came with a user or password; expected none in URLs of {scheme}. "
+            f"Give them in the way of {PACKAGES[scheme]}, such as by its environment variables."
+        )
+    return RemoteUrl(what=what, scheme=scheme, root=rest.strip("/"))
 
 
 def parse_local_path(text: str) -> Path:
@@ -182,19 +193,3 @@ def _http(scheme: str, rest: str, what: str) -> RemoteUrl:
         user=unquote(user),
         password=unquote(password),
     )
-
-
-def _bucket(scheme: str, rest: str, what: str, url_text: str) -> RemoteUrl:
-    if "@" in rest.partition("/")[0]:
-        raise TrilightError(
-            f"{what} {url_text!r} came with a user or password; expected none in URLs of {scheme}. "
-            f"Give them in the way of {PACKAGES[scheme]}, such as by its environment variables."
-        )
-    return RemoteUrl(what=what, scheme=scheme, root=rest.strip("/"))
-
-
-def _local(rest: str, what: str, url_text: str) -> Path:
-    host, slash, path = rest.partition("/")
-    if host not in ("", "localhost") or not slash:
-        raise TrilightError(f"{what} {url_text!r}; expected file:///FOLDER, with three slashes.")
-    return Path("/" + unquote(path))

@@ -15,10 +15,9 @@ import dataclasses
 import functools
 import json
 import reprlib
-import typing
 from collections.abc import Callable, Sequence
 from dataclasses import field as dataclass_field
-from typing import Any, TypeVar, dataclass_transform
+from typing import Any, TypeVar, cast, dataclass_transform
 
 import pydantic
 from pydantic.dataclasses import dataclass
@@ -72,7 +71,7 @@ def checked(called: str = "") -> Callable[[type[Settings]], type[Settings]]:
                 raise _complaint(error, type(self), called=called) from None
 
         group.__init__ = init_or_complain
-        return typing.cast(type[Settings], group)
+        return group
 
     return decorate
 
@@ -94,8 +93,7 @@ def leaves_out(*names: str) -> Any:
 
 def settings_record(group: Any) -> dict[str, Any]:
     """Return settings as JSON values, as manifests and checkpoints hold them."""
-    record: dict[str, Any] = _adapter(typing.cast(Any, type(group))).dump_python(group, mode="json")
-    return record
+    return _adapter(cast(Any, type(group))).dump_python(group, mode="json")
 
 
 def from_record(kind: type[Settings], record: Any) -> Settings:
@@ -104,7 +102,7 @@ def from_record(kind: type[Settings], record: Any) -> Settings:
     Raises:
         TrilightError: a value that they refuse, by its dotted place.
     """
-    return typing.cast(Settings, _read(record, kind, kind))
+    return _read(record, kind, kind)
 
 
 def field_value(kind: type, field: FieldDescription, value: Any, display_name: str) -> Any:

@@ -10,7 +10,7 @@ preset: model=large with model.window_bundles=0.
 import dataclasses
 import json
 import re
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from typing import Any, TypeVar
 
 from storage.errors import OF_EXTENSION, TrilightError, expected_one_of, removal_message
@@ -84,29 +84,30 @@ def apply_overrides(settings: Settings, overrides: Mapping[str, Any]) -> Setting
         TrilightError: a name that does not exist, a value of another kind, or one that the
             settings themselves refuse; a name that is nearly right is asked back.
     """
-    result: Settings = _replace_fields(
-        settings, [(n.split("."), v, n) for n, v in overrides.items()]
-    )
-    return result
+    return _replace_fields(settings, [(n.split("."), v, n) for n, v in overrides.items()])
 
 
-def differences(before: Mapping[str, Any], now: Mapping[str, Any]) -> dict[str, Any]:
-    """Return by dotted name what differs in a record; groups of another kind are whole.
+def differences(
+    before: Mapping[str, Any], now: Mapping[str, Any], prefix: str = "", *, alike: bool = False
+) -> Iterator[tuple[str, Any, Any]]:
+    """Yield (dotted name, value before, value now) for each value of two records that differs.
 
     Args:
-        before: a record (storage.settings.described.settings_record), or part of one.
-        now: that whose values are returned; what it lacks does not differ.
+        before, now: records (storage.settings.described.settings_record), or parts of them.
+        prefix: begins the names.
+        alike: compare groups that have other names as a whole.
     """
-    differing: dict[str, Any] = {}
-    for name, value in now.items():
+    for name in sorted({*before, *now}):
         old = before.get(name)
-        if isinstance(old, Mapping) and isinstance(value, Mapping) and old.keys() == value.keys():
-            differing |= {
-                f"{name}.{below}": each for below, each in differences(old, value).items()
-            }
-        elif old != value:
-            differing[name] = value
-    return differing
+        new = now.get(name)
+        if (
+            isinstance(old, Mapping)
+            and isinstance(new, Mapping)
+            and (not alike or old.keys() == new.keys())
+        ):
+            yield from differences(old, new, f"{prefix}{name}.", alike=alike)
+        elif old != new:
+            yield f"{prefix}{name}", old, new
 
 
 def _replace_fields(group: Any, overrides: Sequence[Override]) -> Any:

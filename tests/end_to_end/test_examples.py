@@ -30,6 +30,7 @@ from tests.end_to_end.production_kit import FEW_SAMPLES
 from tests.extensions_kit import EXAMPLES, loaded, room_for_extensions
 from tests.for_each import for_each
 from tests.scene_templates.balls import one_drawn
+from tests.scene_templates.drawn_values import with_draws
 from tests.scenes_by_hand import tiny_scene
 from train.evaluation.metrics import METRICS, picture_scores
 from train.presets import override_training_preset, resolve_training_preset
@@ -81,11 +82,10 @@ def test_a_surface_repeats_and_lies_in_scenes(copied: Callable[[str], Path]) -> 
 def test_a_sky_is_drawn(copied: Callable[[str], Path]) -> None:
     with loaded(copied("sky.py")):
         changes = {"scenes.skies.maps.families": ["ring"], "scenes.skies.maps.height": 16}
-        sky = draw_sky(
-            rng_for(0, "sky"), preset_settings("smoke", changes=changes).scenes.skies.maps
-        )
-    assert sky.family == "ring" and "height of the ring" in "".join(sky.parameters)
-    rows = sky.radiance_rgb.mean(axis=(1, 2))
+        settings = preset_settings("smoke", changes=changes).scenes.skies.maps
+        (family, radiance_rgb), draws = with_draws(draw_sky, rng_for(0, "sky"), settings)
+    assert family == "ring" and "height of the ring" in "".join(draws)
+    rows = radiance_rgb.mean(axis=(1, 2))
     assert np.unravel_index(rows.argmax(), rows.shape)[0] <= 8 and rows.min() > 0
 
 

@@ -15,7 +15,6 @@ from pipeline.exchange.exports.pictures import stands_alone
 from storage.conventions import preview_srgb8
 from storage.dataset.dataset import open_dataset
 from storage.dataset.layout import DatasetFolder
-from storage.dataset.staging import stage_scene
 from storage.records.lights import num_light_pictures, sum_of_lights
 from storage.records.objects import read_failures
 from storage.records.passes.pictures import view_passes
@@ -24,6 +23,7 @@ from tests.conftest import ROOT
 from tests.end_to_end.conftest import Trilight
 from tests.end_to_end.production_kit import SIXTEEN_SAMPLES
 from tests.foreign_packages import foreign_packages, nerfstudio_pictures
+from tests.scenes_by_hand import stage_scene
 
 BAD_INPUT = [
     (("generate", "nonsense"), "dataset preset 'nonsense' is unknown; expected one of tiny, smoke"),

@@ -23,7 +23,7 @@ import pytest
 from pipeline.generation.generation_run import Piece, ShardJob, TaskResult
 from pipeline.generation.pipeline import make_dataset
 from storage.dataset.layout import DatasetFolder
-from storage.dataset.scene_logs import decode_scene_log
+from storage.dataset.progress import decode_scene_log
 from storage.dataset.verify import verify_dataset
 from storage.errors import TrilightError
 from tests.for_each import case

@@ -35,7 +35,8 @@ def _placements(
     shell: SharedRoom, template: str, count: int = COUNT
 ) -> list[tuple[PatchPlacement, ...]]:
     rng = np.random.default_rng(0)
-    return [shell.sample_room(rng, TEMPLATES[template].parts).patches for _ in range(count)]
+    rooms = (shell.sample_room(rng, TEMPLATES[template].parts) for _ in range(count))
+    return [tuple(room.patches.values()) for room in rooms]
 
 
 def _shared_room_table(shell: SharedRoom) -> Table:
@@ -86,7 +87,8 @@ def _sides_table(stage: int, policy: Policy) -> Table:
         parts = TEMPLATES[family.template].parts
         for _ in range(100):
             patches = family.shell.sample_room(rng, parts).patches
-            for part, at in zip(parts, patches, strict=True):
+            assert tuple(patches) == parts
+            for part, at in patches.items():
                 assert at.reach == 1
                 axis = SIDES[part].axis
                 side = getattr(family.shell, part)

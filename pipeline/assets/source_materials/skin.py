@@ -35,7 +35,7 @@ from storage.errors import Rejected, TrilightError
 from storage.records.asset import Level, LevelSkin, OwnMaterials, SkinQuality
 from storage.records.lookup import texture_values
 from storage.records.packed_maps import pack_map
-from storage.records.texture import TEXTURED, Texture
+from storage.records.texture import NORMAL, TEXTURED, Texture
 from storage.seeds import rng_for
 
 _LEAST_REACH = 1e-3
@@ -112,11 +112,12 @@ def add_skin(level: Level, surface: SourceSurface, settings: OwnMaterialSettings
     _require_near(quality, level.record.budget, settings)
     glow = level_emission(mesh, surface, reach)
     _require_lawful(baked.textures, glow)
-    first, second, third = map(pack_map, baked.textures)
+    textures = dict(zip(TEXTURED, baked.textures, strict=True))
+    if baked.normal is not None:
+        textures[NORMAL] = baked.normal
     skin = LevelSkin(
         uv=baked.uv,
-        packed=(first, second, third),
-        packed_normal=None if baked.normal is None else pack_map(baked.normal),
+        packed={name: pack_map(texture) for name, texture in textures.items()},
         quality=quality,
         emission=glow,
     )

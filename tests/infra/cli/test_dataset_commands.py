@@ -27,8 +27,7 @@ from pipeline.renders.mitsuba_variant import choose_variant
 from storage.dataset.dataset import open_dataset
 from storage.dataset.layout import DatasetFolder
 from storage.dataset.manifest import write_manifest
-from storage.dataset.progress import announce_objects, write_asked
-from storage.dataset.scene_logs import log_scene
+from storage.dataset.progress import announce_objects, log_scene, write_asked
 from storage.dataset.shard import write_shard
 from storage.digests import sha256_hex
 from storage.errors import TrilightError

@@ -334,11 +334,10 @@ def test_what_is_shown_is_what_the_printed_command_selects(
             if words:
                 assert words[:4] == ["trilight", "shards", "select", str(dataset.folder.root)]
                 assert Path(options["--out"]) == dataset.folder.root.with_name("a set-selected")
-            selection = Selection(
-                split=options.get("--split"),
-                template=options.get("--template"),
-                where=options.get("--where"),
-            )
+            stated: dict[str, Any] = {
+                name: options.get(f"--{name}") for name in ("split", "template", "where")
+            }
+            selection = Selection(**stated)
             whole = FinishedDataset(dataset.store, dataset.manifest, {})
             assert {row.pop("views") for row in found["rows"]} <= {2}
             assert found["rows"] == list_scenes(whole, selection)

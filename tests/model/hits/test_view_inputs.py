@@ -269,7 +269,7 @@ def test_noise_goes_and_light_and_surfaces_stay() -> None:
         albedo=(coverage * (guides[0] + guides[1])).numpy(),
         normal=(coverage * noisy[0, ..., Channel.NORMAL]).numpy(),
     )
-    filtered = denoise((_light(noisy) / UNIT).numpy(), features, "fast", threads=1)
+    filtered = denoise((_light(noisy) / UNIT).numpy(), features, "fast")
     np.testing.assert_array_equal(_light(clean), UNIT.numpy() * filtered)
     nothing = noisy[0, ..., 0] == 0
     assert nothing.any() and not _light(clean)[nothing].any(), "nothing is met: black"

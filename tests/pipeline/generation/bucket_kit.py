@@ -14,13 +14,13 @@ from pipeline.generation.dataset_writer import DatasetWriter, begin_or_resume_da
 from pipeline.presets.registry import preset_settings
 from pipeline.shards.pack_shards import PublishedShards, pack_shard
 from storage.dataset.layout import dataset_folder
-from storage.dataset.staging import stage_scene
 from storage.records.objects import Failure
 from storage.records.sample import sample_key
 from storage.remote import retries, store
 from storage.remote import url as remote_url
 from tests.pipeline.generation.test_dataset_writer import ENVIRONMENT, _build, _sample
 from tests.s3_server import CREDENTIALS, control
+from tests.scenes_by_hand import stage_scene
 
 OUT = "s3://shards/set"
 

@@ -23,7 +23,7 @@ from pipeline.shards import pack_shards as pack
 from pipeline.shards.pack_shards import pack_shard
 from storage.dataset.dataset import open_dataset
 from storage.dataset.progress import read_status
-from storage.dataset.staging import is_staged, stage_scene
+from storage.dataset.staging import is_staged
 from storage.dataset.verify import verify_dataset
 from storage.errors import TrilightError
 from storage.records.objects import Failure, decode_failures
@@ -38,7 +38,7 @@ from tests.pipeline.generation.test_dataset_writer import (
 )
 from tests.pipeline.generation.tiny_scenes_kit import tiny_order, without_probe
 from tests.s3_server import control
-from tests.scenes_by_hand import tiny_sample
+from tests.scenes_by_hand import stage_scene, tiny_sample
 
 FIRST, SECOND = "train-000000.tar", "train-000001.tar"
 

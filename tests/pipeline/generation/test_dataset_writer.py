@@ -23,14 +23,14 @@ from storage.dataset.settings import SplitSettings
 from storage.dataset.shard import scan_members
 from storage.dataset.shard_notes import note_of
 from storage.dataset.splits import scenes_of_shard, shard_name
-from storage.dataset.staging import is_staged, stage_scene
+from storage.dataset.staging import is_staged
 from storage.dataset.verify import verify_dataset
 from storage.errors import TrilightError
 from storage.records.objects import Failure
 from storage.records.sample import Sample, sample_key
 from tests.for_each import for_each
 from tests.pipeline.documents.dataset_by_hand import locked
-from tests.scenes_by_hand import tiny_sample, tiny_scene
+from tests.scenes_by_hand import stage_scene, tiny_sample, tiny_scene
 
 ENVIRONMENT = {"mitsuba_variant": "llvm_ad_rgb", "libraries": {"mitsuba": "3.9.1"}}
 LOCKED = locked("a")

@@ -26,11 +26,11 @@ from pipeline.shards.finished_dataset import open_finished
 from pipeline.shards.pack_shards import PublishedShards, pack_shard
 from storage.dataset import layout
 from storage.dataset.dataset import Dataset, open_dataset
-from storage.dataset.derived import derivation_of
 from storage.dataset.layout import DatasetFolder
 from storage.dataset.manifest import Manifest, index_shard, write_manifest
+from storage.dataset.planned import derivation_of
 from storage.dataset.shard import open_shard, write_shard
-from storage.dataset.staging import read_staged_scene, stage_scene
+from storage.dataset.staging import read_staged_scene
 from storage.dataset.verify import verify_dataset
 from storage.digests import sha256_hex
 from storage.errors import TrilightError
@@ -49,6 +49,7 @@ from storage.records.scene import Scene
 from tests.for_each import for_each
 from tests.pipeline.documents.dataset_by_hand import furnished, locked, sample
 from tests.pipeline.generation.test_dataset_writer import ENVIRONMENT, _build
+from tests.scenes_by_hand import stage_scene
 from tests.textured_by_hand import (
     colour_texture,
     number_texture,

@@ -25,7 +25,7 @@ from pipeline.presets.registry import preset_settings
 from pipeline.presets.settings import DatasetSettings
 from pipeline.scenes.compose import compose_scene
 from pipeline.scenes.triangle_budget import PooledAsset, draw_rows, fits_of
-from scene_templates.user_maps import UserMap, draw_user_map
+from scene_templates.textures import UserMap, draw_user_map
 from storage.conventions import SPLITS
 from storage.dataset.verify import check_sample
 from storage.errors import Rejected, TrilightError
@@ -35,12 +35,12 @@ from storage.records.objects import (
     SKY,
     TEXTURE,
     LockedObject,
-    decode_objects_lock,
     encode_objects_lock,
     read_objects_lock,
 )
 from storage.records.texture import MapSource
 from storage.seeds import SceneKey, rng_for
+from storage.typed_json import read_json_lines
 from tests.infra.child_here import ChildHere
 from tests.pipeline.documents.dataset_by_hand import locked, write_dataset
 from tests.pipeline.generation.frozen_kit import BUILD, SOURCE, asked, begun, frozen, prepared
@@ -274,9 +274,9 @@ def test_rows_have_splits_by_content_and_copies_stay_together(accepted: Accepted
         assert rows[copy].split == rows[first].split
     for kind in (TEXTURE, SKY):
         assert {row.split for row in rows.values() if row.kind == kind} == set(SPLITS)
-    assert decode_objects_lock(encode_objects_lock(rows.values()), "lock") == sorted(
-        rows.values(), key=lambda row: row.uid
-    )
+    lock = encode_objects_lock(rows.values())
+    in_order = sorted(rows.values(), key=lambda row: row.uid)
+    assert read_json_lines(lock, LockedObject, "lock") == in_order
 
 
 def test_no_texture_or_map_of_test_is_in_train(

@@ -27,7 +27,7 @@ from storage.dataset.manifest import ShardEntry, index_shard
 from storage.dataset.progress import read_progress, read_status
 from storage.dataset.shard import write_shard
 from storage.dataset.shard_notes import ShardNote, note_shard, noted_shard
-from storage.dataset.staging import is_staged, read_staged_scene, stage_scene
+from storage.dataset.staging import is_staged, read_staged_scene
 from storage.dataset.statistics import Statistics
 from storage.errors import TrilightError
 from storage.file_locks import hold_lock
@@ -40,6 +40,7 @@ from tests.pipeline.generation.test_dataset_writer import (
     make_tiny_shard,
 )
 from tests.pipeline.generation.tiny_scenes_kit import shard_job
+from tests.scenes_by_hand import stage_scene
 
 NAME = "train-000000.tar"
 

@@ -11,7 +11,7 @@ import pytest
 
 from pipeline.presets.frozen_v1 import PRESETS_FOR_JUDGING, RENDERFORMER_PRESETS
 from pipeline.presets.registry import DATASET_PRESETS, frozen_note, object_source, preset_settings
-from pipeline.presets.settings import DatasetSettings, differences
+from pipeline.presets.settings import DatasetSettings
 from scene_templates import placement
 from scene_templates import sample_lights as emitters
 from scene_templates.sample_camera import sample_camera
@@ -23,6 +23,7 @@ from storage.digests import sha256_hex
 from storage.errors import TrilightError
 from storage.seeds import rng_for
 from storage.settings.described import from_record
+from storage.settings.overrides import differences
 from tests.for_each import for_each
 from tests.scene_templates.balls import one_drawn
 

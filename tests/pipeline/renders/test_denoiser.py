@@ -68,13 +68,14 @@ def test_noise_goes_edges_stay_and_what_has_no_light_stays_black() -> None:
     assert (denoise(noisy, nothing, "high")[8:] > 0).all()
 
 
-def test_threads_filter_at_the_same_time() -> None:
+def test_threads_filter_at_the_same_time(monkeypatch: pytest.MonkeyPatch) -> None:
     """Each has its own memory: a shared one would mix their pictures."""
+    monkeypatch.setattr("storage.denoiser._threads", 1)
     _, noisy, features = _noisy_step()
     pictures = [noisy * np.float32(scale) for scale in (0.5, 1, 2, 4)] * 4
-    expected = [denoise(each, features, "fast", 1) for each in pictures]
+    expected = [denoise(each, features, "fast") for each in pictures]
     with ThreadPoolExecutor(4) as pool:
-        found = list(pool.map(lambda each: denoise(each, features, "fast", 1), pictures))
+        found = list(pool.map(lambda each: denoise(each, features, "fast"), pictures))
     np.testing.assert_array_equal(found, expected)
 
 

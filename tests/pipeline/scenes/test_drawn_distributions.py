@@ -15,7 +15,6 @@ import trimesh
 from numpy.typing import NDArray
 
 from pipeline.presets.registry import preset_settings
-from pipeline.presets.settings import differences
 from pipeline.scenes.pieces import object_piece, shell_piece
 from pipeline.scenes.triangle_budget import PooledAsset
 from scene_templates.layout import ShellPart, SurfaceLook
@@ -24,6 +23,7 @@ from scene_templates.rooms import PATCH_FACES, SIDES, patch
 from scene_templates.sample_layout import scene_plan
 from storage.records.material import DIFFUSE, EMISSION, ROUGHNESS
 from storage.records.scene import Scene, SceneObject
+from storage.settings.overrides import differences
 from tests.pipeline.scenes.small_pool import (
     LOOK,
     first_scene,

@@ -83,16 +83,16 @@ def _scene(settings: SceneSettings, index: int, pool: list[PooledAsset] | None =
 def _skinned(level: Level, seed: int = 0, every: int = 0, *, mapped: bool = False) -> Level:
     """Return a level with noise on it, whose every so-manieth triangle emits, ever redder."""
     drawn = np.random.default_rng(seed).uniform(0, 0.5, (4, 4, 7)).astype(np.float32)
-    parts = (slice(0, 3), slice(3, 6), slice(6, 7))
-    first, second, third = (pack_map(Texture(texels=drawn[..., part])) for part in parts)
+    parts = {"diffuse": slice(0, 3), "specular": slice(3, 6), "roughness": slice(6, 7)}
+    packed = {name: pack_map(Texture(texels=drawn[..., part])) for name, part in parts.items()}
+    if mapped:
+        packed["normal"] = pack_map(bumps(seed))
     uv = np.random.default_rng(seed).random((len(level.faces), 3, 2)).astype(np.float32)
-    skin = LevelSkin(uv=uv, packed=(first, second, third), quality=QUALITY)
+    skin = LevelSkin(uv=uv, packed=packed, quality=QUALITY)
     if every:
         emission = np.zeros((len(level.faces), 3), np.float32)
         emission[::every] = np.linspace([1, 0.5, 0.2], [3, 0.1, 0], len(emission[::every]))
         skin = dataclasses.replace(skin, emission=emission)
-    if mapped:
-        skin = dataclasses.replace(skin, packed_normal=pack_map(bumps(seed)))
     return dataclasses.replace(level, skin=skin)
 
 
@@ -385,7 +385,7 @@ def test_an_object_whose_textures_break_a_law_costs_scenes_by_its_name() -> None
     entries, level = _pool()[1:2], _skinned(small_pool()[1].asset.levels[0])
     assert level.skin is not None
     broken = pack_map(Texture(texels=np.full((1, 1, 3), np.nan, np.float32)))
-    skin = dataclasses.replace(level.skin, packed=(broken, *level.skin.packed[1:]))
+    skin = dataclasses.replace(level.skin, packed={**level.skin.packed, "diffuse": broken})
     levels = [dataclasses.replace(level, skin=skin)]
     with pytest.raises(Rejected, match=f"^law_broken: object {entries[0].locked.uid}: .*diffuse"):
         source_skins(entries, levels, OWN.materials, SceneKey(0, 0))

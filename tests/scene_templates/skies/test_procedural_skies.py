@@ -3,16 +3,17 @@
 import hashlib
 import itertools
 import math
+from collections.abc import Mapping
 from typing import Any
 
 import numpy as np
 import pytest
+from numpy.typing import NDArray
 
 from scene_templates.skies.procedural_skies import (
     OUR_SKIES,
     SKIES,
     SkyDraws,
-    SkyMap,
     SkyMapSettings,
     draw_sky,
 )
@@ -20,15 +21,21 @@ from scene_templates.skies.texels import SkyTexels
 from storage.seeds import rng_for
 from storage.settings.overrides import apply_overrides
 from tests.for_each import for_each
+from tests.scene_templates.drawn_values import with_draws
 from tests.scene_templates.skies.test_skies import uv_of
 from tests.scene_templates.statistics import merged, require_plausible, stated_table
 
 MANY = 60
 
 
-def _sky(family: str, seed: int, **changes: Any) -> SkyMap:
+def _with_draws(family: str, seed: int, **changes: Any) -> tuple[NDArray, Mapping[str, Any]]:
     settings = apply_overrides(SkyMapSettings(families=(family,), height=32), changes)
-    return draw_sky(rng_for(seed, "sky"), settings)
+    (_, radiance_rgb), draws = with_draws(draw_sky, rng_for(seed, "sky"), settings)
+    return radiance_rgb, draws
+
+
+def _sky(family: str, seed: int, **changes: Any) -> NDArray:
+    return _with_draws(family, seed, **changes)[0]
 
 
 @for_each("family", OUR_SKIES)
@@ -52,37 +59,35 @@ def test_parameters_are_distributed_as_stated(family: str) -> None:
 @for_each("family", OUR_SKIES)
 def test_the_mean_over_the_sphere_is_the_stated_one(family: str) -> None:
     for seed, height in enumerate((1, 2, 8, 33, 64)):
-        sky = _sky(family, seed, height=height, coloured_share=float(seed % 2))
-        found = sky.radiance_rgb
+        found, draws = _with_draws(family, seed, height=height, coloured_share=float(seed % 2))
         assert found.shape == (height, 2 * height, 3) and found.dtype == np.float32
         assert np.isfinite(found).all() and (found >= 0).all()
         rows = (0.5 - (np.arange(height + 1)) / height) * math.pi
         weights = (np.sin(rows[:-1]) - np.sin(rows[1:])) / 2
         mean = (found.astype(float).mean(axis=(1, 2)) * weights).sum()
         # texels round to float32: 6e-8 each
-        assert mean == pytest.approx(sky.parameters["mean radiance"][0], rel=1e-6)
+        assert mean == pytest.approx(draws["mean radiance"][0], rel=1e-6)
 
 
 def test_skies_without_light_and_with_suns_of_a_million_are_finite() -> None:
     for family in OUR_SKIES:
-        assert (_sky(family, 0, mean_radiance=[0.0, 0.0]).radiance_rgb == 0).all(), family
+        assert (_sky(family, 0, mean_radiance=[0.0, 0.0]) == 0).all(), family
     sky = _sky("sun_and_sky", 0, height=256, sun_to_sky=[1e6, 1e6], mean_radiance=[1e3, 1e3])
-    assert np.isfinite(sky.radiance_rgb).all()
-    assert sky.radiance_rgb.max() > 1e6
-    found = np.mean([_sky("clouds", seed).radiance_rgb for seed in range(12)], axis=(0, 2, 3))
+    assert np.isfinite(sky).all()
+    assert sky.max() > 1e6
+    found = np.mean([_sky("clouds", seed) for seed in range(12)], axis=(0, 2, 3))
     assert found[0] > 1.3 * found[15]
 
 
 @for_each("family", OUR_SKIES)
 def test_the_same_seed_is_the_same_sky_at_every_height(family: str) -> None:
-    coarse, fine = _sky(family, 1), _sky(family, 1, height=64)
-    assert coarse.parameters == fine.parameters
+    (coarse, draws), (fine, again) = (_with_draws(family, 1, height=each) for each in (32, 64))
+    assert draws == again
     moments = [
-        SkyTexels(len(sky.radiance_rgb)).flux(
-            sky.radiance_rgb.astype(float).mean(axis=-1)[..., None]
-            * SkyTexels(len(sky.radiance_rgb)).directions
+        SkyTexels(len(sky)).flux(
+            sky.astype(float).mean(axis=-1)[..., None] * SkyTexels(len(sky)).directions
         )
-        / sky.parameters["mean radiance"][0]
+        / draws["mean radiance"][0]
         for sky in (coarse, fine)
     ]
     # the vector irradiance, of at most 4 pi times the mean; spots and edges lie within a texel of
@@ -93,7 +98,7 @@ def test_the_same_seed_is_the_same_sky_at_every_height(family: str) -> None:
 @for_each("family", OUR_SKIES)
 def test_there_is_no_seam_where_the_edges_meet(family: str) -> None:
     """Nowhere are steps over the seam larger than all steps of maps that hold it elsewhere."""
-    found = np.log1p(np.stack([_sky(family, seed, height=64).radiance_rgb for seed in range(6)]))
+    found = np.log1p(np.stack([_sky(family, seed, height=64) for seed in range(6)]))
     seam = np.square(found[:, :, 0] - found[:, :, -1]).mean()
     inside = np.square(np.diff(found, axis=2)).mean(axis=(0, 1, 3))
     # azimuths are uniform, so the seam is one of 128 columns like any other
@@ -116,18 +121,18 @@ DIGESTS = {
 def test_bytes_are_the_same_everywhere() -> None:
     """Also as other processors compute them: tests/elsewhere.py. Seeds decide them all."""
     for family in OUR_SKIES:
-        made = [_sky(family, seed, height=64).radiance_rgb.tobytes() for seed in range(4)]
+        made = [_sky(family, seed, height=64).tobytes() for seed in range(4)]
         assert hashlib.sha256(b"".join(made)).hexdigest()[:16] == DIGESTS[family], family
-        assert len({_sky(family, seed).radiance_rgb.tobytes() for seed in (3, 4)}) == 2, family
+        assert len({_sky(family, seed).tobytes() for seed in (3, 4)}) == 2, family
 
 
 def test_the_sun_is_the_brightest_texel_and_where_it_was_drawn() -> None:
     height = 64
     for seed in range(30):
-        sky = _sky("sun_and_sky", seed, height=height, sun_to_sky=[2.0, 8.0])
-        brightest = np.argmax(sky.radiance_rgb.sum(axis=-1))
+        sky, draws = _with_draws("sun_and_sky", seed, height=height, sun_to_sky=[2.0, 8.0])
+        brightest = np.argmax(sky.sum(axis=-1))
         row, column = np.unravel_index(brightest, (height, 2 * height))
-        (towards,) = sky.parameters["sun"]
+        (towards,) = draws["sun"]
         u, v = uv_of(np.array(towards))
         assert abs((1 - v) * height - (row + 0.5)) <= 1
         across = abs(u * 2 * height - (column + 0.5))

@@ -21,6 +21,7 @@ from storage.records.scene import Scene
 from storage.seeds import SceneKey, rng_for
 from tests.for_each import for_each
 from tests.pipeline.scenes.small_pool import first_scene, small_pool
+from tests.scene_templates.drawn_values import with_draws
 from tests.scene_templates.statistics import choices, require_plausible, share, uniform
 
 
@@ -183,13 +184,14 @@ def test_colours_are_positive_with_a_mean_of_1_and_no_jump() -> None:
 
 def test_ours_are_drawn_with_brightness_and_colours_as_stated() -> None:
     settings = SkyMapSettings(height=1, coloured_share=0.4, mean_radiance=(1.0, 3.0))
-    found = [draw_sky(rng_for(seed, "sky"), settings) for seed in range(400)]
-    coloured = [sky.parameters["coloured lights"] == (True,) for sky in found]
+    found = [with_draws(draw_sky, rng_for(seed, "sky"), settings) for seed in range(400)]
+    families = [family for (family, _), _ in found]
+    coloured = [draws["coloured lights"] == (True,) for _, draws in found]
     require_plausible(
         {
-            "families": choices([sky.family for sky in found], dict.fromkeys(OUR_SKIES, 1.0)),
+            "families": choices(families, dict.fromkeys(OUR_SKIES, 1.0)),
             "coloured": share(coloured, 0.4),
-            "mean": uniform([float(sky.radiance_rgb.mean()) for sky in found], 1.0, 3.0),
+            "mean": uniform([float(sky.mean()) for (_, sky), _ in found], 1.0, 3.0),
         }
     )
     assert SkyMapSettings().families == OUR_SKIES == tuple(SKIES)

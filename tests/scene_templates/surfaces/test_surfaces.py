@@ -18,6 +18,7 @@ from scene_templates.surfaces.texels import Texels, stones
 from scene_templates.textures import TexturedLook, TextureSettings, draw_look
 from storage.seeds import rng_for
 from tests.for_each import for_each
+from tests.scene_templates.drawn_values import with_draws
 from tests.scene_templates.statistics import choices, require_plausible, share, uniform
 
 
@@ -106,10 +107,9 @@ def test_finishes_are_grey_but_for_metal_mixed_by_area_and_toned() -> None:
 def _shares(family: str, seed: int, first: str, second: str) -> float:
     """Return how much of a surface is `second`, from the colours of both."""
     settings = SurfaceMapSettings(families=(family,), size=256, natural_share=0.0)
-    maps = draw_surface(rng_for(seed, "laid"), settings)
+    maps, draws = with_draws(draw_surface, rng_for(seed, "laid"), settings)
     ends = [
-        np.array(maps.parameters[f"{name}: any colour"][0])
-        * (1 - maps.parameters[f"{name}: specular share"][0])
+        np.array(draws[f"{name}: any colour"][0]) * (1 - draws[f"{name}: specular share"][0])
         for name in (first, second)
     ]
     channel = int(np.argmax(np.abs(ends[1] - ends[0])))
@@ -125,8 +125,8 @@ def test_checkers_are_half_and_half_and_bands_have_their_share() -> None:
         )
     for seed in range(8):
         settings = SurfaceMapSettings(families=("stripes",), size=256, natural_share=0.0)
-        maps = draw_surface(rng_for(seed, "laid"), settings)
-        stated = maps.parameters["share of the bands"][0]
+        _, draws = with_draws(draw_surface, rng_for(seed, "laid"), settings)
+        stated = draws["share of the bands"][0]
         # two edges a band, each known to a sixteenth of a texel of at least 13 a band
         assert _shares("stripes", seed, "ground", "band") == pytest.approx(stated, abs=0.02)
 
@@ -155,9 +155,9 @@ def test_a_level_is_exceeded_by_its_share(share: float) -> None:
 
 def test_ours_are_drawn_equally_often_and_natural_ones_as_often_as_stated() -> None:
     settings = SurfaceMapSettings(size=1, natural_share=0.4)
-    found = [draw_surface(rng_for(seed, "surface"), settings) for seed in range(400)]
-    natural = [maps.parameters["natural colours"] == (True,) for maps in found]
-    families = [maps.family for maps in found]
+    found = [with_draws(draw_surface, rng_for(seed, "surface"), settings) for seed in range(400)]
+    natural = [draws["natural colours"] == (True,) for _, draws in found]
+    families = [maps.family for maps, _ in found]
     require_plausible(
         {
             "families": choices(families, dict.fromkeys(OUR_SURFACES, 1.0)),
@@ -172,8 +172,8 @@ def test_colours_that_are_not_natural_are_in_the_stated_range() -> None:
     settings = SurfaceMapSettings(
         families=("checker",), size=64, natural_share=0.0, albedo=(0.4, 0.4)
     )
-    maps = draw_surface(rng_for(0, "surface"), settings)
-    assert "light square: any colour" in maps.parameters
+    maps, draws = with_draws(draw_surface, rng_for(0, "surface"), settings)
+    assert "light square: any colour" in draws
     # diffuse = (1 - share) x base: the same in every channel, as the base colour is
     assert np.ptp(maps.diffuse_rgb, axis=-1).max() == 0
 

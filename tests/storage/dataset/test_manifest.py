@@ -22,7 +22,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from storage.conventions import SPLITS
-from storage.dataset import progress, scene_logs
+from storage.dataset import progress
 from storage.dataset.dataset import open_dataset
 from storage.dataset.layout import DatasetFolder
 from storage.dataset.manifest import (
@@ -34,16 +34,18 @@ from storage.dataset.manifest import (
     write_manifest,
 )
 from storage.dataset.progress import (
+    SceneLog,
     announce_downloads,
     announce_objects,
     count_object,
+    log_scene,
     missing_shards,
     read_progress,
     read_status,
+    sample_logs,
     tell_views,
     write_asked,
 )
-from storage.dataset.scene_logs import SceneLog, log_scene, sample_logs
 from storage.dataset.settings import SplitSettings
 from storage.dataset.shard_notes import note_of
 from storage.dataset.splits import (
@@ -430,22 +432,21 @@ def test_of_many_logs_few_are_read_and_the_last_scenes_are_all_there(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     folder = DatasetFolder(tmp_path)
-    assert sample_logs(folder).core_s is None
+    assert sample_logs(folder) == ([], None)
     ends_s = [1000.0 + 7.0 * ((5 * number) % 24) for number in range(24)]  # in no order
     for number, end_s in enumerate(ends_s):
         _write_log(folder, number, end_s=end_s)
     (folder.logs / "asked.json").write_text("[]")
-    every = sample_logs(folder)
-    assert every.core_s == 24 * 2 * 10 * 2 and len(every.last) == 48
-    read, decode = Counter[str](), scene_logs.decode_scene_log
+    every, core_s = sample_logs(folder)
+    assert core_s == 24 * 2 * 10 * 2 and len(every) == 48
+    read, decode = Counter[str](), progress.decode_scene_log
 
     def counted(text: str) -> Iterator[SceneLog]:
         read["logs"] += 1
         return decode(text)
 
-    monkeypatch.setattr(scene_logs, "decode_scene_log", counted)
-    monkeypatch.setattr(scene_logs, "LAST_SCENES", 5)
-    monkeypatch.setattr(scene_logs, "MOST_LOGS", 6)
-    some = sample_logs(folder)
-    assert read["logs"] == 5 + 6 and some.core_s == every.core_s
-    assert some.last == every.last[-5:]
+    monkeypatch.setattr(progress, "decode_scene_log", counted)
+    monkeypatch.setattr(progress, "LAST_SCENES", 5)
+    monkeypatch.setattr(progress, "MOST_LOGS", 6)
+    assert sample_logs(folder) == (every[-5:], core_s)
+    assert read["logs"] == 5 + 6

@@ -6,7 +6,7 @@ from numpy.typing import NDArray
 from scipy.interpolate import RegularGridInterpolator
 
 from storage.optics import multiscatter
-from storage.optics.fresnel import constant_albedos
+from storage.optics.bsdf import constant_albedos
 from storage.optics.multiscatter import (
     ROUGHNESS_STEPS,
     X_STEPS,

@@ -286,8 +286,9 @@ def test_a_map_is_unpacked_once(monkeypatch: pytest.MonkeyPatch) -> None:
         one.texels[0] = 0
 
 
-def test_memory_is_bounded_and_the_oldest_goes() -> None:
-    held, made = HeldMaps(most_bytes=1000), list[int]()
+def test_memory_is_bounded_and_the_oldest_goes(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("storage.records.packed_maps.HELD_BYTES", 1000)
+    held, made = HeldMaps(), list[int]()
 
     def asked(number: int, side: int = 10) -> Texture:
         def unpack() -> Texture:
