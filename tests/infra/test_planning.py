@@ -7,7 +7,7 @@ from pathlib import Path
 
 import pytest
 
-from infra import doctor
+from infra.cli import doctor
 from infra.planning import MeasuredScenes, describe_run, measure_scenes, predict_cost
 from pipeline.executors.threads import ThreadRunner
 from pipeline.flows import prefect_server
