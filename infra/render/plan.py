@@ -5,11 +5,10 @@ video. Videos are H.264 in .mp4, which every player reads, or animated .webp. We
 and is shown by browsers; MP4 is written by FFmpeg through PyAV.
 """
 
-import dataclasses
 import importlib.util
 import io
 import tempfile
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from fractions import Fraction
 from pathlib import Path
@@ -167,20 +166,6 @@ _RESOLUTION = 512
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
-class Shot:
-    """One picture to render."""
-
-    source: SceneSource
-    camera: Camera | int
-    """Camera, or the row of a camera of the scene."""
-    exrs: Mapping[str, Path]
-    """Paths of the EXR files by the name of their renderer."""
-    png: Path
-    keep: bool
-    """True to keep existing files of an equal picture."""
-
-
-@dataclass(frozen=True, kw_only=True, eq=False)
 class RenderPlan:
     """Pictures, renderers and files of a render, with all defaults resolved."""
 
@@ -196,7 +181,7 @@ class RenderPlan:
     """Width of every picture in pixels."""
     look: Look
     output: OutputPaths
-    shots: Sequence[Shot]
+    pairs: Pairs
     """Pictures in order; those of one scene are consecutive."""
     fps: int
     choice: Choice | None = None
@@ -233,22 +218,10 @@ def plan_render(options: RenderOptions, reader: SceneReader) -> RenderPlan:
         resolution=resolution,
         look=look,
         output=output,
-        shots=list(shots(pairs, output, [renderer.name for renderer in renderers])),
+        pairs=pairs,
         fps=options.fps,
         choice=choice,
     )
-
-
-def shots(pairs: Pairs, output: OutputPaths, names: list[str]) -> Iterator[Shot]:
-    """Yield the shot of each pair, with its files by the names of renderers."""
-    for index, (source, camera) in enumerate(pairs):
-        stem = output.stem_of(index)
-        suffixes = {name: f".{name}.exr" if len(names) > 1 else ".exr" for name in names}
-        exrs = {name: Path(f"{stem}{suffix}") for name, suffix in suffixes.items()}
-        png = Path(f"{stem}.png")
-        if isinstance(camera, Camera):  # of an orbit or a file: the scene has no such row
-            camera = dataclasses.replace(camera, view=None, name=f"picture {png.stem}")
-        yield Shot(source=source, camera=camera, exrs=exrs, png=png, keep=output.is_sequence)
 
 
 def _network_and_width(options: RenderOptions) -> tuple[str | None, int]:

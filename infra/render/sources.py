@@ -5,7 +5,6 @@ from collections.abc import Sequence
 from pathlib import Path
 
 import numpy as np
-from numpy.typing import NDArray
 
 from pipeline.exchange.formats import readable_suffixes
 from pipeline.exchange.open_scene import SceneSource, scene_source
@@ -96,7 +95,16 @@ def orbit(scene: Scene, start: Camera, count: int, arc_deg: float) -> list[Camer
         angles_deg = 360 * np.arange(count) / count
     else:
         angles_deg = np.linspace(-arc_deg / 2, arc_deg / 2, count) if count > 1 else np.zeros(1)
-    return [_orbit_camera(start, target, float(np.radians(angle_deg))) for angle_deg in angles_deg]
+    cameras = []
+    for angle_rad in np.radians(angles_deg):
+        cos = np.cos(angle_rad)
+        sin = np.sin(angle_rad)
+        rotation = np.array([[cos, -sin, 0], [sin, cos, 0], [0, 0, 1]])  # about the vertical axis
+        turned = pose.copy()
+        turned[:3, :3] = np.einsum("ij,jk->ik", rotation, pose[:3, :3])
+        turned[:3, 3] = np.einsum("ij,j->i", rotation, eye - target) + target
+        cameras.append(Camera(c2w=turned.astype(np.float32), fov_deg=start.fov_deg))
+    return cameras
 
 
 def camera_path(text: str, reader: SceneReader, view: int) -> list[Camera]:
@@ -117,14 +125,3 @@ def camera_path(text: str, reader: SceneReader, view: int) -> list[Camera]:
     return [
         Camera(c2w=pose, fov_deg=float(angle)) for pose, angle in zip(c2w, fov_deg, strict=True)
     ]
-
-
-def _orbit_camera(start: Camera, target: NDArray[np.float64], angle_rad: float) -> Camera:
-    """Return a camera rotated about the vertical axis through `target`, by radians."""
-    cos = np.cos(angle_rad)
-    sin = np.sin(angle_rad)
-    rotation = np.array([[cos, -sin, 0], [sin, cos, 0], [0, 0, 1]])
-    pose = start.c2w.astype(np.float64)
-    pose[:3, :3] = np.einsum("ij,jk->ik", rotation, pose[:3, :3])
-    pose[:3, 3] = np.einsum("ij,j->i", rotation, pose[:3, 3] - target) + target
-    return Camera(c2w=pose.astype(np.float32), fov_deg=start.fov_deg)

@@ -407,19 +407,16 @@ class SceneHandlers:
         if job.image is None:
             raise NotFound("the picture has not begun yet.")
         if request.query.get("as") == "error":
-            pixels = self._error_of(job)
+            reference = self.queue.reference(job)
+            if reference is None or agreement_db(job, reference) is None:
+                raise TrilightError("There is nothing to judge this picture by yet.")
+            assert reference.image is not None
+            pixels = error_picture(job.image.radiance_rgb, reference.image.radiance_rgb)
         elif isinstance(job.image, PassImage):
             pixels = job.image.pixels
         else:
             pixels = _tone_map(job.image.radiance_rgb, request.query)
         return Response(body=encode_png(pixels), kind="image/png")
-
-    def _error_of(self, job: RenderJob) -> NDArray[np.uint8]:
-        reference = self.queue.reference(job)
-        if agreement_db(job, reference) is None:
-            raise TrilightError("There is nothing to judge this picture by yet.")
-        assert job.image is not None and reference is not None and reference.image is not None
-        return error_picture(job.image.radiance_rgb, reference.image.radiance_rgb)
 
     def _export(self, request: Request) -> Response:
         body = request.body if isinstance(request.body, dict) else {}

@@ -25,7 +25,7 @@ from tests.pipeline.generation.tiny_scenes_kit import Undocumented, tiny_order, 
 
 
 def _measured(core_s: tuple[float, ...], num_bytes: int = 150_000) -> MeasuredScenes:
-    return MeasuredScenes(core_s=core_s, num_bytes=(num_bytes,) * len(core_s), num_views=4)
+    return MeasuredScenes(core_s=core_s, num_bytes=(num_bytes,) * len(core_s))
 
 
 def test_equal_scenes_add_up_exactly() -> None:
