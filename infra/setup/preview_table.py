@@ -11,7 +11,7 @@ import json
 import sys
 import tempfile
 import time
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -81,7 +81,13 @@ def main() -> None:
     errors = dict[int, Errors]()
     costs = dict[int, Costs]()
     network = NeuralRenderer.load("builtin:tokens", device="cpu")
-    with _children() as (child, rendering):
+    with (
+        tempfile.TemporaryDirectory() as name,
+        contextlib.closing(
+            composing_child(held_out_settings(), BENCHMARK, Path(name), threads=1)
+        ) as child,
+        contextlib.closing(RenderChild(choose_variant(), threads=1)) as rendering,
+    ):
         renderers = {px: _renderers_at(px, network, rendering) for px in WIDTHS}
         for index in range(SCENES):
             sys.stdout.write(f"scene {index + 1} of {SCENES}\n")
@@ -126,19 +132,6 @@ def table_of(
         costs=_picture_costs(machine, list(costs.values()), np.median),
         probe=_picture_costs(machine, [costs[index] for index in PROBES], np.mean),
     )
-
-
-@contextlib.contextmanager
-def _children() -> Iterator[tuple[IsolatedChild, RenderChild]]:
-    """Yield a child that composes scenes and references, and one that renders."""
-    with (
-        tempfile.TemporaryDirectory() as name,
-        contextlib.closing(
-            composing_child(held_out_settings(), BENCHMARK, Path(name), threads=1)
-        ) as composing,
-        contextlib.closing(RenderChild(choose_variant(), threads=1)) as rendering,
-    ):
-        yield composing, rendering
 
 
 def _errors_of(

@@ -21,8 +21,7 @@ from PIL import Image
 from infra.render.path_tracer import RenderChild
 from infra.viewer import open_source
 from infra.viewer import server as viewer_server
-from infra.viewer.dataset_handlers import DatasetHandlers
-from infra.viewer.folder_handlers import THUMBNAIL_PX, FolderHandlers
+from infra.viewer.list_handlers import THUMBNAIL_PX, DatasetHandlers, FolderHandlers
 from infra.viewer.open_source import DeferredHandlers, page_of, scene_list
 from infra.viewer.server import (
     MAX_BODY_BYTES,
