@@ -20,8 +20,8 @@ from PIL import Image, ImageDraw, ImageFont
 
 from infra.cli.console import console
 from infra.render.path_tracer import PathTracer, RenderChild
+from infra.render.plan import own_camera
 from infra.render.quality import ToStatedError
-from infra.render.sources import own_camera
 from model.inference import NeuralRenderer
 from pipeline.assets.cleaning.clean import clean, normalize
 from pipeline.assets.cleaning.orient import orient_outward

@@ -19,8 +19,7 @@ from numpy.typing import NDArray
 from PIL import Image as Picture
 from PIL import ImageDraw, ImageFont
 
-from infra.render.plan import RenderPlan, write_video
-from infra.render.sources import own_camera
+from infra.render.plan import RenderPlan, own_camera, write_video
 from infra.render.tone_mapping import Look, display_pixels, enlarge
 from pipeline.documents.png import encode_png
 from pipeline.exchange.formats import FORMATS, SceneSource

@@ -22,11 +22,17 @@ from infra.render.networks import (
 )
 from infra.render.options import RenderOptions
 from infra.render.path_tracer import MOST_SCENES, PathTracer, RenderChild, RenderWorker
-from infra.render.plan import plan_render
+from infra.render.plan import (
+    camera_path,
+    orbit,
+    own_camera,
+    pair_cameras,
+    plan_render,
+    scene_sources,
+)
 from infra.render.quality import FixedSamples, ToStatedError
 from infra.render.raw_references import RawReference, true_error, true_error_db
 from infra.render.run_render import Frame, flicker
-from infra.render.sources import camera_path, orbit, own_camera, pair_cameras, scene_sources
 from model.config import hits_smoke
 from model.inference import NeuralRenderer
 from pipeline.exchange.open_scene import SceneSource

@@ -10,9 +10,16 @@ from PIL import Image as Picture
 
 from infra.render import tone_mapping as look_module
 from infra.render.networks import RendererHere, SceneHere
-from infra.render.plan import OutputPaths, RenderPlan, output_paths, write_video
+from infra.render.plan import (
+    OutputPaths,
+    RenderPlan,
+    orbit,
+    output_paths,
+    own_camera,
+    pair_cameras,
+    write_video,
+)
 from infra.render.run_render import FinishedShot, run_plan
-from infra.render.sources import orbit, own_camera, pair_cameras
 from infra.render.tone_mapping import Look, tone_mapped
 from pipeline.exchange.open_scene import SceneSource
 from storage.conventions import preview_srgb8
