@@ -37,7 +37,6 @@ from storage.dataset.verify import verify_dataset
 from storage.errors import TrilightError
 from storage.markdown import front_matter
 from storage.records.objects import read_objects_lock
-from storage.records.sample import Sample
 from storage.renderer import Camera, Renderer
 from train.evaluation.error_colors import ERROR_WHITE, error_picture
 from train.evaluation.evaluate import judge_view
@@ -220,36 +219,30 @@ def compare_scenes(
         for entry, sample in read_chosen(dataset, chosen):
             width = int(sample.radiance_rgb.shape[1])
             if width not in by_width:
-                by_width[width] = _renderers(child, width, checkpoint)
-            yield _compare_scene(sample, entry.split, by_width[width])
+                qualities = [FixedSamples(spp=spp, denoiser="fast") for spp in RIVALS]
+                by_width[width] = [
+                    NetworkRenderer(name=NETWORK, checkpoint=checkpoint, resolution=width),
+                    *(
+                        PathTracer(child, one, width, name=f"{one.count}, filtered")
+                        for one in qualities
+                    ),
+                ]
+            camera = Camera.of_scene(sample.scene, 0)
+            target = sample.radiance_rgb[0]
+            pictures = {
+                each.name: each.load(sample.scene, sample.key).render(camera).radiance_rgb
+                for each in by_width[width]
+            }
+            row = judge_view(sample, validation_scene(sample, width), 0, pictures, None)
+            yield SceneComparison(
+                key=row.key,
+                caption=f"{entry.split}, {row.template}, {row.num_triangles} triangles",
+                target_rgb=target,
+                floor_db=row.floors[METRIC],
+                pictures_rgb=pictures,
+                psnr_db={name: scores[METRIC] or 0.0 for name, scores in row.scores.items()},
+            )
             done()
-
-
-def _renderers(child: RenderChild, resolution: int, checkpoint: str) -> Sequence[Renderer]:
-    network = NetworkRenderer(name=NETWORK, checkpoint=checkpoint, resolution=resolution)
-    qualities = [FixedSamples(spp=spp, denoiser="fast") for spp in RIVALS]
-    return [
-        network,
-        *(PathTracer(child, one, resolution, name=f"{one.count}, filtered") for one in qualities),
-    ]
-
-
-def _compare_scene(sample: Sample, split: str, renderers: Sequence[Renderer]) -> SceneComparison:
-    camera = Camera.of_scene(sample.scene, 0)
-    target = sample.radiance_rgb[0]
-    pictures = {
-        each.name: each.load(sample.scene, sample.key).render(camera).radiance_rgb
-        for each in renderers
-    }
-    row = judge_view(sample, validation_scene(sample, len(target)), 0, pictures, None)
-    return SceneComparison(
-        key=row.key,
-        caption=f"{split}, {row.template}, {row.num_triangles} triangles",
-        target_rgb=target,
-        floor_db=row.floors[METRIC],
-        pictures_rgb=pictures,
-        psnr_db={name: scores[METRIC] or 0.0 for name, scores in row.scores.items()},
-    )
 
 
 if __name__ == "__main__":

@@ -1,8 +1,9 @@
 """Plan of one call of `trilight render`: all decisions, before any picture is rendered.
 
 A source may hold many scenes and many cameras. The files of `--out` are one picture, or a folder of
-numbered pictures with or without a video. Videos are H.264 in .mp4, which every player reads, or animated .webp. WebP needs only Pillow
-and is shown by browsers; MP4 is written by FFmpeg through PyAV.
+numbered pictures with or without a video. Videos are H.264 in .mp4, which every player reads, or
+animated .webp. WebP needs only Pillow and is shown by browsers; MP4 is written by FFmpeg through
+PyAV.
 """
 
 import importlib.util
@@ -324,7 +325,18 @@ def plan_render(options: RenderOptions, reader: SceneReader) -> RenderPlan:
     output = output_paths(options.out)
     pairs = _pairs(options, reader, output)
     if isinstance(quality, Budget):
-        choice = _choose(quality, pairs, resolution, options.threads)
+        table = shipped_table()
+        costs, source = known_costs(choose_variant("auto"))
+        cores = available_cores()
+        candidates = price_all(
+            table,
+            costs,
+            width=resolution,
+            threads=min(options.threads or cores, cores),
+            per_scene=len(pairs) / len({source for source, _ in pairs}),
+            network=importlib.util.find_spec("torch") is not None,
+        )
+        choice = choose(quality, candidates, scenes=table.scenes, costs=source, width=resolution)
         renderers = _renderers(options, choice.priced.samples, None, resolution)
     return RenderPlan(
         source=options.source,
@@ -379,21 +391,6 @@ def _renderers(
         )
         renderers.append(network)
     return renderers
-
-
-def _choose(budget: Budget, pairs: Pairs, resolution: int, threads: int | None) -> Choice:
-    table = shipped_table()
-    costs, source = known_costs(choose_variant("auto"))
-    cores = available_cores()
-    candidates = price_all(
-        table,
-        costs,
-        width=resolution,
-        threads=min(threads or cores, cores),
-        per_scene=len(pairs) / len({source for source, _ in pairs}),
-        network=importlib.util.find_spec("torch") is not None,
-    )
-    return choose(budget, candidates, scenes=table.scenes, costs=source, width=resolution)
 
 
 def _pairs(options: RenderOptions, reader: SceneReader, output: OutputPaths) -> Pairs:

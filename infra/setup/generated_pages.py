@@ -92,22 +92,17 @@ def every_command() -> list[Command]:
 
 def _commands(group: App, name: str) -> Iterator[Command]:
     if group.default_command is not None:
-        options = tuple(map(_option, group.assemble_argument_collection()))
-        yield Command(name=name, help=group.help, options=options)
+        options = []
+        for argument in group.assemble_argument_collection():
+            field = argument.field_info.name
+            by_place = argument.index is not None
+            names = (PRESETS.get(field, field.upper()),) if by_place else tuple(argument.names)
+            takes = argument.parameter.metavar or ""
+            options.append(Option(field, names, takes, str(argument.parameter.help)))
+        yield Command(name, group.help, tuple(options))
     for inner in group:
         if not inner.startswith("-"):
             yield from _commands(group[inner], f"{name} {inner}")
-
-
-def _option(argument: Any) -> Option:
-    by_place = argument.index is not None
-    name: str = argument.field_info.name
-    return Option(
-        field=name,
-        names=(PRESETS.get(name, name.upper()),) if by_place else tuple(argument.names),
-        takes=argument.parameter.metavar or "",
-        help=argument.parameter.help,
-    )
 
 
 def command_line_page() -> str:

@@ -125,9 +125,17 @@ def table_of(
     return PreviewTable(
         scenes=len(errors),
         errors=tuple(
-            _way_error(px, method, [one[px][method] for one in errors.values()])
+            PreviewError(
+                rung="network" if (spp, denoiser) == NETWORK else "traced",
+                spp=spp,
+                denoiser=denoiser,
+                width=px,
+                median_db=round(float(np.median(errors_db)), 2),
+                least_db=round(min(errors_db), 2),
+            )
             for px in WIDTHS
-            for method in (NETWORK, *ladder(px))
+            for spp, denoiser in (NETWORK, *ladder(px))
+            for errors_db in [[one[px][spp, denoiser] for one in errors.values()]]
         ),
         costs=_picture_costs(machine, list(costs.values()), np.median),
         probe=_picture_costs(machine, [costs[index] for index in PROBES], np.mean),
@@ -171,17 +179,6 @@ def _costs_of(network: Renderer, child: IsolatedChild, scene: Scene, px: int) ->
         core_s[NETWORK_SCENE] = loaded.cpu_seconds or 0.0
         core_s[NETWORK_VIEW] = view.cpu_seconds or 0.0
     return core_s
-
-
-def _way_error(px: int, method: Method, errors_db: list[float]) -> PreviewError:
-    return PreviewError(
-        rung="network" if method == NETWORK else "traced",
-        spp=method[0],
-        denoiser=method[1],
-        width=px,
-        median_db=round(float(np.median(errors_db)), 2),
-        least_db=round(min(errors_db), 2),
-    )
 
 
 def _picture_costs(

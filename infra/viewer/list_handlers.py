@@ -159,10 +159,6 @@ class DatasetIndex:
         self._thread = threading.Thread(target=self._read_all, daemon=True)
         self._thread.start()
 
-    def wait(self) -> None:
-        """Wait until all shards are read."""
-        self._thread.join()
-
     def close(self) -> None:
         """Stop reading."""
         self._closed = True
@@ -241,38 +237,34 @@ def _num_triangles(opened: ShardReader, members: Mapping[str, Member]) -> int:
     return int(shapes["faces"]["shape"][0])
 
 
-def selection_of(query: Mapping[str, str]) -> Selection:
-    """Return the selection of a query, whose `split`, `template` and `where` are as in commands.
+def selected_rows(
+    rows: Sequence[SceneRow], query: Mapping[str, str]
+) -> tuple[list[SceneRow], Sequence[str]]:
+    """Return the rows that a query selects, in its order, and the options of commands that do so.
+
+    Args:
+        query: `split`, `template` and `where` as in commands, and `sort` and `descending`.
 
     Raises:
-        TrilightError: a condition is malformed, or on values that the index does not hold.
+        TrilightError: a condition is malformed, or on values that the index does not hold; or the
+            sort column is unknown.
     """
     stated = {name: query.get(name) or None for name in ("split", "template", "where")}
     selection = Selection(**stated)  # type: ignore[arg-type]
-    if (where := selection.condition()) and (unknown := sorted(where.names - _NAMES)):
+    where = selection.condition()
+    if where is not None and (unknown := sorted(where.names - _NAMES)):
         raise TrilightError(f"{unknown[0]}: not in the page's index; use trilight shards list.")
-    return selection
-
-
-def sorted_rows(
-    rows: Sequence[SceneRow], selection: Selection, query: Mapping[str, str]
-) -> list[SceneRow]:
-    """Return the selected rows in the order of a query, by `sort` and `descending`.
-
-    Raises:
-        TrilightError: the sort column is unknown.
-    """
     sort = query.get("sort", "key")
     if sort not in SORTS:
         raise TrilightError(f"sort is {sort:.40}; {expected_one_of(sort, SORTS)}.")
-    where = selection.condition()
     taken = [
         row
         for row in rows
         if selection.takes(row.facts) and (where is None or where.holds(row.facts.values))
     ]
     backwards = query.get("descending") == "1"
-    return sorted(taken, key=lambda row: (row.columns[sort], row.facts.key), reverse=backwards)
+    taken.sort(key=lambda row: (row.columns[sort], row.facts.key), reverse=backwards)
+    return taken, selection.words
 
 
 MOST_ROWS = 200
@@ -335,8 +327,7 @@ class DatasetHandlers(SceneListHandlers):
     def _rows(self, request: Request) -> Response:
         query = request.query
         every = self.index.rows
-        selection = selection_of(query)
-        matching = sorted_rows(every, selection, query)
+        matching, words = selected_rows(every, query)
         first = int(query["from"]) if query.get("from", "").isdecimal() else 0
         page = matching[first : first + MOST_ROWS]
         return json_response(
@@ -344,7 +335,7 @@ class DatasetHandlers(SceneListHandlers):
                 "of": len(every),
                 "total": len(matching),
                 "rows": [row.columns for row in page],
-                "command": self._command(selection.words),
+                "command": self._command(words),
             }
         )
 
