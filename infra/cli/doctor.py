@@ -292,21 +292,16 @@ def doctor(options: DoctorOptions) -> None:
             findings.append(finding)
             console.print(_row(finding))
     if options.measure:
-        findings.append(_measure_previews())
+        from infra.render.machine_costs import measure_costs
+        from infra.render.preview_table import keep_machine_costs, shipped_table
+
+        with console.status("measuring previews"):
+            path = keep_machine_costs(measure_costs(shipped_table()))
+        findings.append(Finding("ok", f"measured, and kept in {path}", name="previews"))
+        console.print(_row(findings[-1]))
     print_json([asdict(finding) for finding in findings])
     if any(finding.state == "missing" for finding in findings):
         sys.exit(1)
-
-
-def _measure_previews() -> Finding:
-    from infra.render.machine_costs import measure_costs
-    from infra.render.preview_table import keep_machine_costs, shipped_table
-
-    with console.status("measuring previews"):
-        path = keep_machine_costs(measure_costs(shipped_table()))
-    finding = Finding("ok", f"measured, and kept in {path}", name="previews")
-    console.print(_row(finding))
-    return finding
 
 
 def _row(finding: Finding) -> Table:

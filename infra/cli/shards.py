@@ -1,6 +1,7 @@
 """`trilight shards`: makes new datasets from finished ones."""
 
 from collections.abc import Sequence
+from dataclasses import fields
 from pathlib import Path
 from typing import Annotated, Literal
 
@@ -65,12 +66,7 @@ class SelectOptions:
     @property
     def selection(self) -> Selection:
         """The conditions as the selection of a derived dataset."""
-        return Selection(
-            split=self.split,
-            template=self.template,
-            min_noise_floor_db=self.min_noise_floor_db,
-            where=self.where,
-        )
+        return Selection(**{each.name: getattr(self, each.name) for each in fields(Selection)})
 
 
 @checked()

@@ -35,7 +35,7 @@ from storage.records.lights import num_lights, rounded_to_half
 from storage.records.safe_read import read_plain
 from storage.records.scene import Scene
 from storage.records.scene_file import scene_digest
-from storage.renderer import Camera, Fact, Facts, Image, OnProgress, ReadyScene, Renderer
+from storage.renderer import Camera, Fact, Facts, OnProgress, ReadyScene, Renderer
 from train.evaluation.error_colors import ERROR_WHITE, error_picture
 
 _CAPTION_PX = 24
@@ -165,24 +165,6 @@ def load_matching_picture(
     return PictureFile(path=path, facts=facts, is_black=is_black, seconds=None), radiance_rgb
 
 
-def write_picture(
-    path: Path, header: Mapping[str, Fact], image: Image, facts: Facts, seconds: float
-) -> tuple[PictureFile, Radiance]:
-    """Write a picture with its facts, and return it as the file holds it.
-
-    Equal headers and pictures give equal bytes.
-
-    Raises:
-        TrilightError: a value is not finite, or the file cannot be written.
-    """
-    named = {_PREFIX + name: value for name, value in (dict(header) | dict(facts)).items()}
-    layers_rgb = {"": image.radiance_rgb, **image.layers_rgb}
-    write_atomically(path, encode_layers(layers_rgb, named))
-    radiance_rgb = rounded_to_half(image.radiance_rgb)
-    is_black = not radiance_rgb.any()
-    return PictureFile(path=path, facts=facts, is_black=is_black, seconds=seconds), radiance_rgb
-
-
 @dataclass(frozen=True, kw_only=True, eq=False)
 class FinishedShot:
     """Result of one shot."""
@@ -297,7 +279,10 @@ class _SceneAtHand:
     def _picture(
         self, stem: Path, camera: Camera, renderer: Renderer
     ) -> tuple[PictureFile, Radiance]:
-        """Return the picture of one renderer, from an equal file or rendered."""
+        """Return the picture of one renderer, from an equal file or rendered.
+
+        Equal headers and pictures give equal bytes.
+        """
         plan = self._plan
         path = Path(f"{stem}.{renderer.name}.exr" if len(plan.renderers) > 1 else f"{stem}.exr")
         header = header_of(renderer, self._source.name, self._sha256, camera)
@@ -314,7 +299,12 @@ class _SceneAtHand:
         image = loaded.render(camera, self._on_progress)
         seconds += time.perf_counter() - began
         facts = {**image.facts, **(plan.choice.facts if plan.choice else {})}
-        return write_picture(path, header, image, facts, seconds)
+        named = {_PREFIX + name: value for name, value in {**header, **facts}.items()}
+        layers_rgb = {"": image.radiance_rgb, **image.layers_rgb}
+        write_atomically(path, encode_layers(layers_rgb, named))
+        radiance_rgb = rounded_to_half(image.radiance_rgb)  # as the file holds it
+        is_black = not radiance_rgb.any()
+        return PictureFile(path=path, facts=facts, is_black=is_black, seconds=seconds), radiance_rgb
 
 
 def _caveats(renderer: Renderer, finished: Sequence[FinishedShot]) -> list[str]:
