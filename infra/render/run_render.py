@@ -255,7 +255,8 @@ class _SceneAtHand:
             ((_, radiance_rgb),) = made.values()
             pixels = display_pixels(radiance_rgb, self._plan.look)
         else:
-            (_, traced), (_, neural) = made["mitsuba"], made["neural"]
+            traced = made["mitsuba"][1]
+            neural = made["neural"][1]
             pixels = comparison_sheet(traced, neural, self._plan.look)
             agreement = psnr_log_db(neural, traced)
             now = Frame(
