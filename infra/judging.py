@@ -500,7 +500,16 @@ def picture_folder(folder: Path, views: Views, widths: Sequence[int]) -> Picture
         TrilightError: a picture is missing, unreadable, of another width than the first one or than
             the evaluated ones, or has values that are not finite or below 0.
     """
-    _require_all(folder, views)
+    if not folder.is_dir():
+        raise TrilightError(f"--pictures {folder}: no such folder; expected one.")
+    missing = [name for name in views if not (folder / picture_name(*name)).is_file()]
+    if missing:
+        raise TrilightError(
+            f"--pictures {folder}: {len(missing)} of {len(views)} pictures are missing, the first "
+            f"is {picture_name(*missing[0])}; expected one for each view, called as `trilight "
+            "export SET --form exr` calls them. Fewer scenes can be judged (--scenes of "
+            "leaderboard, --most-scenes of evaluate)."
+        )
     sha256: dict[tuple[str, int], str] = {}
     by_width: dict[int, Path] = {}
     for key, view in views:
@@ -528,19 +537,6 @@ def picture_folder(folder: Path, views: Views, widths: Sequence[int]) -> Picture
         digest=lambda key, view: sha256[key, view],
         pictures=pictures,
     )
-
-
-def _require_all(folder: Path, views: Views) -> None:
-    if not folder.is_dir():
-        raise TrilightError(f"--pictures {folder}: no such folder; expected one.")
-    missing = [name for name in views if not (folder / picture_name(*name)).is_file()]
-    if missing:
-        raise TrilightError(
-            f"--pictures {folder}: {len(missing)} of {len(views)} pictures are missing, the first "
-            f"is {picture_name(*missing[0])}; expected one for each view, called as `trilight "
-            "export SET --form exr` calls them. Fewer scenes can be judged (--scenes of "
-            "leaderboard, --most-scenes of evaluate)."
-        )
 
 
 def _bytes_of(path: Path) -> bytes:

@@ -20,8 +20,8 @@ from PIL import Image, ImageDraw, ImageFont
 
 from infra.cli.console import console
 from infra.render.path_tracer import PathTracer, RenderChild
+from infra.render.plan import own_camera
 from infra.render.quality import ToStatedError
-from infra.render.sources import own_camera
 from model.inference import NeuralRenderer
 from pipeline.assets.cleaning.clean import clean, normalize
 from pipeline.assets.cleaning.orient import orient_outward
@@ -262,18 +262,17 @@ class Pictures:
     def _meshes(self, scene: Scene) -> tuple[TriangleMesh, TriangleMesh]:
         """Return the object whose file has most triangles: that file, and what the scene has."""
         objects = [row for row, each in enumerate(scene.objects) if each.kind == "object"]
-        source = {row: self._source_mesh(scene.objects[row].uid) for row in objects}
+        source = {}
+        for row in objects:
+            path = next(self._objects.rglob(f"{Path(scene.objects[row].uid).stem}.*"))
+            mesh = load_mesh(read_source(path, AssetSettings().read_limits))
+            source[row] = orient_outward(clean(normalize(mesh)))[0]
         row = max(objects, key=lambda each: len(source[each].faces))
         faces = scene.faces[scene.object_index == row].astype(np.int64)
         positions = scene.vertex_positions.astype(np.float64)
         used, where = np.unique(faces, return_inverse=True)
         level = TriangleMesh(positions=positions[used], faces=where.reshape(-1, 3))
         return source[row], orient_outward(clean(normalize(level)))[0]
-
-    def _source_mesh(self, uid: str) -> TriangleMesh:
-        path = next(self._objects.rglob(f"{Path(uid).stem}.*"))
-        mesh = load_mesh(read_source(path, AssetSettings().read_limits))
-        return orient_outward(clean(normalize(mesh)))[0]
 
     def _write(self, name: str, pixels: Pixels) -> None:
         path = self._out / f"{name}.webp"

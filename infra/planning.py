@@ -69,7 +69,6 @@ class MeasuredScenes:
     """CPU seconds of each scene, in the order of rendering."""
     num_bytes: tuple[int, ...]
     """Bytes of each scene in its shard, in the same order."""
-    num_views: int
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -126,9 +125,7 @@ def measure_scenes(
             scene_done()
     finally:
         close_children()
-    return MeasuredScenes(
-        core_s=tuple(core_s), num_bytes=tuple(sizes), num_views=job.settings.scenes.num_views
-    )
+    return MeasuredScenes(core_s=tuple(core_s), num_bytes=tuple(sizes))
 
 
 def predict_cost(

@@ -309,19 +309,17 @@ class SceneBuilder:
             cameras=tuple(self._cameras),
             unknown_fields=(),
         )
+        with SceneReader() as reader:  # starts a child process only for mesh files
+            meshes = [
+                reader.mesh(*mesh) if isinstance(mesh, tuple) else mesh for mesh in self._meshes
+            ]
         return scene_from_description(
             description,
-            self._read(),
+            meshes,
             num_views=len(self._cameras),
             provenance={"template": _TEMPLATE, "name": self._name},
             albedo_over_one="refuse",
         )
-
-    def _read(self) -> list[LoadedMesh]:
-        with SceneReader() as reader:  # starts a child process only for mesh files
-            return [
-                reader.mesh(*mesh) if isinstance(mesh, tuple) else mesh for mesh in self._meshes
-            ]
 
     def _add(
         self,

@@ -9,8 +9,8 @@ from typing import TYPE_CHECKING, cast
 import numpy as np
 from numpy.typing import NDArray
 
+from infra.render.plan import own_camera
 from infra.render.quality import MOST_TRACED_SPP, ToStatedError
-from infra.render.sources import own_camera
 from infra.torch_library import require_torch
 from pipeline.renders.renderer import RenderedView
 from pipeline.renders.settings import StatedError

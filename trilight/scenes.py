@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 from numpy.typing import NDArray
 
-from infra.render.sources import scene_sources
+from infra.render.plan import scene_sources
 from pipeline.exchange.convert import reduce_scene
 from pipeline.exchange.convert import write_scene as write_in_form
 from pipeline.exchange.open_scene import LoadedScene, scene_source

@@ -54,15 +54,10 @@ def main() -> None:
             leave(f"trilight: {its_author}", 1)
         if isinstance(error, OSError):
             _leave_without_output(error)
-        _leave_without_memory(error)
+        if isinstance(error, MemoryError) or _describe_limit():  # libraries fail in various ways
+            said = f"too little memory ({type(error).__name__}); what was finished is safe."
+            leave(f"trilight: {said}{_describe_limit()}", EnvironmentFailure.exit_status)
         raise
-
-
-def _leave_without_memory(error: Exception) -> None:
-    """End with one sentence where memory lacks: each library fails in a different way then."""
-    if isinstance(error, MemoryError) or _describe_limit():
-        said = f"too little memory ({type(error).__name__}); what was finished is safe."
-        leave(f"trilight: {said}{_describe_limit()}", EnvironmentFailure.exit_status)
 
 
 def _describe_limit() -> str:

@@ -255,7 +255,11 @@ class Program(App):
         chain, apps, _ = self.parse_commands(tokens)
         name = " ".join(chain)
         page = EVERYDAY.get(name)
-        names = option_names(apps[-1], page.options) if page and not Program.shows_all else set()
+        names = set[str]()
+        if page and page.options and not Program.shows_all:
+            fields = (*page.options, "json")
+            arguments = apps[-1].assemble_argument_collection()
+            names = {each.names[0] for each in arguments if each.field_info.name in fields}
         sections = self.help_formatter = Sections(names)
         console = console or self.console
         super().help_print(tokens, console=console)
@@ -264,15 +268,6 @@ class Program(App):
             console.print("".join(f"   {line}\n" for line in page.examples), highlight=False)
         if sections.hides_some:
             console.print(f"All options: trilight {name} {ALL_OPTIONS}\n", highlight=False)
-
-
-def option_names(command: App, fields: Collection[str]) -> set[str]:
-    """Return the shown names of the options that fill the named fields, and of --json."""
-    return {
-        argument.names[0]
-        for argument in command.assemble_argument_collection()
-        if fields and argument.field_info.name in (*fields, "json")
-    }
 
 
 COMMANDS = {

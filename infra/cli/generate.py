@@ -159,15 +159,13 @@ def report(folder: DatasetFolder, outcome: "Outcome", seconds: float) -> None:
     """Print the result and the next commands."""
     rejected = count_by_reason([*read_failures(folder.failures), *outcome.failures])
     statistics = outcome.statistics
-    sizes = (
-        {}
-        if statistics is None
-        else {
+    sizes = {}
+    if statistics is not None:
+        sizes = {
             "scenes": statistics.num_scenes,
             "views": statistics.num_views,
             "bytes": statistics.num_bytes,
         }
-    )
     print_json(
         {
             "out": folder.display_name,

@@ -13,9 +13,7 @@ from numpy.typing import NDArray
 from infra.cli.console import (
     command_line,
     first_words,
-    print_json,
     print_result,
-    print_rows,
     progress_bars,
     suggest_look,
 )
@@ -86,7 +84,6 @@ def inspect(options: InspectOptions) -> None:
         folder = None
     if folder is not None:
         _write(opened, statistics, distributions, folder, options)
-    print_json(_as_json(opened, statistics, distributions))
     _print_summary(name, opened, statistics, distributions)
     suggest_look(f"Look at {folder.report} and {folder.contact_sheet}" if folder else _READ_ONLY)
 
@@ -141,30 +138,25 @@ def _write(
     renew_sums(folder.root)
 
 
-def _as_json(
-    opened: Dataset, statistics: Statistics, distributions: "Distributions"
-) -> dict[str, object]:
-    return {
-        "bytes": statistics.num_bytes,
-        "dataset_digest": opened.digest,
-        "distributions": distributions.as_json(),
-        "licences": Counter(entry.licence for entry in distributions.objects),
-        **_round_all({name: getattr(statistics, name) for name in _STATED}),
-        "part_noise_floor_db": _round_all(statistics.part_noise_floor_db),
-        "objects_by_split": Counter(entry.split for entry in distributions.objects),
-        "rejections": [list(row) for row in count_by_reason(distributions.failures)],
-        "scenes_by_split": statistics.scenes_by_split,
-        "scenes_by_template": statistics.scenes_by_template,
-        "spp": [int(v) for v in statistics.spp],
-    }
-
-
 def _print_summary(
     title: str, opened: Dataset, statistics: Statistics, distributions: "Distributions"
 ) -> None:
     licences = Counter(entry.licence for entry in distributions.objects)
     splits = Counter(entry.split for entry in distributions.objects)
     rejected = count_by_reason(distributions.failures)
+    record = {
+        "bytes": statistics.num_bytes,
+        "dataset_digest": opened.digest,
+        "distributions": distributions.as_json(),
+        "licences": licences,
+        **_round_all({name: getattr(statistics, name) for name in _STATED}),
+        "part_noise_floor_db": _round_all(statistics.part_noise_floor_db),
+        "objects_by_split": splits,
+        "rejections": [list(row) for row in rejected],
+        "scenes_by_split": statistics.scenes_by_split,
+        "scenes_by_template": statistics.scenes_by_template,
+        "spp": [int(v) for v in statistics.spp],
+    }
     rows = [
         ("build", opened.manifest.build),
         *statistics.lines(),
@@ -173,7 +165,7 @@ def _print_summary(
         *(("rejected", f"{count} x {stage}: {reason}") for stage, reason, count in rejected),
         ("dataset digest", opened.digest),
     ]
-    print_rows(title, rows)
+    print_result(title, rows, record)
 
 
 def _round_all(

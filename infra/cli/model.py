@@ -12,7 +12,6 @@ from storage.settings.ranges import Within
 
 if TYPE_CHECKING:
     from model.costs import Costs, Workload
-    from model.renderformer import RenderFormer
 
 
 @checked()
@@ -48,7 +47,19 @@ def model(options: ModelOptions, files: PublishOptions) -> None:
         if error.name != "torch":
             raise
         raise TrilightError("model: torch is not installed; run `make setup-all`.") from error
-    network = None if name in SIZES else _open(name)
+    network = None
+    if name not in SIZES:
+        from model.open import open_network
+
+        try:
+            network = open_network(name)
+        except TrilightError as error:
+            if Path(name).exists() or "/" in name:
+                raise
+            expected = expected_one_of(name, SIZES)
+            raise TrilightError(
+                f"model {name!r}: neither a size nor a checkpoint here; {expected}."
+            ) from error
     config = network.config if network else SIZES[name]()
     if options.resolution % config.picture_px:
         raise TrilightError(
@@ -70,20 +81,6 @@ def model(options: ModelOptions, files: PublishOptions) -> None:
     records = {"config": dataclasses.asdict(config), "workload": dataclasses.asdict(workload)}
     print_json({"name": name, **records, **dataclasses.asdict(network_costs)})
     _report(name, workload, network_costs)
-
-
-def _open(name: str) -> "RenderFormer":
-    from model.config import SIZES
-    from model.open import open_network
-
-    try:
-        return open_network(name)
-    except TrilightError as error:
-        if Path(name).exists() or "/" in name:
-            raise
-        raise TrilightError(
-            f"model {name!r}: neither a size nor a checkpoint here; {expected_one_of(name, SIZES)}."
-        ) from error
 
 
 def _report(name: str, workload: "Workload", counted: "Costs") -> None:

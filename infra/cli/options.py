@@ -106,9 +106,10 @@ def _parameter(field: FieldDescription, group: Group, *, by_place: bool) -> insp
     """Return a field as a parameter of the signature that cyclopts reads."""
     # an argument may be left out where the field is empty or None by default
     required = field.default is MISSING or (by_place and field.default not in ((), None))
-    several = is_repeated(field.hint) or takes_names(field.hint)
-    choices = choices_of(field.hint)
-    kind = kind_of(field.hint)
+    several = get_origin(field.bare) is tuple or takes_names(field.hint)
+    parts = list(parts_of(field.hint))
+    choices = tuple(part for part in parts if isinstance(part, str))
+    kind = next((kind for kind in (bool, int, float) if kind in parts), str)
     module, constant = NAMES.get(field.name, ("", ""))
     complete = (
         (lambda _: list(getattr(import_module(module_name(module)), constant))) if module else None
@@ -213,22 +214,6 @@ def _one(word: str, hint: Any) -> Any:
             except ValueError:
                 pass
     return word
-
-
-def choices_of(hint: Any) -> tuple[str, ...]:
-    """Return the choices of a field; empty where it takes other words too."""
-    return tuple(part for part in parts_of(hint) if isinstance(part, str))
-
-
-def kind_of(hint: Any) -> type:
-    """Return the type of one word of a field: bool, int, float, or str for any text."""
-    kinds = list(parts_of(hint))
-    return next((kind for kind in (bool, int, float) if kind in kinds), str)
-
-
-def is_repeated(hint: Any) -> bool:
-    """Return whether a field takes several words."""
-    return get_origin(unwrap(hint)[0]) is tuple
 
 
 def takes_names(hint: Any) -> bool:

@@ -1,7 +1,6 @@
 """`trilight render`: renders scenes by path tracing, by a trained network, or by both."""
 
 import time
-from collections import Counter
 from collections.abc import Sequence
 from typing import Any
 
@@ -101,7 +100,7 @@ def _shot_json(done: FinishedShot, *, timed: bool) -> dict[str, Any]:
         if timed:
             seconds = picture.seconds
             facts["picture_seconds"] = None if seconds is None else float(f"{seconds:.4g}")
-        by_renderer[name] = {**facts, "exr": str(picture.path), "kept": picture.was_kept}
+        by_renderer[name] = {**facts, "exr": str(picture.path), "kept": picture.seconds is None}
     if len(by_renderer) == 1:
         (by_renderer,) = by_renderer.values()
     else:
@@ -111,7 +110,7 @@ def _shot_json(done: FinishedShot, *, timed: bool) -> dict[str, Any]:
             by_renderer["flicker"] = rounded
     return {
         "lights": done.num_lights,
-        "png": str(done.shot.png),
+        "png": str(done.png),
         "scene_sha256": done.scene_sha256,
         "triangles": done.num_triangles,
         **by_renderer,
@@ -138,7 +137,7 @@ def _print_one(plan: RenderPlan, done: FinishedShot, seconds: float) -> None:
     rows += [("wall time", f"{seconds:.1f} s"), ("scene digest", done.scene_sha256)]
     print_rows("Rendered", rows)
     measure = " and ".join(str(picture.path) for picture in done.pictures.values())
-    look = f"Look at {done.shot.png}; measure with {measure}"
+    look = f"Look at {done.png}; measure with {measure}"
     suggest_look(look)
 
 
@@ -190,7 +189,7 @@ def _floor(settings: RenderSettings, facts: Facts, metric: str) -> str:
 
 def _print_sequence(plan: RenderPlan, shots: Sequence[FinishedShot], seconds: float) -> None:
     pictures = [picture for shot in shots for picture in shot.pictures.values()]
-    num_kept = Counter(picture.was_kept for picture in pictures)[True]
+    num_kept = sum(picture.seconds is None for picture in pictures)
     rows: Rows = [
         ("pictures", f"{len(shots)} of {plan.resolution} x {plan.resolution}"),
         ("files", f"{len(pictures)}, of which {num_kept} were there already"),

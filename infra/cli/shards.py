@@ -1,6 +1,7 @@
 """`trilight shards`: makes new datasets from finished ones."""
 
 from collections.abc import Sequence
+from dataclasses import fields
 from pathlib import Path
 from typing import Annotated
 

@@ -160,7 +160,19 @@ def verify(options: VerifyOptions) -> None:
             scenes_from=options.scenes_from,
         )
         verification = _verify(options.dataset, fast=options.fast)
-    print_json(_as_json(verification))
+    manifest = verification.manifest
+    print_json(
+        {
+            "bad_shards": list(verification.bad_shards),
+            "dataset_digest": manifest.dataset_digest,
+            "finished": verification.is_finished,
+            "problems": list(verification.problems),
+            "samples": manifest.num_samples,
+            "scenes_planned": manifest.num_scenes,
+            "shards": len(manifest.shards),
+            "shards_planned": num_planned(manifest),
+        }
+    )
     _report(verification, fast=options.fast)
     _print_repair(verification, options.dataset)
     if verification.problems or not verification.is_finished:
@@ -208,19 +220,6 @@ def _print_repair(verification: Verification, dataset: str) -> None:
         named = [word for option, value in values if value for word in (option, value)]
         words = ("verify", dataset, "--repair", *named)
         next_step(words, recorded=verification.manifest.extensions)
-
-
-def _as_json(verification: Verification) -> dict[str, object]:
-    return {
-        "bad_shards": list(verification.bad_shards),
-        "dataset_digest": verification.manifest.dataset_digest,
-        "finished": verification.is_finished,
-        "problems": list(verification.problems),
-        "samples": verification.manifest.num_samples,
-        "scenes_planned": verification.manifest.num_scenes,
-        "shards": len(verification.manifest.shards),
-        "shards_planned": num_planned(verification.manifest),
-    }
 
 
 def _report(verification: Verification, *, fast: bool) -> None:

@@ -1,7 +1,7 @@
 """`trilight submit`: runs `generate` by workers of a Prefect server, or as an array of tasks."""
 
 import shlex
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Iterable, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
@@ -144,14 +144,31 @@ def _submit_flow(
     base: BaseSettings,
     runs: FlowRunOptions,
 ) -> None:
-    """Submit a flow run and report it; once it has ended, name the next commands."""
+    """Submit a flow run; watch it to its end, report it and name the next commands.
+
+    Raises:
+        TrilightError: there is no such server or deployment, or the run failed.
+    """
     first_words(f"Submitting {flow} with the preset {options.build}")
     load_prefect()
-    from pipeline.flows.submission import parameters
+    from pipeline.flows import submission as prefect  # Prefect reads its settings at the import
 
-    values = parameters(with_base_settings(options, base))
-    ended = run_flow(flow, values, runs, where=options.place)
-    if ended and Path(options.place).is_dir():
+    values = prefect.parameters(with_base_settings(options, base))
+    with prefect.server() as client:
+        run = prefect.submit(client, flow, runs.deployment, values)
+        console.print(f"Run {run.name} of {run.deployment}: {run.page}", soft_wrap=True)
+        ends = f"prefect flow-run cancel {run.id} ends it"
+        console.print(f"Ctrl-C here leaves it running; {ends}", soft_wrap=True)
+        if not prefect.workers_online(client, run.pool):
+            start = f"prefect worker start --pool {run.pool}"
+            text = f"no worker of the pool {run.pool} is online, and the run waits for one"
+            note(f"{text}: {start}")
+        if runs.no_watch:
+            print_json({"flow_run": str(run.id), "deployment": run.deployment})
+            return
+        last = _watch_run(prefect.poll_run(client, run.id))
+    _report(run, last, options.place)
+    if Path(options.place).is_dir():
         next_step(["verify", options.place], ["inspect", options.place])
 
 
@@ -195,37 +212,6 @@ def submit_to_array(
     next_step(["status", options.place])
 
 
-def run_flow(flow: str, parameters: Mapping[str, Any], runs: FlowRunOptions, *, where: str) -> bool:
-    """Run a flow by a worker of the server; print its progress and its summary.
-
-    Args:
-        where: folder or URL of the dataset, for the summary.
-
-    Returns:
-        Whether the run has ended; False where it is not watched.
-
-    Raises:
-        TrilightError: there is no such server or deployment, or the run failed.
-    """
-    from pipeline.flows import submission as prefect  # Prefect reads its settings at the import
-
-    with prefect.server() as client:
-        run = prefect.submit(client, flow, runs.deployment, parameters)
-        console.print(f"Run {run.name} of {run.deployment}: {run.page}", soft_wrap=True)
-        ends = f"prefect flow-run cancel {run.id} ends it"
-        console.print(f"Ctrl-C here leaves it running; {ends}", soft_wrap=True)
-        if not prefect.workers_online(client, run.pool):
-            start = f"prefect worker start --pool {run.pool}"
-            text = f"no worker of the pool {run.pool} is online, and the run waits for one"
-            note(f"{text}: {start}")
-        if runs.no_watch:
-            print_json({"flow_run": str(run.id), "deployment": run.deployment})
-            return False
-        last = _watch_run(prefect.poll_run(client, run.id))
-    _report(run, last, where)
-    return True
-
-
 def _watch_run(looks: "Iterable[RunStatus]") -> "RunStatus":
     """Draw the progress of a run, and return its last state."""
     last = None
@@ -253,11 +239,10 @@ def _report(run: "SubmittedRun", last: "RunStatus", where: str) -> None:
             "summary": dict(rows),
         }
     )
-    if last.is_completed:
-        print_rows(f"{run.deployment} finished", [*rows, ("where", where)])
     if not last.is_completed:
         reason = last.message.rstrip(".") or "no reason given"
         raise TrilightError(
             f"{run.deployment}: the run ended as {last.state}: {reason}. Its log is "
             f"at {run.page}; the same command goes on with what is missing."
         )
+    print_rows(f"{run.deployment} finished", [*rows, ("where", where)])

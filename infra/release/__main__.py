@@ -3,27 +3,45 @@
     python -m infra.release FOLDER
 
 FOLDER holds `dataset`, an output of `trilight generate`. `network` and `gallery` are written next
-to it; each of the three is a repository of a hub.
+to it; each of the three is a repository of a hub. The gallery is a page that works from disk:
+traced, network, error and few samples side by side.
 """
 
+import contextlib
 import shutil
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated
 
 import cyclopts
+import numpy as np
 from cyclopts import Parameter
+from numpy.typing import NDArray
 
 from infra.cli.console import first_words, next_step, print_rows, progress_bars
 from infra.release.push_to_hub import NETWORK_FILE, kind_of, require_within_limits
-from infra.release.release_page import chosen_scenes, compare_scenes, write_page
+from infra.render.networks import NetworkRenderer
+from infra.render.path_tracer import PathTracer, RenderChild
+from infra.render.quality import FixedSamples
 from model.open import BUILTIN_NETWORKS
 from pipeline.documents.checksums import write_sums
+from pipeline.documents.pages import Figure, render_page
+from pipeline.documents.png import encode_png
+from pipeline.documents.sheets import ChosenScene, choose_scenes, read_chosen
+from pipeline.renders.mitsuba_variant import choose_variant
 from storage.atomic import write_atomically
-from storage.dataset.dataset import open_dataset
+from storage.conventions import SPLITS, preview_srgb8
+from storage.dataset.dataset import Dataset, open_dataset
 from storage.dataset.verify import verify_dataset
 from storage.errors import TrilightError
 from storage.markdown import front_matter
 from storage.records.objects import read_objects_lock
+from storage.renderer import Camera, Renderer
+from train.evaluation.error_colors import ERROR_WHITE, error_picture
+from train.evaluation.evaluate import judge_view
+from train.evaluation.metrics import METRIC
+from train.evaluation.validation import validation_scene
 
 FREE = {"CC0-1.0"}
 """Licences under which pictures are published."""
@@ -83,6 +101,148 @@ def _sum_and_say(folder: Path) -> None:
         rows.append((str(part), size))
     print_rows("Ready for a hub", rows)
     next_step(*(["push", str(part), f"USER/{part.name}", "--dry-run"] for part in parts))
+
+
+_TITLE = "Trilight: traced, learned and filtered"
+_PICTURES = "pictures"
+
+
+RIVALS = (1, 4, 16)
+"""Samples per pixel of the previews in the comparison, filtered by Open Image Denoise."""
+
+NETWORK = "network"
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class SceneComparison:
+    """First view of one scene, rendered by all methods."""
+
+    key: str
+    caption: str
+    """Split, layout and number of triangles as text."""
+    target_rgb: NDArray[np.float32]
+    """[R, R, 3] linear radiance of the dataset's picture."""
+    floor_db: float
+    """Stated error of the target as psnr_log_db."""
+    pictures_rgb: Mapping[str, NDArray[np.float32]]
+    """[R, R, 3] linear radiance by method."""
+    psnr_db: Mapping[str, float]
+    """psnr_log_db to the target by method."""
+
+
+def write_page(
+    folder: Path, comparisons: Sequence[SceneComparison], *, about: Sequence[tuple[str, str]]
+) -> Path:
+    """Write `index.html`, its pictures and the README of a static space; return the page's path.
+
+    Pictures of an earlier page, which would be uploaded, too, are deleted.
+
+    Raises:
+        TrilightError: the folder cannot be written.
+    """
+    for old in sorted((folder / _PICTURES).glob("[0-9]" * 9 + "-*.png")):
+        old.unlink()
+    page = render_page(
+        "release.html",
+        _TITLE,
+        explained=_EXPLAINED,
+        about=about,
+        medians=list(_medians(comparisons)),
+        scenes=[(each, list(_pictures(folder, each))) for each in comparisons],
+    )
+    path = folder / "index.html"
+    write_atomically(path, page)
+    card = front_matter({"title": _TITLE, "sdk": "static", "license": "cc0-1.0"})
+    write_atomically(folder / "README.md", f"{card}\n# {_TITLE}\n\n{_EXPLAINED}\n".encode())
+    return path
+
+
+_EXPLAINED = (
+    "First views of scenes of built-in objects, which are CC0. The figure below a picture is its "
+    "psnr_log_db to the traced one, whose own is that of its noise. In error pictures white is a "
+    f"difference of {ERROR_WHITE} in log10(1 + radiance)."
+)
+
+
+def _pictures(folder: Path, each: SceneComparison) -> Iterator[Figure]:
+    """Write the pictures of a scene, and yield them."""
+    error = error_picture(each.pictures_rgb[NETWORK], each.target_rgb)
+    pictures = [
+        ("traced", preview_srgb8(each.target_rgb), f"traced, stated error {each.floor_db:.1f} dB")
+    ]
+    for place, (name, radiance_rgb) in enumerate(each.pictures_rgb.items()):
+        caption = f"{name}, {each.psnr_db[name]:.1f} dB"
+        pictures.append((str(place), preview_srgb8(radiance_rgb), caption))
+        if name == NETWORK:
+            pictures.append(("error", error, "error of the network"))
+    for name, pixels, caption in pictures:
+        relative = f"{_PICTURES}/{each.key}-{name}.png"
+        write_atomically(folder / relative, encode_png(pixels))
+        yield Figure(relative, f"{each.key}, {caption}", caption)
+
+
+def _medians(comparisons: Sequence[SceneComparison]) -> Iterator[tuple[str, float, float, str]]:
+    """Yield each picture's name, median and worst PSNR, and how often it beats the network."""
+    for name in comparisons[0].psnr_db:
+        values = [each.psnr_db[name] for each in comparisons]
+        better = sum(each.psnr_db[name] > each.psnr_db[NETWORK] for each in comparisons)
+        beaten = "" if name == NETWORK else f"{better} of {len(comparisons)}"
+        yield name, float(np.median(values)), min(values), beaten
+
+
+def chosen_scenes(dataset: Dataset, count: int) -> list[ChosenScene]:
+    """Return up to `count` scenes of the test split, or of all splits if it is empty.
+
+    Raises:
+        TrilightError: `count` is below 1, or the dataset is empty.
+    """
+    judged = any(shard.num_samples for shard in dataset.shards_of("test"))
+    splits = ("test",) if judged else SPLITS
+    if count < 1 or not (chosen := choose_scenes(dataset, count, splits)):
+        raise TrilightError(
+            f"--pictures is {count}, of a dataset of {dataset.manifest.num_samples} scenes; "
+            "expected at least one scene to show."
+        )
+    return chosen
+
+
+def compare_scenes(
+    dataset: Dataset, chosen: Sequence[ChosenScene], *, checkpoint: str, done: Callable[[], None]
+) -> Iterator[SceneComparison]:
+    """Yield the comparison of each scene's first view.
+
+    Raises:
+        TrilightError: a sample is unreadable, or the network or the path tracer cannot render it.
+    """
+    with contextlib.closing(RenderChild(choose_variant(), threads=1)) as child:
+        by_width: dict[int, Sequence[Renderer]] = {}
+        for entry, sample in read_chosen(dataset, chosen):
+            width = int(sample.radiance_rgb.shape[1])
+            if width not in by_width:
+                qualities = [FixedSamples(spp=spp, denoiser="fast") for spp in RIVALS]
+                by_width[width] = [
+                    NetworkRenderer(name=NETWORK, checkpoint=checkpoint, resolution=width),
+                    *(
+                        PathTracer(child, one, width, name=f"{one.count}, filtered")
+                        for one in qualities
+                    ),
+                ]
+            camera = Camera.of_scene(sample.scene, 0)
+            target = sample.radiance_rgb[0]
+            pictures = {
+                each.name: each.load(sample.scene, sample.key).render(camera).radiance_rgb
+                for each in by_width[width]
+            }
+            row = judge_view(sample, validation_scene(sample, width), 0, pictures, None)
+            yield SceneComparison(
+                key=row.key,
+                caption=f"{entry.split}, {row.template}, {row.num_triangles} triangles",
+                target_rgb=target,
+                floor_db=row.floors[METRIC],
+                pictures_rgb=pictures,
+                psnr_db={name: scores[METRIC] or 0.0 for name, scores in row.scores.items()},
+            )
+            done()
 
 
 if __name__ == "__main__":

@@ -79,7 +79,17 @@ def planned_upload(folder: Path, repository: str) -> Upload:
         )
     kind = kind_of(folder)
     if kind == "dataset":
-        _require_sound(folder)
+        verification = verify_dataset(str(folder), fast=True)
+        if not verification.is_finished:
+            raise TrilightError(
+                f"{folder}: is not finished; expected a whole dataset. Run its trilight generate "
+                "again."
+            )
+        if verification.problems:
+            raise TrilightError(
+                f"{folder}: is damaged ({verification.problems[0].rstrip('.')}); expected a whole "
+                f"dataset. See trilight verify {folder}."
+            )
     if not (folder / "README.md").is_file():
         raise TrilightError(
             f"{folder}: has no README.md, the card that the hub shows; a dataset's is written by "
@@ -149,19 +159,6 @@ def _broken_off(upload: Upload, what: str, error: Exception) -> TrilightError:
     return TrilightError(
         f"{upload.repository}: {what} ({said}). What it has already is kept: run it again."
     )
-
-
-def _require_sound(folder: Path) -> None:
-    verification = verify_dataset(str(folder), fast=True)
-    if not verification.is_finished:
-        raise TrilightError(
-            f"{folder}: is not finished; expected a whole dataset. Run its trilight generate again."
-        )
-    if verification.problems:
-        raise TrilightError(
-            f"{folder}: is damaged ({verification.problems[0].rstrip('.')}); expected a whole "
-            f"dataset. See trilight verify {folder}."
-        )
 
 
 def require_within_limits(folder: Path) -> tuple[int, int]:

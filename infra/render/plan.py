@@ -1,20 +1,22 @@
 """Plan of one call of `trilight render`: all decisions, before any picture is rendered.
 
-With it come the files of `--out`: one picture, or a folder of numbered pictures with or without a
-video. Videos are H.264 in .mp4, which every player reads, or animated .webp. WebP needs only Pillow
-and is shown by browsers; MP4 is written by FFmpeg through PyAV.
+A source may hold many scenes and many cameras. The files of `--out` are one picture, or a folder of
+numbered pictures with or without a video. Videos are H.264 in .mp4, which every player reads, or
+animated .webp. WebP needs only Pillow and is shown by browsers; MP4 is written by FFmpeg through
+PyAV.
 """
 
-import dataclasses
 import importlib.util
 import io
+import re
 import tempfile
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from fractions import Fraction
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 from PIL import Image
 
 from infra.render.networks import NetworkRenderer
@@ -22,15 +24,17 @@ from infra.render.options import EngineChoice, RenderOptions
 from infra.render.path_tracer import PathTracer, RenderChild
 from infra.render.preview_table import Choice, choose, known_costs, price_all, shipped_table
 from infra.render.quality import Budget, FixedSamples, Traced
-from infra.render.sources import camera_path, orbit, own_camera, pair_cameras, scene_sources
 from infra.render.tone_mapping import Look
 from infra.torch_library import require_torch
+from pipeline.exchange.formats import readable_suffixes
 from pipeline.exchange.open_scene import SceneSource, scene_source
 from pipeline.exchange.reader import SceneReader
 from pipeline.renders.mitsuba_variant import choose_variant
 from storage.atomic import write_atomically, write_error
+from storage.dataset.shard_set import expand_pattern
 from storage.errors import TrilightError
 from storage.machine import available_cores
+from storage.records.scene import Scene
 from storage.renderer import Camera, Renderer
 
 SUFFIXES = (".mp4", ".webp")
@@ -160,24 +164,122 @@ def _av() -> Any:
     return av
 
 
+def scene_sources(text: str, reader: SceneReader) -> list[SceneSource]:
+    """Return every scene of a source, in order.
+
+    Args:
+        text: one file; `scenes/{000..119}.json` for numbered ones; or a folder, whose scene files
+            are sorted by the numbers in their names. A shard stands for all of its samples, an
+            animated USD stage for all of its frames.
+
+    Raises:
+        TrilightError: a file is unusable, or there is no scene.
+    """
+    if "://" not in text and Path(text).is_dir():
+        paths = [
+            path for path in Path(text).iterdir() if path.suffix.lower() in readable_suffixes()
+        ]
+        if not paths:
+            raise TrilightError(
+                f"{text}: holds no scene file; expected files that end in "
+                f"{' '.join(readable_suffixes())}."
+            )
+        return [scene_source(str(path)) for path in sorted(paths, key=_by_number)]
+    names = expand_pattern(text, "scenes") if "{" in text else [text]
+    files = [scene_source(name, many=True) for name in names]
+    return [scene for source in files for scene in reader.scenes_of(source)]
+
+
+def _by_number(path: Path) -> list[tuple[int, str]]:
+    """Return a key that sorts frame9 before frame10."""
+    parts = re.split(r"([0-9]+)", path.name)
+    return [(int(part), part) if part.isdecimal() else (-1, part) for part in parts]
+
+
+def pair_cameras(
+    sources: Sequence[SceneSource], cameras: Sequence[Camera | int]
+) -> list[tuple[SceneSource, Camera | int]]:
+    """Return scene and camera of each picture, in order.
+
+    One scene is combined with all cameras, and one camera with all scenes; equally many scenes and
+    cameras are paired. A number is the row of a camera of the scene.
+
+    Raises:
+        TrilightError: several scenes and several cameras, but not equally many.
+    """
+    if len(sources) > 1 and len(cameras) > 1 and len(sources) != len(cameras):
+        raise TrilightError(
+            f"{len(sources)} scenes and {len(cameras)} cameras; expected one of either, or as many "
+            "cameras as scenes."
+        )
+    count = max(len(sources), len(cameras))
+    return [(sources[at % len(sources)], cameras[at % len(cameras)]) for at in range(count)]
+
+
+def own_camera(scene: Scene, view: int, named: str = "--view") -> Camera:
+    """Return a camera of a scene; raises TrilightError, with `named`, if there is no such view."""
+    if not 0 <= view < scene.num_views:
+        raise TrilightError(
+            f"{named} is {view}; expected 0 to {scene.num_views - 1}: the scene has "
+            f"{scene.num_views} cameras."
+        )
+    return Camera.of_scene(scene, view)
+
+
+def orbit(scene: Scene, start: Camera, count: int, arc_deg: float) -> list[Camera]:
+    """Return `count` cameras on a horizontal circle around the point that `start` looks at.
+
+    The circle's center is the point of the camera's axis nearest to the center of all surfaces that
+    reflect. The whole circle begins at `start`; a shorter arc has `start` in its middle.
+    """
+    points = scene.vertex_positions[scene.faces[~scene.triangle_emits]].reshape(-1, 3)
+    if not len(points):
+        points = scene.vertex_positions
+    middle = (points.min(axis=0).astype(np.float64) + points.max(axis=0)) / 2
+    pose = start.c2w.astype(np.float64)
+    eye = pose[:3, 3]
+    forward = -pose[:3, 2]
+    target = eye + forward * max(float(np.einsum("i,i->", middle - eye, forward)), 0.0)
+    if arc_deg == 360:
+        angles_deg = 360 * np.arange(count) / count
+    else:
+        angles_deg = np.linspace(-arc_deg / 2, arc_deg / 2, count) if count > 1 else np.zeros(1)
+    cameras = []
+    for angle_rad in np.radians(angles_deg):
+        cos = np.cos(angle_rad)
+        sin = np.sin(angle_rad)
+        rotation = np.array([[cos, -sin, 0], [sin, cos, 0], [0, 0, 1]])  # about the vertical axis
+        turned = pose.copy()
+        turned[:3, :3] = np.einsum("ij,jk->ik", rotation, pose[:3, :3])
+        turned[:3, 3] = np.einsum("ij,j->i", rotation, eye - target) + target
+        cameras.append(Camera(c2w=turned.astype(np.float32), fov_deg=start.fov_deg))
+    return cameras
+
+
+def camera_path(text: str, reader: SceneReader, view: int) -> list[Camera]:
+    """Return the cameras of a file: all of one scene, or one of each frame of an animated stage.
+
+    Args:
+        text: JSON file with a list `cameras` as in RenderFormer's scenes, or any scene.
+        view: row of the camera in each frame.
+
+    Raises:
+        TrilightError: the file is unusable, or has no such camera.
+    """
+    source = scene_source(text, many=True)
+    frames = reader.scenes_of(source)
+    if len(frames) > 1:
+        return [own_camera(reader.load(frame).scene, view) for frame in frames]
+    c2w, fov_deg = reader.cameras(frames[0])
+    return [
+        Camera(c2w=pose, fov_deg=float(angle)) for pose, angle in zip(c2w, fov_deg, strict=True)
+    ]
+
+
 Pairs = Sequence[tuple[SceneSource, Camera | int]]
 """Scene and camera of each picture; a number is the row of a camera of the scene."""
 
 _RESOLUTION = 512
-
-
-@dataclass(frozen=True, kw_only=True, eq=False)
-class Shot:
-    """One picture to render."""
-
-    source: SceneSource
-    camera: Camera | int
-    """Camera, or the row of a camera of the scene."""
-    exrs: Mapping[str, Path]
-    """Paths of the EXR files by the name of their renderer."""
-    png: Path
-    keep: bool
-    """True to keep existing files of an equal picture."""
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -196,7 +298,7 @@ class RenderPlan:
     """Width of every picture in pixels."""
     look: Look
     output: OutputPaths
-    shots: Sequence[Shot]
+    pairs: Pairs
     """Pictures in order; those of one scene are consecutive."""
     fps: int
     choice: Choice | None = None
@@ -223,7 +325,18 @@ def plan_render(options: RenderOptions, reader: SceneReader) -> RenderPlan:
     output = output_paths(options.out)
     pairs = _pairs(options, reader, output)
     if isinstance(quality, Budget):
-        choice = _choose(quality, pairs, resolution, options.threads)
+        table = shipped_table()
+        costs, source = known_costs(choose_variant("auto"))
+        cores = available_cores()
+        candidates = price_all(
+            table,
+            costs,
+            width=resolution,
+            threads=min(options.threads or cores, cores),
+            per_scene=len(pairs) / len({source for source, _ in pairs}),
+            network=importlib.util.find_spec("torch") is not None,
+        )
+        choice = choose(quality, candidates, scenes=table.scenes, costs=source, width=resolution)
         renderers = _renderers(options, choice.priced.samples, None, resolution)
     return RenderPlan(
         source=options.source,
@@ -233,22 +346,10 @@ def plan_render(options: RenderOptions, reader: SceneReader) -> RenderPlan:
         resolution=resolution,
         look=look,
         output=output,
-        shots=list(shots(pairs, output, [renderer.name for renderer in renderers])),
+        pairs=pairs,
         fps=options.fps,
         choice=choice,
     )
-
-
-def shots(pairs: Pairs, output: OutputPaths, names: list[str]) -> Iterator[Shot]:
-    """Yield the shot of each pair, with its files by the names of renderers."""
-    for index, (source, camera) in enumerate(pairs):
-        stem = output.stem_of(index)
-        suffixes = {name: f".{name}.exr" if len(names) > 1 else ".exr" for name in names}
-        exrs = {name: Path(f"{stem}{suffix}") for name, suffix in suffixes.items()}
-        png = Path(f"{stem}.png")
-        if isinstance(camera, Camera):  # of an orbit or a file: the scene has no such row
-            camera = dataclasses.replace(camera, view=None, name=f"picture {png.stem}")
-        yield Shot(source=source, camera=camera, exrs=exrs, png=png, keep=output.is_sequence)
 
 
 def _network_and_width(options: RenderOptions) -> tuple[str | None, int]:
@@ -290,21 +391,6 @@ def _renderers(
         )
         renderers.append(network)
     return renderers
-
-
-def _choose(budget: Budget, pairs: Pairs, resolution: int, threads: int | None) -> Choice:
-    table = shipped_table()
-    costs, source = known_costs(choose_variant("auto"))
-    cores = available_cores()
-    candidates = price_all(
-        table,
-        costs,
-        width=resolution,
-        threads=min(threads or cores, cores),
-        per_scene=len(pairs) / len({source for source, _ in pairs}),
-        network=importlib.util.find_spec("torch") is not None,
-    )
-    return choose(budget, candidates, scenes=table.scenes, costs=source, width=resolution)
 
 
 def _pairs(options: RenderOptions, reader: SceneReader, output: OutputPaths) -> Pairs:

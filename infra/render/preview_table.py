@@ -130,7 +130,13 @@ def known_costs(variant: Variant) -> tuple[PictureCosts, str]:
     try:
         record = read_json(path.read_bytes(), dict[str, Any], str(path))
         costs = from_record(PictureCosts, record)
-        _require_whole(costs, shipped)
+        known = {(row.part, row.width) for row in costs.rows}
+        for row in shipped.rows:
+            if (row.part, row.width) not in known:
+                raise TrilightError(
+                    f"costs of previews: {row.part!r} at {row.width} pixels is missing; expected "
+                    "each part at each width."
+                )
     except FileNotFoundError:
         why = f"costs as shipped: `{MEASURE}` measures this machine"
     except (OSError, ValueError) as error:  # a TrilightError is one
@@ -150,16 +156,6 @@ def keep_machine_costs(costs: PictureCosts) -> Path:
     path = machine_costs_path()
     write_atomically(path, canonical_json(settings_record(costs)) + b"\n")
     return path
-
-
-def _require_whole(costs: PictureCosts, shipped: PictureCosts) -> None:
-    known = {(row.part, row.width) for row in costs.rows}
-    for row in shipped.rows:
-        if (row.part, row.width) not in known:
-            raise TrilightError(
-                f"costs of previews: {row.part!r} at {row.width} pixels is missing; expected each "
-                "part at each width."
-            )
 
 
 NETWORK = "the network builtin:tokens"

@@ -5,6 +5,7 @@ compared side by side, and by the flicker of their error: in motion an error tha
 pixels is hardly seen; one that jumps is (storage.metrics.flicker_log_db).
 """
 
+import dataclasses
 import itertools
 import time
 from collections.abc import Callable, Mapping, Sequence
@@ -18,9 +19,7 @@ from numpy.typing import NDArray
 from PIL import Image as Picture
 from PIL import ImageDraw, ImageFont
 
-from infra.render.plan import RenderPlan, Shot, write_video
-from infra.render.preview_table import Choice
-from infra.render.sources import own_camera
+from infra.render.plan import RenderPlan, own_camera, write_video
 from infra.render.tone_mapping import Look, display_pixels, enlarge
 from pipeline.documents.png import encode_png
 from pipeline.exchange.formats import FORMATS, SceneSource
@@ -36,7 +35,7 @@ from storage.records.lights import num_lights, rounded_to_half
 from storage.records.safe_read import read_plain
 from storage.records.scene import Scene
 from storage.records.scene_file import scene_digest
-from storage.renderer import Camera, Fact, Facts, Image, OnProgress, ReadyScene, Renderer
+from storage.renderer import Camera, Fact, Facts, OnProgress, ReadyScene, Renderer
 from train.evaluation.error_colors import ERROR_WHITE, error_picture
 
 _CAPTION_PX = 24
@@ -113,12 +112,10 @@ class PictureFile:
 
     path: Path
     facts: Facts
-    was_kept: bool
-    """True where an equal file existed already."""
     is_black: bool
     seconds: float | None
     """Wall-clock seconds of rendering, those of loading the scene included for its first picture;
-    None where the file was kept."""
+    None where an equal file existed already."""
 
 
 def header_of(
@@ -164,43 +161,15 @@ def load_matching_picture(
         for name, value in stored.items()
         if name.startswith(_PREFIX) and name not in described
     }
-    return _picture_file(path, facts, radiance_rgb, None), radiance_rgb
-
-
-def write_picture(
-    path: Path, header: Mapping[str, Fact], image: Image, facts: Facts, seconds: float
-) -> tuple[PictureFile, Radiance]:
-    """Write a picture with its facts, and return it as the file holds it.
-
-    Equal headers and pictures give equal bytes.
-
-    Raises:
-        TrilightError: a value is not finite, or the file cannot be written.
-    """
-    named = {_PREFIX + name: value for name, value in (dict(header) | dict(facts)).items()}
-    layers_rgb = {"": image.radiance_rgb, **image.layers_rgb}
-    write_atomically(path, encode_layers(layers_rgb, named))
-    radiance_rgb = rounded_to_half(image.radiance_rgb)
-    return _picture_file(path, facts, radiance_rgb, seconds), radiance_rgb
-
-
-def _picture_file(
-    path: Path, facts: Facts, radiance_rgb: Radiance, seconds: float | None
-) -> PictureFile:
-    return PictureFile(
-        path=path,
-        facts=dict(facts),
-        was_kept=seconds is None,
-        is_black=not radiance_rgb.any(),
-        seconds=seconds,
-    )
+    is_black = not radiance_rgb.any()
+    return PictureFile(path=path, facts=facts, is_black=is_black, seconds=None), radiance_rgb
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class FinishedShot:
     """Result of one shot."""
 
-    shot: Shot
+    png: Path
     scene_sha256: str
     """SHA-256 of the scene by storage.records.scene_file.scene_digest."""
     num_triangles: int
@@ -239,95 +208,104 @@ def run_plan(
     with ExitStack() as stack:
         for renderer in plan.renderers:
             stack.enter_context(closing(renderer))
-        on_picture(0, len(plan.shots))
-        for source, shots in itertools.groupby(plan.shots, key=lambda shot: shot.source):
+        on_picture(0, len(plan.pairs))
+        for source, pairs in itertools.groupby(plan.pairs, key=lambda pair: pair[0]):
             source_scene = reader.load(source)
-            scene = _SceneAtHand(source, source_scene.scene, plan.choice, on_samples)
-            for shot in shots:
-                made = {each.name: scene.picture(shot, each) for each in plan.renderers}
-                done, before = _finish(shot, scene, made, plan.look, before)
+            scene = _SceneAtHand(plan, source, source_scene.scene, on_samples)
+            for _, camera in pairs:
+                stem = plan.output.stem_of(len(finished))
+                done, before = scene.finish(stem, camera, before)
                 finished.append(done)
-                on_picture(len(finished), len(plan.shots))
+                on_picture(len(finished), len(plan.pairs))
             notes |= dict.fromkeys([*source_scene.notes, *scene.notes])
     if plan.output.video is not None:
-        write_video(plan.output.video, [done.shot.png for done in finished], plan.fps)
+        write_video(plan.output.video, [done.png for done in finished], plan.fps)
     for renderer in plan.renderers:
         notes |= dict.fromkeys(_caveats(renderer, finished))
     return finished, list(notes)
 
 
 class _SceneAtHand:
-    """Scene of consecutive shots; a renderer loads it for the first picture that is not kept."""
+    """Scene of consecutive pictures; a renderer loads it for the first one that is not kept."""
 
     def __init__(
-        self, source: SceneSource, scene: Scene, choice: Choice | None, on_progress: OnProgress
+        self, plan: RenderPlan, source: SceneSource, scene: Scene, on_progress: OnProgress
     ) -> None:
-        self.scene = scene
-        self.sha256 = scene_digest(scene)
         self.notes: list[str] = []
+        self._plan = plan
         self._source = source
-        self._facts: Facts = {} if choice is None else choice.facts
+        self._scene = scene
+        self._sha256 = scene_digest(scene)
         self._on_progress = on_progress
         self._loaded: dict[str, ReadyScene] = {}
 
-    def picture(self, shot: Shot, renderer: Renderer) -> tuple[PictureFile, Radiance]:
-        """Return the picture of one renderer, from an equal file or rendered."""
-        camera = shot.camera
+    def finish(
+        self, stem: Path, camera: Camera | int, before: Frame | None
+    ) -> tuple[FinishedShot, Frame | None]:
+        """Write the files of a picture; return it, and the frame if there are both renderers."""
         if isinstance(camera, int):
-            camera = own_camera(self.scene, camera)
-        path = shot.exrs[renderer.name]
-        header = header_of(renderer, self._source.name, self.sha256, camera)
-        existing = load_matching_picture(path, header) if shot.keep else None
+            camera = own_camera(self._scene, camera)
+        else:  # of an orbit or a file: the scene has no such row
+            camera = dataclasses.replace(camera, view=None, name=f"picture {stem.name}")
+        made = {each.name: self._picture(stem, camera, each) for each in self._plan.renderers}
+        files = {name: file for name, (file, _) in made.items()}
+        now = None
+        agreement = None
+        if len(made) == 1:
+            ((_, radiance_rgb),) = made.values()
+            pixels = display_pixels(radiance_rgb, self._plan.look)
+        else:
+            traced = made["mitsuba"][1]
+            neural = made["neural"][1]
+            pixels = comparison_sheet(traced, neural, self._plan.look)
+            agreement = psnr_log_db(neural, traced)
+            now = Frame(
+                source=self._source,
+                error_RR3=log10_radiance(neural) - log10_radiance(traced),
+                noise_floor_db=float(files["mitsuba"].facts["noise_floor_db"]),
+            )
+        png = Path(f"{stem}.png")
+        write_atomically(png, encode_png(pixels))
+        finished = FinishedShot(
+            png=png,
+            scene_sha256=self._sha256,
+            num_triangles=self._scene.num_triangles,
+            num_lights=num_lights(self._scene),
+            pictures=files,
+            psnr_log_db=agreement,
+            flicker=flicker(before, now) if now else None,
+        )
+        return finished, now
+
+    def _picture(
+        self, stem: Path, camera: Camera, renderer: Renderer
+    ) -> tuple[PictureFile, Radiance]:
+        """Return the picture of one renderer, from an equal file or rendered.
+
+        Equal headers and pictures give equal bytes.
+        """
+        plan = self._plan
+        path = Path(f"{stem}.{renderer.name}.exr" if len(plan.renderers) > 1 else f"{stem}.exr")
+        header = header_of(renderer, self._source.name, self._sha256, camera)
+        existing = load_matching_picture(path, header) if plan.output.is_sequence else None
         if existing is not None:
             return existing
         seconds = 0.0
         loaded = self._loaded.get(renderer.name)
         if loaded is None:
-            loaded = self._loaded[renderer.name] = renderer.load(self.scene, self._source.name)
+            loaded = self._loaded[renderer.name] = renderer.load(self._scene, self._source.name)
             self.notes += [f"{self._source.name}: {note}" for note in loaded.notes]
             seconds = loaded.seconds
         began = time.perf_counter()
         image = loaded.render(camera, self._on_progress)
         seconds += time.perf_counter() - began
-        return write_picture(path, header, image, {**image.facts, **self._facts}, seconds)
-
-
-def _finish(
-    shot: Shot,
-    scene: _SceneAtHand,
-    made: Mapping[str, tuple[PictureFile, Radiance]],
-    look: Look,
-    before: Frame | None,
-) -> tuple[FinishedShot, Frame | None]:
-    """Write the PNG; return the finished shot, and the frame if there are both renderers."""
-    files = {name: file for name, (file, _) in made.items()}
-    radiances = {name: radiance_rgb for name, (_, radiance_rgb) in made.items()}
-    now = None
-    agreement = None
-    if len(made) == 1:
-        (radiance_rgb,) = radiances.values()
-        pixels = display_pixels(radiance_rgb, look)
-    else:
-        traced = radiances["mitsuba"]
-        neural = radiances["neural"]
-        pixels = comparison_sheet(traced, neural, look)
-        agreement = psnr_log_db(neural, traced)
-        now = Frame(
-            source=shot.source,
-            error_RR3=log10_radiance(neural) - log10_radiance(traced),
-            noise_floor_db=float(files["mitsuba"].facts["noise_floor_db"]),
-        )
-    write_atomically(shot.png, encode_png(pixels))
-    finished = FinishedShot(
-        shot=shot,
-        scene_sha256=scene.sha256,
-        num_triangles=scene.scene.num_triangles,
-        num_lights=num_lights(scene.scene),
-        pictures=files,
-        psnr_log_db=agreement,
-        flicker=flicker(before, now) if now else None,
-    )
-    return finished, now
+        facts = {**image.facts, **(plan.choice.facts if plan.choice else {})}
+        named = {_PREFIX + name: value for name, value in {**header, **facts}.items()}
+        layers_rgb = {"": image.radiance_rgb, **image.layers_rgb}
+        write_atomically(path, encode_layers(layers_rgb, named))
+        radiance_rgb = rounded_to_half(image.radiance_rgb)  # as the file holds it
+        is_black = not radiance_rgb.any()
+        return PictureFile(path=path, facts=facts, is_black=is_black, seconds=seconds), radiance_rgb
 
 
 def _caveats(renderer: Renderer, finished: Sequence[FinishedShot]) -> list[str]:

@@ -60,10 +60,7 @@ def read_deployments() -> list[dict[str, Any]]:
     """Return the rows of prefect.yaml."""
     import yaml
 
-    rows: list[dict[str, Any]] = yaml.safe_load((FILES_ROOT / "prefect.yaml").read_text())[
-        "deployments"
-    ]
-    return rows
+    return list(yaml.safe_load((FILES_ROOT / "prefect.yaml").read_text())["deployments"])
 
 
 def _deploy_flow(row: dict[str, Any]) -> None:

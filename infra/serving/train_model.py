@@ -13,7 +13,13 @@ from prefect.concurrency.sync import concurrency
 from prefect.logging import get_run_logger
 
 from infra.train_options import TrainOptions
-from pipeline.flows.forms import PublicUrl, options_of_form, overrides_form, parameters_of
+from pipeline.flows.forms import (
+    PublicUrl,
+    options_of_form,
+    overrides_form,
+    parameters_of,
+    run_name,
+)
 from pipeline.flows.prefect_server import GPU_LIMIT, run_to_end
 from pipeline.renders.mitsuba_variant import visible_gpus
 from storage.aliases import PRESET_ALIASES
@@ -50,15 +56,7 @@ def train_options(parameters: Mapping[str, Any]) -> TrainOptions:
     return options
 
 
-def _run_name() -> str:
-    """Return the name of the flow run: training preset and folder."""
-    from prefect.runtime import flow_run
-
-    parameters = {"run": TrainOptions.run, **flow_run.parameters}
-    return "-".join(filter(None, [parameters["run"], parameters.get("out")]))
-
-
-@flow(name="train-model", flow_run_name=_run_name, persist_result=False)
+@flow(name="train-model", flow_run_name=run_name, persist_result=False)
 @parameters_of(TrainOptions, **TRAIN_FORMS)
 def train_model(**parameters: Any) -> None:
     """Train a model on a dataset, in processes of its own; a run that is cancelled is saved.

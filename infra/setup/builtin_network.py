@@ -68,11 +68,12 @@ def main(
     dataset = open_dataset(data)
     weights = folder.weights.read_bytes()
     about = json.loads(folder.settings.read_text())
-    judged = json.loads((evaluation / "evaluation.json").read_text())
+    every = [json.loads((each / "evaluation.json").read_text()) for each in (evaluation, *also)]
+    judged, *other_evaluations = every
     _check(dataset, weights, about, judged["about"])
-    other_evaluations = [json.loads((each / "evaluation.json").read_text()) for each in also]
-    for each in other_evaluations:
-        _require_same(each["about"], weights)
+    for each in every:
+        if each["about"]["network sha256"] != network_digest(decode_weights(weights)):
+            raise TrilightError("builtin network: another network was judged.")
     place = BUILTIN_NETWORKS[name]
     summary = json.loads(folder.summary.read_text())
     lines = [f"# The network `{name}`", "", _HEADS[name], ""]
@@ -113,12 +114,6 @@ def _check(
     ):
         if not law:
             raise TrilightError(f"builtin network: {complaint}.")
-    _require_same(judged, weights)
-
-
-def _require_same(judged: Mapping[str, Any], weights: bytes) -> None:
-    if judged["network sha256"] != network_digest(decode_weights(weights)):
-        raise TrilightError("builtin network: another network was judged.")
 
 
 def _card(

@@ -10,7 +10,6 @@ outside the navigation, to which the links lead.
 import os
 import posixpath
 import re
-from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
@@ -31,7 +30,8 @@ def on_files(files: Files, config: Any) -> Files:
     known = set(waiting)
     while waiting:
         page = waiting.pop()
-        for target in _targets(page, (ROOT / page).read_text()):
+        for match in LINK.finditer((ROOT / page).read_text()):
+            target = _resolve_link(page, match[3])
             if target in known or target.startswith("docs/") or not (ROOT / target).is_file():
                 continue
             known.add(target)
@@ -69,11 +69,6 @@ def on_page_markdown(markdown: str, page: Any, config: Any, files: Files) -> str
         return f"{bang}[{words}]({target}{anchor})"
 
     return LINK.sub(replace_link, markdown)
-
-
-def _targets(page: str, text: str) -> Iterator[str]:
-    for match in LINK.finditer(text):
-        yield _resolve_link(page, match[3])
 
 
 def _resolve_link(page: str, target: str) -> str:

@@ -33,7 +33,7 @@ from scene_templates.surfaces.procedural_textures import OUR_SURFACES, SURFACES,
 from scene_templates.surfaces.texels import Texels
 from storage.markdown import table
 from storage.records.material import PUBLISHED_COLUMNS, laid_out
-from storage.records.passes.declared import MOTION, Pass, declared_passes
+from storage.records.passes.declared import MOTION, declared_passes
 from storage.records.quantities import QUANTITIES
 from storage.records.scene import Scene
 from storage.seeds import rng_for
@@ -92,22 +92,17 @@ def every_command() -> list[Command]:
 
 def _commands(group: App, name: str) -> Iterator[Command]:
     if group.default_command is not None:
-        options = tuple(map(_option, group.assemble_argument_collection()))
-        yield Command(name=name, help=group.help, options=options)
+        options = []
+        for argument in group.assemble_argument_collection():
+            field = argument.field_info.name
+            by_place = argument.index is not None
+            names = (PRESETS.get(field, field.upper()),) if by_place else tuple(argument.names)
+            takes = argument.parameter.metavar or ""
+            options.append(Option(field, names, takes, str(argument.parameter.help)))
+        yield Command(name, group.help, tuple(options))
     for inner in group:
         if not inner.startswith("-"):
             yield from _commands(group[inner], f"{name} {inner}")
-
-
-def _option(argument: Any) -> Option:
-    by_place = argument.index is not None
-    name: str = argument.field_info.name
-    return Option(
-        field=name,
-        names=(PRESETS.get(name, name.upper()),) if by_place else tuple(argument.names),
-        takes=argument.parameter.metavar or "",
-        help=argument.parameter.help,
-    )
 
 
 def command_line_page() -> str:
@@ -347,24 +342,24 @@ _SEEDS = 32
 
 def passes_page() -> str:
     """Return the page of passes, with meaning, channels, unit and averaging."""
-    rows = [_row(each) for each in declared_passes()]
+    rows = [
+        (
+            f"`{each.name}`",
+            f"`{each.short}`" if each.short and stored else "",
+            each.means,
+            " ".join(each.channels) or "1",
+            *(each.unit, each.frame, each.averaging),
+            " ".join(f"`{channel}`" for channel in each.exr_channels) if stored else "",
+            str(_STORED_KB.get(each.name, "")),
+        )
+        for each in declared_passes()
+        for stored in [each.name != MOTION]
+    ]
     columns = (
         *("pass", "shorter", "what it means", "channels", "unit", "frame", "averaging"),
         *("in OpenEXR", "kB"),
     )
     return f"{_PASSES}\n{table(columns, rows)}\n"
-
-
-def _row(each: Pass) -> tuple[str, ...]:
-    channels = " ".join(each.channels) or "1"
-    stored = each.name != MOTION
-    return (
-        f"`{each.name}`",
-        f"`{each.short}`" if each.short and stored else "",
-        *(each.means, channels, each.unit, each.frame, each.averaging),
-        " ".join(f"`{channel}`" for channel in each.exr_channels) if stored else "",
-        str(_STORED_KB.get(each.name, "")),
-    )
 
 
 def quantities_page() -> str:

@@ -11,7 +11,7 @@ import json
 import sys
 import tempfile
 import time
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -81,7 +81,13 @@ def main() -> None:
     errors = dict[int, Errors]()
     costs = dict[int, Costs]()
     network = NeuralRenderer.load("builtin:tokens", device="cpu")
-    with _children() as (child, rendering):
+    with (
+        tempfile.TemporaryDirectory() as name,
+        contextlib.closing(
+            composing_child(held_out_settings(), BENCHMARK, Path(name), threads=1)
+        ) as child,
+        contextlib.closing(RenderChild(choose_variant(), threads=1)) as rendering,
+    ):
         renderers = {px: _renderers_at(px, network, rendering) for px in WIDTHS}
         for index in range(SCENES):
             sys.stdout.write(f"scene {index + 1} of {SCENES}\n")
@@ -119,26 +125,21 @@ def table_of(
     return PreviewTable(
         scenes=len(errors),
         errors=tuple(
-            _way_error(px, method, [one[px][method] for one in errors.values()])
+            PreviewError(
+                rung="network" if (spp, denoiser) == NETWORK else "traced",
+                spp=spp,
+                denoiser=denoiser,
+                width=px,
+                median_db=round(float(np.median(errors_db)), 2),
+                least_db=round(min(errors_db), 2),
+            )
             for px in WIDTHS
-            for method in (NETWORK, *ladder(px))
+            for spp, denoiser in (NETWORK, *ladder(px))
+            for errors_db in [[one[px][spp, denoiser] for one in errors.values()]]
         ),
         costs=_picture_costs(machine, list(costs.values()), np.median),
         probe=_picture_costs(machine, [costs[index] for index in PROBES], np.mean),
     )
-
-
-@contextlib.contextmanager
-def _children() -> Iterator[tuple[IsolatedChild, RenderChild]]:
-    """Yield a child that composes scenes and references, and one that renders."""
-    with (
-        tempfile.TemporaryDirectory() as name,
-        contextlib.closing(
-            composing_child(held_out_settings(), BENCHMARK, Path(name), threads=1)
-        ) as composing,
-        contextlib.closing(RenderChild(choose_variant(), threads=1)) as rendering,
-    ):
-        yield composing, rendering
 
 
 def _errors_of(
@@ -178,17 +179,6 @@ def _costs_of(network: Renderer, child: IsolatedChild, scene: Scene, px: int) ->
         core_s[NETWORK_SCENE] = loaded.cpu_seconds or 0.0
         core_s[NETWORK_VIEW] = view.cpu_seconds or 0.0
     return core_s
-
-
-def _way_error(px: int, method: Method, errors_db: list[float]) -> PreviewError:
-    return PreviewError(
-        rung="network" if method == NETWORK else "traced",
-        spp=method[0],
-        denoiser=method[1],
-        width=px,
-        median_db=round(float(np.median(errors_db)), 2),
-        least_db=round(min(errors_db), 2),
-    )
 
 
 def _picture_costs(

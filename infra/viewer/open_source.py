@@ -105,8 +105,7 @@ def open_handlers(source: str, *, checkpoint: str | None, threads: int | None) -
         TrilightError: the source is unusable.
     """
     from infra.render.path_tracer import RenderChild
-    from infra.viewer.dataset_handlers import DatasetHandlers
-    from infra.viewer.folder_handlers import FolderHandlers
+    from infra.viewer.list_handlers import DatasetHandlers, FolderHandlers
     from infra.viewer.scene_handlers import handlers_of_scene
     from pipeline.exchange.open_scene import scene_source
     from pipeline.exchange.reader import SceneReader

@@ -99,10 +99,11 @@ def sky_bytes(scene: Scene) -> bytes:
     float32, v rising, after its width and height as two unsigned integers.
     """
     assert scene.environment is not None
-    sky = dataclasses.replace(
-        scene.environment, radiance_rgb=_downsample_map(scene.environment.radiance_rgb)
-    )
-    rows = len(sky.radiance_rgb)
+    texels = scene.environment.radiance_rgb
+    step = max(1, len(texels) // _SKY_ROWS)  # blocks of texels are averaged
+    rows = len(texels) // step
+    blocks = texels[: rows * step, : 2 * rows * step].reshape(rows, step, 2 * rows, step, 3)
+    sky = dataclasses.replace(scene.environment, radiance_rgb=blocks.mean(axis=(1, 3)))
     height = (np.arange(rows) + 0.5) / rows * np.pi - np.pi / 2
     around = (np.arange(2 * rows) + 0.5) / rows * np.pi - np.pi
     flat = np.cos(height)[:, None]
@@ -111,15 +112,6 @@ def sky_bytes(scene: Scene) -> bytes:
     rgba = np.ones((rows, 2 * rows, 4), "<f4")
     rgba[..., :3] = environment_values(sky, directions)
     return struct.pack("<II", 2 * rows, rows) + rgba.tobytes()
-
-
-def _downsample_map(radiance_rgb: NDArray[np.float32]) -> NDArray[np.float32]:
-    """Return a map of fewer than twice _SKY_ROWS rows, by averaging blocks of texels."""
-    step = max(1, len(radiance_rgb) // _SKY_ROWS)
-    rows = len(radiance_rgb) // step
-    cut = radiance_rgb[: rows * step, : 2 * rows * step]
-    means: NDArray[np.float32] = cut.reshape(rows, step, 2 * rows, step, 3).mean(axis=(1, 3))
-    return means
 
 
 def _groups(scene: Scene) -> tuple[NDArray[np.int64], list[Mapping[str, int]]]:

@@ -6,14 +6,11 @@ so that switching back to one costs nothing. Pictures of one scene, camera and w
 with the best of them: the one stored in the file, else the path traced one.
 """
 
-import dataclasses
 import itertools
 import json
-import re
 import shlex
 import tempfile
 import threading
-from abc import ABC, abstractmethod
 from collections import OrderedDict
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
@@ -38,16 +35,12 @@ from infra.viewer.server import (
     Request,
     Response,
     Routes,
-    dispatch,
     json_response,
-    static_routes,
 )
 from pipeline.documents.png import encode_png
-from pipeline.documents.scene_page import preview
 from pipeline.exchange.convert import write_scene
 from pipeline.exchange.formats import FORMATS, LoadedScene
 from pipeline.exchange.renderformer_json import camera_entry
-from storage.conventions import preview_gain
 from storage.errors import TrilightError
 from storage.metrics import psnr_log_db
 from storage.records.lights import num_lights
@@ -280,14 +273,7 @@ CAMERA = "camera.json"
 EDITED = "scene.safetensors"
 """Names of saved files in the commands that the page shows."""
 
-MOST_THUMBNAILS = 1000
-"""Maximum number of small pictures that a page keeps."""
-
 _OCTETS = "application/octet-stream"
-MOST_OPEN = 3
-"""Maximum number of scenes whose pages stay open."""
-
-_BELOW = re.compile(r"scene/([^/]+)/(.*)", re.DOTALL)
 
 
 @dataclass(kw_only=True, eq=False)
@@ -407,19 +393,16 @@ class SceneHandlers:
         if job.image is None:
             raise NotFound("the picture has not begun yet.")
         if request.query.get("as") == "error":
-            pixels = self._error_of(job)
+            reference = self.queue.reference(job)
+            if reference is None or agreement_db(job, reference) is None:
+                raise TrilightError("There is nothing to judge this picture by yet.")
+            assert reference.image is not None
+            pixels = error_picture(job.image.radiance_rgb, reference.image.radiance_rgb)
         elif isinstance(job.image, PassImage):
             pixels = job.image.pixels
         else:
             pixels = _tone_map(job.image.radiance_rgb, request.query)
         return Response(body=encode_png(pixels), kind="image/png")
-
-    def _error_of(self, job: RenderJob) -> NDArray[np.uint8]:
-        reference = self.queue.reference(job)
-        if agreement_db(job, reference) is None:
-            raise TrilightError("There is nothing to judge this picture by yet.")
-        assert job.image is not None and reference is not None and reference.image is not None
-        return error_picture(job.image.radiance_rgb, reference.image.radiance_rgb)
 
     def _export(self, request: Request) -> Response:
         body = request.body if isinstance(request.body, dict) else {}
@@ -466,11 +449,6 @@ def handlers_of_scene(
     )
 
 
-def thumbnail_png(radiance_rgb: NDArray[np.float32], width: int) -> bytes:
-    """Return a picture [R, R, 3] of linear radiance as a small PNG, exposed for looking."""
-    return encode_png(preview(radiance_rgb * preview_gain(radiance_rgb), width))
-
-
 def _job_record(job: RenderJob, reference: RenderJob | None) -> Mapping[str, Any]:
     image = job.image
     sampling = job.sampling
@@ -510,53 +488,3 @@ def _tone_map(radiance_rgb: NDArray[np.float32], query: Mapping[str, str]) -> ND
     if not -32 <= exposure_ev <= 32:
         raise TrilightError(f"ev is {exposure_ev}; expected -32 to 32.")
     return tone_mapped(radiance_rgb * np.float32(2.0**exposure_ev), tone_map)
-
-
-class SceneListHandlers(ABC):
-    """Handlers of a page of many scenes: thumbnails, and the page of a scene at `scene/KEY/`."""
-
-    key: re.Pattern[str]
-    """Pattern of the keys of scenes."""
-
-    def __init__(self, child: RenderChild, checkpoint: str | None) -> None:
-        """Open no scene yet; render child and checkpoint are for the pages of the scenes."""
-        self._child = child
-        self._checkpoint = checkpoint
-        self._opening = threading.Lock()
-        self._open = OrderedDict[str, SceneHandlers]()
-
-    def routes(self) -> Routes:
-        """Return the routes of the page's requests."""
-        return {
-            "GET api/thumbnail/": self._thumbnail,
-            "GET scene/": self._below,
-            "POST scene/": self._below,
-        }
-
-    def close(self) -> None:
-        """Stop rendering, and wait for its end."""
-        for room in self._open.values():
-            room.close()
-        self._child.close()
-
-    @abstractmethod
-    def _thumbnail(self, request: Request) -> Response:
-        """Respond with the small picture of a scene."""
-
-    @abstractmethod
-    def _open_scene(self, key: str) -> SceneHandlers:
-        """Return the handlers of a scene; raises TrilightError without such a scene."""
-
-    def _below(self, request: Request) -> Response:
-        """Respond to a request below a scene's page; the most recent scenes stay open."""
-        match = _BELOW.fullmatch(request.path)
-        if match is None or not self.key.fullmatch(match[1]):
-            raise NotFound("there is no such scene.")
-        key = match[1]
-        with self._opening:
-            room = self._open.pop(key, None) or self._open_scene(key)
-            self._open[key] = room
-            while len(self._open) > MOST_OPEN:
-                self._open.popitem(last=False)[1].queue.cancel_all()
-        below = dataclasses.replace(request, path=match[2])
-        return dispatch({**static_routes("scene.html"), **room.routes()}, below)

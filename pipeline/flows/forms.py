@@ -150,6 +150,7 @@ def run_name() -> str:
     """Return the name of the starting flow run: preset, number of scenes and output folder."""
     from prefect.runtime import flow_run
 
-    parameters = {"build": GenerateOptions.build, **flow_run.parameters}
-    parts = (parameters["build"], parameters.get("scenes"), parameters.get("out"))
-    return "-".join(str(part) for part in parts if part is not None)
+    parameters = flow_run.parameters
+    preset = parameters.get("build") or parameters.get("run") or GenerateOptions.build
+    parts = (preset, parameters.get("scenes"), parameters.get("out"))
+    return "-".join(map(str, filter(None, parts)))

@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from infra.release.release_page import write_page
+from infra.release.__main__ import write_page
 from pipeline.documents.distributions import dataset_distributions
 from pipeline.documents.quality_page import Pair, encode_quality_page
 from pipeline.documents.report import write_report

@@ -7,7 +7,7 @@ from pathlib import Path
 
 import pytest
 
-from infra import doctor
+from infra.cli import doctor
 from infra.planning import MeasuredScenes, describe_run, measure_scenes, predict_cost
 from pipeline.executors.threads import ThreadRunner
 from pipeline.flows import prefect_server
@@ -25,7 +25,7 @@ from tests.pipeline.generation.tiny_scenes_kit import Undocumented, tiny_order, 
 
 
 def _measured(core_s: tuple[float, ...], num_bytes: int = 150_000) -> MeasuredScenes:
-    return MeasuredScenes(core_s=core_s, num_bytes=(num_bytes,) * len(core_s), num_views=4)
+    return MeasuredScenes(core_s=core_s, num_bytes=(num_bytes,) * len(core_s))
 
 
 def test_equal_scenes_add_up_exactly() -> None:

@@ -10,25 +10,25 @@ export async function ask(path, body) {
   } catch {
     throw new Error("The server does not answer: has `trilight view` ended?");
   }
-  if (!answer.ok) throw new Error(await sentence(answer));
-  return answer;
+  if (answer.ok) return answer;
+  const told = await answer.json().catch(() => ({ error: `The server answered ${answer.status}.` }));
+  throw new Error(told.error);
 }
 
 export async function askJson(path, body) {
   return (await ask(path, body)).json();
 }
 
-async function sentence(answer) {
-  try {
-    return (await answer.json()).error;
-  } catch {
-    return `The server answered ${answer.status}.`;
-  }
-}
-
 export const byId = (name) => document.getElementById(name);
 
 export const some = (count, what) => `${count.toLocaleString("en")} ${what}${count === 1 ? "" : "s"}`;
+
+// Says how many are shown, and offers the others.
+export function page(shown, matching, all) {
+  byId("count").textContent = `${matching.toLocaleString("en")} of ${all}`
+    + (shown < matching ? `, the first ${shown} shown` : "");
+  byId("more").hidden = shown >= matching;
+}
 
 export function say(error) {
   const place = document.getElementById("mistake");

@@ -1,6 +1,6 @@
 // The page of a dataset: any number of scenes, of which only those in sight are fetched.
 
-import { askJson, byId, copy, element, KeptForm, onChange, say, sleep, some } from "./ask.js";
+import { askJson, byId, copy, element, KeptForm, onChange, page, say, sleep, some } from "./ask.js";
 
 const form = byId("filters");
 const LOOK_AGAIN_MS = 700;
@@ -32,10 +32,7 @@ async function show(first) {
     }
     rows.push(...found.rows);
     byId("scenes").append(...found.rows.map(card));
-    byId("count").textContent = `${found.total.toLocaleString("en")} of ${
-      found.of.toLocaleString("en")} scenes${rows.length < found.total
-      ? `, the first ${rows.length} shown` : ""}`;
-    byId("more").hidden = rows.length >= found.total;
+    page(rows.length, found.total, `${found.of.toLocaleString("en")} scenes`);
     byId("command-part").hidden = !found.command;
     byId("command").textContent = found.command;
     say("");

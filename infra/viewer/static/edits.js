@@ -1,8 +1,9 @@
 // Lamps that are moved and materials that are changed, and what the page says of them.
 
+import { byId } from "./ask.js";
+import { Color } from "./three/three.module.min.js";
+
 const encoded = (x) => (x <= 0.0031308 ? 12.92 * x : 1.055 * x ** (1 / 2.4) - 0.055);
-const linear = (s) => (s <= 0.04045 ? s / 12.92 : ((s + 0.055) / 1.055) ** 2.4);
-const byId = (name) => document.getElementById(name);
 const MOST_OF_ONE = 12; // materials of one thing that are listed one by one
 
 export class Edits {
@@ -151,9 +152,4 @@ function toHex(colour) {
   return `#${digits.join("")}`;
 }
 
-function fromHex(text) {
-  return [1, 3, 5].map((at) => {
-    const value = linear(parseInt(text.slice(at, at + 2), 16) / 255);
-    return Math.round(value * 1e5) / 1e5;
-  });
-}
+const fromHex = (text) => new Color(text).toArray().map((value) => Math.round(value * 1e5) / 1e5);

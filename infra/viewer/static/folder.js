@@ -1,6 +1,6 @@
 // The page of a folder of scene files: names at once, and of those in sight what they hold.
 
-import { askJson, byId, element, KeptForm, onChange, say, some } from "./ask.js";
+import { askJson, byId, element, KeptForm, onChange, page, say, some } from "./ask.js";
 
 const form = byId("filters");
 const kept = new KeptForm(form);
@@ -67,9 +67,7 @@ function card(number) {
 function more() {
   byId("scenes").append(...shown.slice(cards, cards + PAGE).map(card));
   cards = Math.min(shown.length, cards + PAGE);
-  byId("more").hidden = cards >= shown.length;
-  byId("count").textContent = `${shown.length.toLocaleString("en")} of ${some(files.length, "file")}`
-    + (cards < shown.length ? `, the first ${cards} shown` : "");
+  page(cards, shown.length, some(files.length, "file"));
 }
 
 function filter() {

@@ -14,9 +14,16 @@ import numpy as np
 import pytest
 
 from infra.release import push_to_hub as pushing
-from infra.release.__main__ import _sum_and_say, _write_network
+from infra.release.__main__ import (
+    NETWORK,
+    RIVALS,
+    SceneComparison,
+    _sum_and_say,
+    _write_network,
+    chosen_scenes,
+    write_page,
+)
 from infra.release.push_to_hub import kind_of, planned_upload, require_within_limits
-from infra.release.release_page import NETWORK, RIVALS, SceneComparison, chosen_scenes, write_page
 from model.open import open_network
 from pipeline.documents.checksums import SUMS, published_files
 from storage.dataset.dataset import Dataset, open_dataset

@@ -22,11 +22,17 @@ from infra.render.networks import (
 )
 from infra.render.options import RenderOptions
 from infra.render.path_tracer import MOST_SCENES, PathTracer, RenderChild, RenderWorker
-from infra.render.plan import plan_render
+from infra.render.plan import (
+    camera_path,
+    orbit,
+    own_camera,
+    pair_cameras,
+    plan_render,
+    scene_sources,
+)
 from infra.render.quality import FixedSamples, ToStatedError
 from infra.render.raw_references import RawReference, true_error, true_error_db
 from infra.render.run_render import Frame, flicker
-from infra.render.sources import camera_path, orbit, own_camera, pair_cameras, scene_sources
 from model.config import hits_smoke
 from model.inference import NeuralRenderer
 from pipeline.exchange.open_scene import SceneSource
@@ -325,11 +331,10 @@ def test_a_plan_has_all_that_was_asked(source: Path, tmp_path: Path) -> None:
     """One picture is of the scene's own camera; both engines share the width."""
     one = {"out": tmp_path / "new/x.exr", "view": 1, "threads": 3}
     plan = plan_render(RenderOptions(source=str(source), **one), HereReader())  # type: ignore[arg-type]
-    (shot,), (tracer,) = plan.shots, plan.renderers
+    ((_, camera),), (tracer,) = plan.pairs, plan.renderers
     assert isinstance(tracer, PathTracer)
     assert (tracer.child.threads, tracer.settings.resolution, plan.resolution) == (3, 512, 512)
-    assert (shot.camera, shot.png) == (1, tmp_path / "new/x.png")
-    assert shot.exrs == {"mitsuba": tmp_path / "new/x.exr"}
+    assert (camera, plan.output.stem_of(0)) == (1, tmp_path / "new/x")
     network = str(write_network(tmp_path / "model.safetensors"))
     asked = RenderOptions(
         source=str(source), out=tmp_path / "turn.webp", engine="both", checkpoint=network,
@@ -341,12 +346,8 @@ def test_a_plan_has_all_that_was_asked(source: Path, tmp_path: Path) -> None:
     assert mitsuba.settings.resolution == neural.resolution == plan.resolution == 16
     assert neural.checkpoint == network
     assert plan.output.video == tmp_path / "turn.webp"
-    assert len(plan.shots) == 3
-    last, folder = plan.shots[2], tmp_path / "turn"
-    assert isinstance(last.camera, Camera)
-    assert (last.camera.name, last.camera.view) == ("picture 000002", None)
-    assert last.exrs == {name: folder / f"000002.{name}.exr" for name in ("mitsuba", "neural")}
-    assert last.png == folder / "000002.png"
+    assert len(plan.pairs) == 3 and all(isinstance(camera, Camera) for _, camera in plan.pairs)
+    assert plan.output.stem_of(2) == tmp_path / "turn/000002"
 
 
 def test_the_pictures_of_a_turn_share_the_loading_of_its_scene(

@@ -10,9 +10,16 @@ from PIL import Image as Picture
 
 from infra.render import tone_mapping as look_module
 from infra.render.networks import RendererHere, SceneHere
-from infra.render.plan import OutputPaths, RenderPlan, output_paths, shots, write_video
+from infra.render.plan import (
+    OutputPaths,
+    RenderPlan,
+    orbit,
+    output_paths,
+    own_camera,
+    pair_cameras,
+    write_video,
+)
 from infra.render.run_render import FinishedShot, run_plan
-from infra.render.sources import orbit, own_camera, pair_cameras
 from infra.render.tone_mapping import Look, tone_mapped
 from pipeline.exchange.open_scene import SceneSource
 from storage.conventions import preview_srgb8
@@ -35,6 +42,7 @@ class FlatRenderer(RendererHere):
         self.setting = setting
         self.opened = 0
         self.rendered = 0
+        self.asked: list[str] = []
 
     @property
     def identity(self) -> Mapping[str, Any]:
@@ -46,6 +54,7 @@ class FlatRenderer(RendererHere):
 
     def render(self, camera: Camera) -> Image:
         self.rendered += 1
+        self.asked.append(camera.name)
         picture = np.full((16, 16, 3), 3 + camera.c2w[0, 3], np.float32)
         facts = {"number": self.rendered, "half": 0.5}
         return Image(radiance_rgb=picture, cpu_seconds=0.0, facts=facts)
@@ -68,7 +77,6 @@ def run(
     pairs: Pairs,
     look: Look = Look(),  # noqa: B008
 ) -> tuple[Sequence[FinishedShot], Sequence[str]]:
-    where = output_paths(out)
     plan = RenderPlan(
         source="tiny",
         view=0,
@@ -76,8 +84,8 @@ def run(
         renderers=renderers,
         resolution=16,
         look=look,
-        output=where,
-        shots=list(shots(pairs, where, [each.name for each in renderers])),
+        output=output_paths(out),
+        pairs=pairs,
         fps=24,
     )
     return run_plan(plan, HereReader(), lambda done, total: None, lambda now: None)
@@ -89,6 +97,7 @@ def test_pictures_are_numbered_and_what_is_there_is_kept(turn: Pairs, tmp_path: 
     engine, again, nothing = FlatRenderer(), FlatRenderer(), FlatRenderer()
     first, notes = run([engine], out, turn)
     assert (engine.opened, engine.rendered) == (1, 4)
+    assert engine.asked == [f"picture {at:06d}" for at in range(4)]
     assert notes == ["tiny.safetensors: it was opened"]
     before = {path.name: path.read_bytes() for path in out.iterdir()}
     assert sorted(before) == [f"{at:06d}.{suffix}" for at in range(4) for suffix in ("exr", "png")]
@@ -99,7 +108,7 @@ def test_pictures_are_numbered_and_what_is_there_is_kept(turn: Pairs, tmp_path: 
     second, _ = run([again], out, turn)
     assert (again.opened, again.rendered) == (1, 2)
     kept = [shot.pictures["neural"] for shot in second]
-    assert [picture.was_kept for picture in kept] == [True, True, False, False]
+    assert [picture.seconds is None for picture in kept] == [True, True, False, False]
     assert kept[1].facts == first[1].pictures["neural"].facts == {"number": 2, "half": 0.5}
     for shown in ("000000.png", "000003.png"):
         assert (out / shown).read_bytes() == before[shown]

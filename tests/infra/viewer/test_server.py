@@ -21,8 +21,7 @@ from PIL import Image
 from infra.render.path_tracer import RenderChild
 from infra.viewer import open_source
 from infra.viewer import server as viewer_server
-from infra.viewer.dataset_handlers import DatasetHandlers
-from infra.viewer.folder_handlers import THUMBNAIL_PX, FolderHandlers
+from infra.viewer.list_handlers import THUMBNAIL_PX, DatasetHandlers, FolderHandlers
 from infra.viewer.open_source import DeferredHandlers, page_of, scene_list
 from infra.viewer.server import (
     MAX_BODY_BYTES,
@@ -306,7 +305,7 @@ def dataset_asker(dataset: Dataset) -> Iterator[Asker]:
         Variant(name="llvm_ad_rgb", libllvm="", note=""), threads=1
     )  # nothing is traced here
     room = DatasetHandlers(dataset, str(dataset.folder.root), child, None)
-    room.index.wait()
+    room.index._thread.join()
     with served(room, "dataset.html") as found:
         yield found
 
@@ -381,7 +380,7 @@ def test_a_damaged_shard_costs_itself_alone(tmp_path: Path) -> None:
     shard = broken.folder.root / "train-000000.tar"
     shard.write_bytes(shard.read_bytes()[:5000])
     room = DatasetHandlers(broken, "broken", cast(Any, ClosedChild()), None)
-    room.index.wait()
+    room.index._thread.join()
     assert {row.columns["split"] for row in room.index.rows} >= {"validation"}
     assert len(room.index.problems) == 1 and "train-000000.tar" in room.index.problems[0]
     room.close()

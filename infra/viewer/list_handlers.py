@@ -1,4 +1,8 @@
-"""Request handlers of a dataset's page: rows, thumbnails, and any scene as a page below it."""
+"""Request handlers of the pages of many scenes: a dataset or a folder, and any scene below it.
+
+The page of a dataset has its rows and thumbnails from the shards. A file of a folder is read when
+its row becomes visible, by one child with limits; its thumbnail has few samples.
+"""
 
 import dataclasses
 import functools
@@ -7,32 +11,113 @@ import re
 import shlex
 import threading
 import time
+
+from abc import ABC, abstractmethod
 from array import array
+from collections import OrderedDict
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
 
-from infra.render.path_tracer import RenderChild
-from infra.viewer.scene_handlers import (
-    MOST_THUMBNAILS,
-    SceneHandlers,
-    SceneListHandlers,
-    handlers_of_scene,
-    thumbnail_png,
+import numpy as np
+from numpy.typing import NDArray
+
+from infra.render.path_tracer import PathTracer, RenderChild
+from infra.render.quality import FixedSamples
+from infra.viewer.open_source import scene_list
+from infra.viewer.scene_handlers import SceneHandlers, handlers_of_scene
+from infra.viewer.server import (
+    NotFound,
+    Request,
+    Response,
+    Routes,
+    dispatch,
+    json_response,
+    static_routes,
 )
-from infra.viewer.server import NotFound, Request, Response, Routes, json_response
+from pipeline.documents.png import encode_png
+from pipeline.documents.scene_page import preview
 from pipeline.exchange.formats import LoadedScene
+from pipeline.exchange.open_scene import scene_source
+from pipeline.exchange.reader import SceneReader
 from pipeline.generation.derive_dataset import Selection, columns_of
 from pipeline.shards.finished_dataset import SceneFacts
+from storage.conventions import preview_gain
 from storage.dataset.dataset import Dataset, reading
 from storage.dataset.manifest import ShardEntry
 from storage.dataset.shard import Member, ShardReader
 from storage.errors import TrilightError, expected_one_of
 from storage.records.exr import decode_exr
+from storage.records.lights import num_lights
 from storage.records.profiles import PACKED, PLAIN
 from storage.records.safe_read import safetensors_header, unpack_gzip
 from storage.remote.safe_url import safe_url
 from storage.settings.overrides import option_words
+from storage.renderer import Camera
+
+MOST_OPEN = 3
+"""Maximum number of scenes whose pages stay open."""
+
+MOST_THUMBNAILS = 1000
+"""Maximum number of small pictures that a page keeps."""
+
+_BELOW = re.compile(r"scene/([^/]+)/(.*)", re.DOTALL)
+
+
+def thumbnail_png(radiance_rgb: NDArray[np.float32], width: int) -> bytes:
+    """Return a picture [R, R, 3] of linear radiance as a small PNG, exposed for looking."""
+    return encode_png(preview(radiance_rgb * preview_gain(radiance_rgb), width))
+
+
+class SceneListHandlers(ABC):
+    """Handlers of a page of many scenes: thumbnails, and the page of a scene at `scene/KEY/`."""
+
+    key: re.Pattern[str]
+    """Pattern of the keys of scenes."""
+
+    def __init__(self, child: RenderChild, checkpoint: str | None) -> None:
+        """Open no scene yet; render child and checkpoint are for the pages of the scenes."""
+        self._child = child
+        self._checkpoint = checkpoint
+        self._opening = threading.Lock()
+        self._open = OrderedDict[str, SceneHandlers]()
+
+    def routes(self) -> Routes:
+        """Return the routes of the page's requests."""
+        return {
+            "GET api/thumbnail/": self._thumbnail,
+            "GET scene/": self._below,
+            "POST scene/": self._below,
+        }
+
+    def close(self) -> None:
+        """Stop rendering, and wait for its end."""
+        for room in self._open.values():
+            room.close()
+        self._child.close()
+
+    @abstractmethod
+    def _thumbnail(self, request: Request) -> Response:
+        """Respond with the small picture of a scene."""
+
+    @abstractmethod
+    def _open_scene(self, key: str) -> SceneHandlers:
+        """Return the handlers of a scene; raises TrilightError without such a scene."""
+
+    def _below(self, request: Request) -> Response:
+        """Respond to a request below a scene's page; the most recent scenes stay open."""
+        match = _BELOW.fullmatch(request.path)
+        if match is None or not self.key.fullmatch(match[1]):
+            raise NotFound("there is no such scene.")
+        key = match[1]
+        with self._opening:
+            room = self._open.pop(key, None) or self._open_scene(key)
+            self._open[key] = room
+            while len(self._open) > MOST_OPEN:
+                self._open.popitem(last=False)[1].queue.cancel_all()
+        below = dataclasses.replace(request, path=match[2])
+        return dispatch({**static_routes("scene.html"), **room.routes()}, below)
+
 
 MOST_SCENES = 500_000
 """Maximum number of rows; a larger dataset is cut."""
@@ -74,10 +159,6 @@ class DatasetIndex:
         """Messages on shards that could not be read."""
         self._thread = threading.Thread(target=self._read_all, daemon=True)
         self._thread.start()
-
-    def wait(self) -> None:
-        """Wait until all shards are read."""
-        self._thread.join()
 
     def close(self) -> None:
         """Stop reading."""
@@ -155,38 +236,34 @@ def _num_triangles(opened: ShardReader, members: Mapping[str, Member]) -> int:
     return int(safetensors_header(head, name=suffix)["faces"]["shape"][0])
 
 
-def selection_of(query: Mapping[str, str]) -> Selection:
-    """Return the selection of a query, whose `split`, `template` and `where` are as in commands.
+def selected_rows(
+    rows: Sequence[SceneRow], query: Mapping[str, str]
+) -> tuple[list[SceneRow], Sequence[str]]:
+    """Return the rows that a query selects, in its order, and the options of commands that do so.
+
+    Args:
+        query: `split`, `template` and `where` as in commands, and `sort` and `descending`.
 
     Raises:
-        TrilightError: a condition is malformed, or on values that the index does not hold.
+        TrilightError: a condition is malformed, or on values that the index does not hold; or the
+            sort column is unknown.
     """
     stated = {name: query.get(name) or None for name in ("split", "template", "where")}
     selection = Selection(**stated)  # type: ignore[arg-type]
-    if (where := selection.condition()) and (unknown := sorted(where.names - _NAMES)):
+    where = selection.condition()
+    if where is not None and (unknown := sorted(where.names - _NAMES)):
         raise TrilightError(f"{unknown[0]}: not in the page's index; use trilight shards list.")
-    return selection
-
-
-def sorted_rows(
-    rows: Sequence[SceneRow], selection: Selection, query: Mapping[str, str]
-) -> list[SceneRow]:
-    """Return the selected rows in the order of a query, by `sort` and `descending`.
-
-    Raises:
-        TrilightError: the sort column is unknown.
-    """
     sort = query.get("sort", "key")
     if sort not in SORTS:
         raise TrilightError(f"sort is {sort:.40}; {expected_one_of(sort, SORTS)}.")
-    where = selection.condition()
     taken = [
         row
         for row in rows
         if selection.takes(row.facts) and (where is None or where.holds(row.facts.values))
     ]
     backwards = query.get("descending") == "1"
-    return sorted(taken, key=lambda row: (row.columns[sort], row.facts.key), reverse=backwards)
+    taken.sort(key=lambda row: (row.columns[sort], row.facts.key), reverse=backwards)
+    return taken, option_words(selection)
 
 
 MOST_ROWS = 200
@@ -249,8 +326,7 @@ class DatasetHandlers(SceneListHandlers):
     def _rows(self, request: Request) -> Response:
         query = request.query
         every = self.index.rows
-        selection = selection_of(query)
-        matching = sorted_rows(every, selection, query)
+        matching, words = selected_rows(every, query)
         first = int(query["from"]) if query.get("from", "").isdecimal() else 0
         page = matching[first : first + MOST_ROWS]
         return json_response(
@@ -258,7 +334,7 @@ class DatasetHandlers(SceneListHandlers):
                 "of": len(every),
                 "total": len(matching),
                 "rows": [row.columns for row in page],
-                "command": self._command(option_words(selection)),
+                "command": self._command(words),
             }
         )
 
@@ -297,3 +373,95 @@ class DatasetHandlers(SceneListHandlers):
         place = f"{Path(self._source) / shard.name}::{key}" if self._dataset.local else ""
         name = f"scene {key}, {shard.split}"
         return handlers_of_scene(name, loaded, place, self._child, self._checkpoint, floors)
+
+
+THUMBNAIL_PX = 128
+"""Width in pixels of thumbnails."""
+
+_THUMBNAIL = FixedSamples(spp=4, denoiser="fast")
+
+
+class FolderHandlers(SceneListHandlers):
+    """Handlers of a folder, and of its scenes that are open."""
+
+    key = re.compile(r"\d{1,5}", re.ASCII)
+
+    def __init__(self, root: Path, child: RenderChild, checkpoint: str | None) -> None:
+        """List the files; render child and checkpoint are for the pages of the scenes."""
+        super().__init__(child, checkpoint)
+        self._root = root
+        self._names, self._is_cut = scene_list(root)
+        self._reader = SceneReader()
+        self._reading = threading.Lock()
+        self._last: tuple[int, LoadedScene] | None = None
+        self._png = functools.lru_cache(MOST_THUMBNAILS)(self._small_png)
+
+    def routes(self) -> Routes:
+        """Return the routes of the page's requests."""
+        return {
+            **super().routes(),
+            "GET api/folder": self._facts,
+            "GET api/about/": self._about,
+        }
+
+    def close(self) -> None:
+        """Stop reading and rendering."""
+        super().close()
+        self._reader.close()
+
+    def _facts(self, _: Request) -> Response:
+        suffixes = sorted({Path(name).suffix.lower() for name in self._names})
+        return json_response(
+            {
+                "name": self._root.resolve().name,
+                "files": list(self._names),
+                "forms": suffixes,
+                "is_cut": self._is_cut,
+            }
+        )
+
+    def _about(self, request: Request) -> Response:
+        loaded = self._load(self._row(request.path.removeprefix("api/about/")))
+        scene = loaded.scene
+        return json_response(
+            {
+                "triangles": scene.num_triangles,
+                "lights": num_lights(scene),
+                "textures": len(scene.textures),
+                "views": scene.num_views,
+                "notes": len(loaded.notes),
+            }
+        )
+
+    def _thumbnail(self, request: Request) -> Response:
+        row = self._row(request.path.removeprefix("api/thumbnail/"))
+        return Response(body=self._png(row), kind="image/png")
+
+    def _small_png(self, number: int) -> bytes:
+        loaded = self._load(number)
+        if loaded.radiance_rgb is not None and len(loaded.radiance_rgb):
+            return thumbnail_png(loaded.radiance_rgb[0], THUMBNAIL_PX)
+        tracer = PathTracer(self._child, _THUMBNAIL, THUMBNAIL_PX)
+        traced = tracer.load(loaded.scene, self._names[number])
+        image = traced.render(Camera.of_scene(loaded.scene, 0))
+        return thumbnail_png(image.radiance_rgb, THUMBNAIL_PX)
+
+    def _row(self, key: str) -> int:
+        if not self.key.fullmatch(key) or int(key) >= len(self._names):
+            raise NotFound("the folder has no such file.")
+        return int(key)
+
+    def _load(self, number: int) -> LoadedScene:
+        """Return a scene; the last one is kept, since the page requests it several times."""
+        with self._reading:
+            if self._last is None or self._last[0] != number:
+                source = scene_source(str(self._root / self._names[number]))
+                self._last = (number, self._reader.load(source, pictures=True))
+            return self._last[1]
+
+    def _open_scene(self, key: str) -> SceneHandlers:
+        number = self._row(key)
+        name = self._names[number]
+        loaded = self._load(number)
+        place = str(self._root / name)
+        return handlers_of_scene(name, loaded, place, self._child, self._checkpoint)
