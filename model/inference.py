@@ -25,12 +25,12 @@ from numpy.typing import ArrayLike, NDArray
 from torch import Tensor
 
 from model.config import ModelConfig
+from model.hits.device_arrays import Replayed
 from model.hits.traced import Traced, denoise_traced
 from model.open import find_network
 from model.positions import EncodedScene
 from model.precision import set_precision
 from model.renderformer import RenderFormer, radiance
-from model.replayed import Replayed
 from model.scene_tensors import Cameras, batch_scenes, map_tensors, scene_tensors
 from model.weights import MAX_LIGHTS, TrainedRange, network_digest
 from storage.errors import TrilightError

@@ -18,13 +18,12 @@ from torch import Tensor
 from torch.nn.functional import interpolate
 
 from model import inference
-from model.config import ModelConfig, smoke
-from model.demodulated import compose_radiance
+from model.config import SIZES, ModelConfig
 from model.hits.tracing import with_traced
 from model.inference import LightGroup, NeuralRenderer, light_groups
 from model.renderformer import RenderFormer, radiance
 from model.scene_tensors import SceneTensors, scene_tensors
-from model.view_decoder import BilinearUpsample, Fusion
+from model.view_decoder import BilinearUpsample, Fusion, compose_radiance
 from model.weights import RANGE_KEY, TrainedRange, encode_weights, trained_range
 from storage.conventions import look_at_c2w
 from storage.errors import TrilightError
@@ -121,7 +120,7 @@ def test_groups_give_what_a_linear_network_gives_at_once(
 
 
 def test_extremes_give_finite_pictures() -> None:
-    model = awake(smoke(), torch.float32)
+    model = awake(SIZES["smoke"](), torch.float32)
     with torch.no_grad():
         model.decoder.head.last.weight *= 0.1
     renderer = NeuralRenderer(model)

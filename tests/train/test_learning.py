@@ -19,8 +19,7 @@ import numpy as np
 import pytest
 import torch
 
-from model.config import ModelConfig
-from model.config import smoke as smoke_model
+from model.config import SIZES, ModelConfig
 from model.hits.traced import INPUTS
 from model.inference import NeuralRenderer
 from model.open import open_network
@@ -65,7 +64,7 @@ from train.run_training import run_training
 from train.settings import AugmentationSettings, TrainSettings, learning_rate
 
 SMALL = dataclasses.replace(
-    smoke_model(), width=64, num_heads=1, hidden_width=192, encoder_layers=2, decoder_layers=2
+    SIZES["smoke"](), width=64, num_heads=1, hidden_width=192, encoder_layers=2, decoder_layers=2
 )
 
 

@@ -11,7 +11,7 @@ from typing import Any
 import pydantic
 import pytest
 
-from model.config import SIZES, large
+from model.config import SIZES
 from storage.digests import canonical_json, sha256_hex
 from storage.errors import LAST_COMMIT, TrilightError
 from storage.settings.described import settings_record
@@ -296,7 +296,7 @@ def test_every_size_can_be_asked_for_by_name() -> None:
     for name, make in SIZES.items():
         assert override_training_preset("smoke", {"model": name}).model == make()
     without = override_training_preset("pretrain", {"model.window_bundles": 0, "model": "large"})
-    assert without.model == dataclasses.replace(large(), window_bundles=0)
+    assert without.model == dataclasses.replace(SIZES["large"](), window_bundles=0)
     with pytest.raises(TrilightError, match="'model' is 'larg'; did you mean large"):
         override_training_preset("smoke", {"model": "larg"})
     with pytest.raises(TrilightError, match="resolution is 72; expected a multiple of 64"):

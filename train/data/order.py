@@ -255,11 +255,9 @@ def plan_mixture(
 def _mixture_of_header(header: Mapping[str, Any]) -> Mixture:
     """Return the mixture of a checkpoint, or that of its single dataset."""
     if RECORD in header:
-        record: dict[str, Any] = {
-            name: tuple(value) if isinstance(value, list) else value
-            for name, value in header[RECORD].items()
-        }
-        return Mixture(**record)
+        from storage.settings.described import from_record  # it loads pydantic
+
+        return from_record(Mixture, header[RECORD])
     return single_dataset(header["data_digest"], header["settings"]["scenes_per_step"])
 
 
