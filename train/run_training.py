@@ -12,8 +12,7 @@ from typing import Any
 
 import torch
 
-from model.checkpoint_format import Checkpoint, find_checkpoint, read_header, saved_steps
-from model.open import open_network
+from model.open import Checkpoint, find_checkpoint, open_network, read_header, saved_steps
 from model.renderformer import RenderFormer, count_parameters
 from model.scene_tensors import lit_sky, require_known_sky
 from model.weights import TrainedRange, decode_config, encode_weights
@@ -47,7 +46,7 @@ from train.loop.trainer import Trainer, scene_flops
 from train.loss.lpips import load_lpips
 from train.loss.training_loss import TrainingLoss
 from train.progress import TrainProgress
-from train.resume import Event, ResumePlan, StartOptions, event_records, plan_resume
+from train.resume import Event, ResumePlan, StartOptions, plan_resume
 from train.settings import TrainSettings, WatchSettings, stored_settings
 
 LOSS_SHARE = 20
@@ -276,9 +275,7 @@ def _make_judge(
         for sample in first_samples(data.split("train"), MEDIAN_SCENES, unusable)
     ]
     # no damage is allowed here: a score over fewer scenes would be another score
-    samples = list(
-        first_samples(data.split(VALIDATION), settings.validation_scenes, BadSampleCounter(0))
-    )
+    samples = list(first_samples(data.split(VALIDATION), settings.validation_scenes))
     for sample in samples:  # before any step, not at the first validation
         require_known_sky(lit_sky(sample.scene.environment), settings.model)
     return Judge(samples, settings.resolution, median_picture(training))
@@ -421,7 +418,7 @@ def _write_settings(
         "settings": stored_settings(state.settings),
         "data_digest": state.data_digest,
         **({RECORD: dataclasses.asdict(state.mixture)} if state.mixture else {}),
-        "history": event_records(state.history),
+        "history": [dataclasses.asdict(event) for event in state.history],
     }
     write_atomically(folder.settings, pretty_json(origin | _read_settings(folder) | now))
 

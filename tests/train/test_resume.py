@@ -23,7 +23,7 @@ from train.presets import (
     scale_intervals,
     training_preset,
 )
-from train.resume import ResumePlan, event_records, plan_resume
+from train.resume import ResumePlan, plan_resume
 from train.settings import AugmentationSettings, TrainSettings, known_settings, stored_settings
 
 DIGEST = "d" * 64
@@ -42,9 +42,9 @@ def header(settings: TrainSettings | None = None, *, step: int = 8, **more: Any)
 
 def following(before: dict[str, Any], going: ResumePlan, step: int) -> dict[str, Any]:
     """Return the header of a later checkpoint of a run that went on."""
-    return header(going.settings, step=step, history=event_records(going.history)) | {
-        "data_digest": before["data_digest"]
-    }
+    history = [dataclasses.asdict(event) for event in going.history]
+    later = header(going.settings, step=step, history=history)
+    return later | {"data_digest": before["data_digest"]}
 
 
 def test_the_same_command_goes_on_and_nothing_happens() -> None:

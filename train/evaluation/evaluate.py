@@ -33,7 +33,7 @@ from storage.records.sample import Sample
 from storage.records.scene import Scene
 from storage.renderer import Camera, ReadyScene, Renderer
 from storage.settings.described import checked
-from train.data.bad_samples import BadSampleCounter, first_samples
+from train.data.bad_samples import first_samples
 from train.data.scenes import TrainingScene, training_scene
 from train.evaluation.metrics import (
     GROUPED,
@@ -90,18 +90,18 @@ class EvalConfig:
 
     def samples(self) -> Iterator[Sample]:
         """Yield the samples; a damaged one raises, since the scores would be of another set."""
-        return first_samples(self.shards, self.most_scenes, BadSampleCounter(0))
+        return first_samples(self.shards, self.most_scenes)
 
 
 def make_baselines(shards: ShardSet, resolution: int) -> Baselines:
     """Return the baselines from the first scenes of a training split."""
-    samples = first_samples(shards, BASELINE_SCENES, BadSampleCounter(0))
+    samples = first_samples(shards, BASELINE_SCENES)
     return Baselines(training_scene(sample, resolution) for sample in samples)
 
 
 def stored_resolution(shards: ShardSet) -> int:
     """Return the width in pixels of the first sample's pictures."""
-    (sample,) = first_samples(shards, 1, BadSampleCounter(0))
+    (sample,) = first_samples(shards, 1)
     return int(sample.radiance_rgb.shape[1])
 
 

@@ -26,7 +26,7 @@ from storage.records.safe_read import read_plain
 from storage.records.sample import Sample
 from storage.renderer import Camera, Renderer, fingerprint
 from storage.typed_json import read_json_lines
-from train.data.bad_samples import BadSampleCounter, first_samples
+from train.data.bad_samples import first_samples
 from train.evaluation.cost_charts import on_front
 from train.evaluation.evaluate import Price, median_price, time_scene
 from train.evaluation.metrics import (
@@ -269,7 +269,7 @@ def judge_all(board: Board, on_progress: OnProgress) -> None:
         TrilightError: damaged data, or a network that cannot render a scene.
     """
     total = len(board.keys) * len(board.widths)
-    samples = first_samples(board.shards, len(board.keys), BadSampleCounter(0))
+    samples = first_samples(board.shards, len(board.keys))
     turns = ((row, sample, width) for row, sample in enumerate(samples) for width in board.widths)
     for done, (row, sample, width) in enumerate(turns):
         on_progress(done, total, "")

@@ -36,12 +36,6 @@ Scores = Mapping[str, float]
 """Score of a picture by metric."""
 
 
-def score_view(radiance_rgb: NDArray, target_rgb: NDArray, hits: NDArray[np.bool_]) -> Scores:
-    """Score one picture [R, R, 3] of linear radiance by VALIDATED; `hits` is as in `hit_masks`."""
-    scores = picture_scores(radiance_rgb, target_rgb, hits, None, VALIDATED)
-    return {name: score or 0.0 for name, score in scores.items()}
-
-
 def summarize_scores(views: Sequence[Scores]) -> dict[str, float]:
     """Return mean log_l1, and median and the worse 5th percentile of each dB value."""
     summary = {"log_l1": float(np.mean([view["log_l1"] for view in views]))}

@@ -23,11 +23,12 @@ from storage.renderer import fingerprint
 from train.data.buckets import collate_batch
 from train.data.scenes import TrainingScene, block_mean, training_scene
 from train.evaluation.metrics import (
+    VALIDATED,
     Lead,
     Scores,
     fraction_better,
     lead,
-    score_view,
+    picture_scores,
     summarize_scores,
 )
 
@@ -90,12 +91,11 @@ def median_picture(log10_pictures: Sequence[NDArray]) -> NDArray[np.float64]:
 
 
 def _small(log10_MRR3: NDArray) -> NDArray[np.float32]:
-    count, resolution = log10_MRR3.shape[:2]
+    resolution = log10_MRR3.shape[1]
     factor = max(resolution // COMPARED_PX, 1)
-    cropped_px = resolution // factor * factor
-    cropped = log10_MRR3[:, :cropped_px, :cropped_px].astype(np.float32)
-    blocks = cropped.reshape(count, cropped_px // factor, factor, cropped_px // factor, factor, 3)
-    return blocks.mean(axis=(2, 4))
+    width = resolution // factor
+    cropped = log10_MRR3[:, : width * factor, : width * factor].astype(np.float32)
+    return block_mean(cropped, width)
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -149,6 +149,12 @@ class ValidationScene:
     hits_VRR: NDArray[np.bool_]
     """True for pixels that see geometry (`hit_masks`)."""
 
+    def scores(self, pictures_VRR3: NDArray) -> list[Scores]:
+        """Score pictures [V, R, R, 3] of linear radiance by VALIDATED, view by view."""
+        views = zip(pictures_VRR3, self.target_VRR3, self.hits_VRR, strict=True)
+        every = [picture_scores(*view, None, VALIDATED) for view in views]
+        return [{name: score or 0.0 for name, score in scores.items()} for scores in every]
+
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class ValidationResult:
@@ -169,8 +175,11 @@ class Judge:
 
     def __init__(self, samples: Sequence[Sample], resolution: int, median_RR3: NDArray) -> None:
         self.scenes = [validation_scene(sample, resolution) for sample in samples]
-        stills = [np.broadcast_to(median_RR3, scene.target_VRR3.shape) for scene in self.scenes]
-        self.median_views = score_pictures(stills, self.scenes)
+        self.median_views = [
+            scores
+            for scene in self.scenes
+            for scores in scene.scores(np.broadcast_to(median_RR3, scene.target_VRR3.shape))
+        ]
         self.median_scores = summarize_scores(self.median_views)
 
     def judge(
@@ -187,9 +196,8 @@ class Judge:
         for judged in self.scenes:
             between()
             pictures.append(predict(model, judged.scene))
-        for picture, judged in zip(pictures, self.scenes, strict=True):
             between()
-            views += score_pictures([picture], [judged])
+            views += judged.scores(pictures[-1])
         scores = summarize_scores(views)
         scores["better_than_median"] = fraction_better(views, self.median_views)
         sizes = [len(scene.target_VRR3) for scene in self.scenes]
@@ -219,17 +227,6 @@ def predict(model: RenderFormer, scene: TrainingScene) -> NDArray[np.float64]:
     batch = collate_batch([scene]).to(device)
     log10_VRR3 = model(batch.scenes, scene.target_VRR3.shape[1])[0]
     return np.maximum(radiance(log10_VRR3.double()).cpu().numpy(), 0)
-
-
-def score_pictures(pictures: Sequence[NDArray], judged: Sequence[ValidationScene]) -> list[Scores]:
-    """Score the pictures [V, R, R, 3] of each scene, view by view."""
-    return [
-        score_view(picture, target, hits)
-        for pictures_VRR3, entry in zip(pictures, judged, strict=True)
-        for picture, target, hits in zip(
-            pictures_VRR3, entry.target_VRR3, entry.hits_VRR, strict=True
-        )
-    ]
 
 
 def hit_masks(scene: Scene, resolution: int) -> NDArray[np.bool_]:

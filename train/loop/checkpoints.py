@@ -20,14 +20,8 @@ from typing import Annotated, Any
 import torch
 from safetensors.torch import save
 
-from model import checkpoint_format
-from model.checkpoint_format import (
-    HEADER_KEY,
-    Checkpoint,
-    path_of_step,
-    saved_steps,
-    unreadable_error,
-)
+from model.open import HEADER_KEY, Checkpoint, path_of_step, saved_steps, unreadable_error
+from model.open import read_checkpoint as read_network_checkpoint
 from model.weights import encode_config, load_tensors
 from storage.atomic import atomic_writer, remove_leftovers
 from storage.digests import seal_of
@@ -39,7 +33,7 @@ from train.data.order import RECORD, Mixture
 from train.loop.distributed import DistributedContext
 from train.loop.step import StepReport
 from train.loop.train_state import TrainState, new_state
-from train.resume import Event, ResumePlan, event_records
+from train.resume import Event, ResumePlan
 from train.settings import Precision, decay_start_step, stored_settings
 
 UNSEALED = "0" * 64
@@ -94,7 +88,7 @@ def _encode_checkpoint(state: TrainState, world_size: int) -> bytes:
         "model": encode_config(state.settings.model),
         "data_digest": state.data_digest,
         **({RECORD: dataclasses.asdict(state.mixture)} if state.mixture else {}),
-        "history": event_records(state.history),
+        "history": [dataclasses.asdict(event) for event in state.history],
         "world_size": world_size,
         "threads": torch.get_num_threads(),
         "muon_precision": state.optimizer.muon_precision,
@@ -116,7 +110,7 @@ def _write_sealed(path: Path, data: bytes) -> None:
 
 def read_checkpoint(path: Path) -> Checkpoint:
     """Read and verify a checkpoint; raises TrilightError, with its path, if it is invalid."""
-    checkpoint = checkpoint_format.read_checkpoint(path)
+    checkpoint = read_network_checkpoint(path)
     try:
         read_json(json.dumps(checkpoint.header), _Header, "its header")
     except TrilightError as error:

@@ -6,7 +6,7 @@ import torch
 from torch import Tensor
 
 from model.hits.anchors import anchor_pixels
-from model.hits.light_filter import (
+from model.hits.decoder import (
     _ALIKE,
     _MOST_DOUBT,
     STEPS_PX,

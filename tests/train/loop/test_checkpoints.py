@@ -18,9 +18,8 @@ import pytest
 import torch
 from safetensors.torch import save as save_tensors
 
-from model.checkpoint_format import HEADER_KEY, path_of_step, saved_steps
 from model.inference import NeuralRenderer
-from model.open import find_network, open_network
+from model.open import HEADER_KEY, find_network, open_network, path_of_step, saved_steps
 from model.weights import encode_weights
 from storage.dataset.dataset import Dataset
 from storage.digests import seal_of
