@@ -142,9 +142,6 @@ def _group(scene: Scene, removed_faces: NDArray[np.int64], fraction: float) -> L
     return alone, fraction
 
 
-_FLOAT_BYTES = 4
-
-
 @dataclass(frozen=True, kw_only=True, eq=False)
 class PreparedScene:
     """A scene that is ready for any number of cameras."""
@@ -340,7 +337,8 @@ class NeuralRenderer:
     def _require_memory(self, num_triangles: int) -> None:
         """Refuse a scene of which one layer's tokens alone exceed the free memory."""
         config = self.config
-        least = num_triangles * (2 * config.hidden_width + 2 * config.width) * _FLOAT_BYTES
+        numbers = num_triangles * 2 * (config.hidden_width + config.width)
+        least = numbers * torch.float32.itemsize
         on_card = self.device.type == "cuda"
         free = int(torch.cuda.mem_get_info(self.device)[0]) if on_card else free_memory()
         if free is not None and least > free:

@@ -29,8 +29,8 @@ from train.data.loader import choose_workers, load_batches
 from train.data.order import RECORD, plan_mixture
 from train.data.scenes import training_scene
 from train.evaluation.metrics import Lead
-from train.evaluation.sheet import draw_validation_sheet, write_picture
-from train.evaluation.validation import Judge, median_picture
+from train.evaluation.sheet import write_picture
+from train.evaluation.validation import Judge, draw_validation_sheet, median_picture
 from train.folder import RunFolder, add_note, claim_run, copy_rows, pretty_json, read_rows
 from train.loop.checkpoints import (
     newest_checkpoint,

@@ -238,15 +238,11 @@ def _interp(x: Tensor, known: Tensor, values: Tensor) -> Tensor:
     return values[right - 1] + share * (values[right] - values[right - 1])
 
 
-def _nonzero(mask: Tensor) -> tuple[NDArray, ...]:
-    """Return the places of all elements: those that the mask leaves out may be given no weight."""
-    return tuple(each.ravel() for each in np.indices(mask.shape))
-
-
 _FUNCTIONS: dict[str, Callable] = {
     "flatnonzero": lambda mask: MaskedRows(mask.flatten() != 0),
     "interp": _interp,
-    "nonzero": _nonzero,
+    # the places of all elements: those that the mask leaves out may be given no weight
+    "nonzero": lambda mask: tuple(each.ravel() for each in np.indices(mask.shape)),
     "take": _take,
     "take_along_axis": torch.take_along_dim,
     "tile": lambda a, count: a.repeat(count),

@@ -90,7 +90,7 @@ def memorised(scenes: list[TrainingScene], model: ModelConfig, steps: int) -> Tr
 def score(state: TrainState, scene: TrainingScene, target: TrainingScene) -> float:
     """Return the psnr_log_db of one scene's picture against another's."""
     wanted = 10 ** target.target_VRR3[0].double().numpy() - 1
-    return psnr_log_db(predict(state.eval_model, scene)[0], wanted)
+    return psnr_log_db(predict(state.eval_model, scene.tensors, len(wanted))[0], wanted)
 
 
 @pytest.mark.slow("training")

@@ -113,21 +113,15 @@ def judge_views(config: EvalConfig, scene_done: Callable[[], None]) -> list[Judg
     """
     rows: list[JudgedView] = []
     before: SceneTensors | None = None
+    device = next(config.network.parameters()).device
     every, first = spread_views(config.tracer_views, config.num_scenes)
     for number, sample in enumerate(config.samples()):
         scene = validation_scene(sample, config.resolution)
-        if config.network.config.view_stage == "hits":
-            tensors = with_traced(
-                scene.scene.tensors,
-                config.resolution,
-                config.network.config,
-                device=next(config.network.parameters()).device,
-            )  # traced once for all predictions
-            scene = dataclasses.replace(
-                scene, scene=dataclasses.replace(scene.scene, tensors=tensors)
-            )
-        contestants = {NETWORK: predict(config.network, scene.scene)}
-        contestants |= withheld_pictures(config.network, scene.scene)
+        tensors = with_traced(  # once for all predictions
+            scene.scene.tensors, config.resolution, config.network.config, device=device
+        )
+        contestants = {NETWORK: predict(config.network, tensors, config.resolution)}
+        contestants |= withheld_pictures(config.network, tensors, config.resolution)
         grouped_VRR3 = grouped_pictures(config.network, sample.scene, config.resolution)
         if grouped_VRR3 is not None:
             contestants[GROUPED] = grouped_VRR3
@@ -142,9 +136,9 @@ def judge_views(config: EvalConfig, scene_done: Callable[[], None]) -> list[Judg
                 pictures[TRACER] = traced[view]
             scene_rows.append(judge_view(sample, scene, view, pictures, config.lpips))
         if before is not None and config.network.config.scene_tokens:
-            scene_rows = _add_swapped_scores(scene_rows, config.network, scene, before)
+            scene_rows = _add_swapped_scores(config, scene_rows, scene, tensors, before)
         rows += scene_rows
-        before = scene.scene.tensors
+        before = tensors
         scene_done()
     if not rows:
         raise TrilightError("evaluate: the split holds no scene; expected at least one.")
@@ -186,7 +180,11 @@ def _traced_pictures(
 
 
 def _add_swapped_scores(
-    rows: Sequence[JudgedView], network: RenderFormer, judged: ValidationScene, other: SceneTensors
+    config: EvalConfig,
+    rows: Sequence[JudgedView],
+    judged: ValidationScene,
+    cameras: SceneTensors,
+    other: SceneTensors,
 ) -> list[JudgedView]:
     """Return rows with the scores of predictions that are given another scene's triangles.
 
@@ -194,11 +192,10 @@ def _add_swapped_scores(
     no worse with other triangles. A network of hits keeps its own hits; only the scene's tokens are
     replaced.
     """
-    cameras = judged.scene.tensors
     seen = dataclasses.replace(other, c2w_V44=cameras.c2w_V44, fov_deg_V=cameras.fov_deg_V)
     if cameras.traced is not None:
         seen = dataclasses.replace(seen, traced=with_others_tokens(cameras.traced, other.traced))
-    pictures_VRR3 = predict(network, dataclasses.replace(judged.scene, tensors=seen))
+    pictures_VRR3 = predict(config.network, seen, config.resolution)
     return [
         dataclasses.replace(row, swapped_psnr_log_db=psnr_log_db(picture, target))
         for row, picture, target in zip(rows, pictures_VRR3, judged.target_VRR3, strict=True)
@@ -214,7 +211,7 @@ def sheet_views(config: EvalConfig, chosen: Sequence[JudgedView]) -> list[SheetV
     for sample in config.samples():
         if rows := rows_of.get(sample.key):
             scene = training_scene(sample, config.resolution)
-            pictures = predict(config.network, scene)
+            pictures = predict(config.network, scene.tensors, config.resolution)
             traced = _traced_pictures(config, sample, [row.view for row in rows])
             for row in rows:
                 sheet_view = _sheet_view(row, scene, pictures[row.view])
@@ -271,13 +268,13 @@ def grouped_pictures(
 
 
 def withheld_pictures(
-    network: RenderFormer, scene: TrainingScene
+    network: RenderFormer, scene: SceneTensors, resolution: int
 ) -> dict[str, NDArray[np.float64]]:
     """Predict a traced scene without each of the inputs, by the method's name.
 
     Scenes without traced inputs return an empty dict.
     """
-    traced = scene.tensors.traced
+    traced = scene.traced
     if traced is None:
         return {}
     pictures = {}
@@ -286,10 +283,8 @@ def withheld_pictures(
             continue
         kept_VI = torch.ones_like(traced.given_VI)
         kept_VI[:, index] = 0
-        tensors = dataclasses.replace(scene.tensors, traced=traced.without(kept_VI))
-        pictures[f"{NETWORK} without {name}"] = predict(
-            network, dataclasses.replace(scene, tensors=tensors)
-        )
+        without = dataclasses.replace(scene, traced=traced.without(kept_VI))
+        pictures[f"{NETWORK} without {name}"] = predict(network, without, resolution)
     return pictures
 
 

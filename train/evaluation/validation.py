@@ -12,15 +12,16 @@ from dataclasses import dataclass
 import numpy as np
 import torch
 from numpy.typing import NDArray
+from PIL import Image
 
 from model.renderformer import RenderFormer, radiance
+from model.scene_tensors import SceneTensors, batch_scenes, map_tensors
 from storage.conventions import log10_radiance, radiance_from_log10
 from storage.errors import TrilightError
 from storage.raycast.first_hits import first_hits
 from storage.records.sample import Sample
 from storage.records.scene import Scene
 from storage.renderer import fingerprint
-from train.data.buckets import collate_batch
 from train.data.scenes import TrainingScene, block_mean, training_scene
 from train.evaluation.metrics import (
     VALIDATED,
@@ -31,6 +32,8 @@ from train.evaluation.metrics import (
     picture_scores,
     summarize_scores,
 )
+from train.evaluation.sheet import SheetView, draw_sheet
+from train.settings import TrainSettings
 
 MEDIAN = "median picture"
 NEAREST = "nearest training view"
@@ -174,6 +177,7 @@ class Judge:
     """Validation scenes, and the scores of the median picture on them."""
 
     def __init__(self, samples: Sequence[Sample], resolution: int, median_RR3: NDArray) -> None:
+        self._resolution = resolution
         self.scenes = [validation_scene(sample, resolution) for sample in samples]
         self.median_views = [
             scores
@@ -195,7 +199,7 @@ class Judge:
         views = []
         for judged in self.scenes:
             between()
-            pictures.append(predict(model, judged.scene))
+            pictures.append(predict(model, judged.scene.tensors, self._resolution))
             between()
             views += judged.scores(pictures[-1])
         scores = summarize_scores(views)
@@ -218,14 +222,14 @@ def validation_scene(sample: Sample, resolution: int) -> ValidationScene:
 
 
 @torch.no_grad()
-def predict(model: RenderFormer, scene: TrainingScene) -> NDArray[np.float64]:
+def predict(model: RenderFormer, scene: SceneTensors, resolution: int) -> NDArray[np.float64]:
     """Return the pictures of one scene, linear radiance [V, R, R, 3] of at least 0.
 
     The network computes in float32, on its own device.
     """
     device = next(model.parameters()).device
-    batch = collate_batch([scene]).to(device)
-    log10_VRR3 = model(batch.scenes, scene.target_VRR3.shape[1])[0]
+    batch = map_tensors(batch_scenes([scene]), lambda tensor: tensor.to(device))
+    log10_VRR3 = model(batch, resolution)[0]
     return np.maximum(radiance(log10_VRR3.double()).cpu().numpy(), 0)
 
 
@@ -236,3 +240,40 @@ def hit_masks(scene: Scene, resolution: int) -> NDArray[np.bool_]:
     """
     views = range(scene.num_views)
     return np.stack([first_hits(scene, view=view, resolution=resolution).met for view in views])
+
+
+SHEET_SCENES = 8
+"""Maximum number of scenes on a validation sheet, one view each."""
+
+
+def draw_validation_sheet(
+    settings: TrainSettings, judge: Judge, validation: ValidationResult, step: int
+) -> Image.Image:
+    """Draw the sheet of the first validation scenes after a step."""
+    views = []
+    at = 0
+    scene_pictures = zip(judge.scenes, validation.pictures, strict=True)
+    for judged, pictures in list(scene_pictures)[:SHEET_SCENES]:
+        score = validation.views[at]
+        median = judge.median_views[at]
+        at += len(pictures)
+        views.append(
+            SheetView(
+                name=f"scene {judged.scene.key}, view 0",
+                scores=(
+                    f"log L1 {score['log_l1']:.4f} (median picture {median['log_l1']:.4f}), "
+                    f"{score['psnr_log_db']:.1f} dB log, {score['psnr_linear_db']:.1f} dB linear"
+                ),
+                target_rgb=judged.target_VRR3[0],
+                predicted_rgb=pictures[0],
+                noise=float(judged.scene.noise_V[0]),
+            )
+        )
+    title = (
+        f"run {settings.run}, step {step} of {settings.num_steps}, {settings.resolution} pixels: "
+        f"validation scenes, never trained on",
+        f"log L1 {validation.scores['log_l1']:.4f}, median picture of the training views "
+        f"{judge.median_scores['log_l1']:.4f}, "
+        f"{validation.scores['better_than_median']:.0%} of views better than it",
+    )
+    return draw_sheet(views, title)

@@ -17,8 +17,7 @@ from model.renderformer import count_parameters
 from storage.atomic import append_line
 from storage.errors import TrilightError
 from storage.settings.described import settings_record
-from train.evaluation.sheet import draw_validation_sheet
-from train.evaluation.validation import Judge
+from train.evaluation.validation import Judge, draw_validation_sheet
 from train.folder import RunFolder, add_note, copy_rows, read_rows
 from train.loop.train_state import TrainState
 from train.progress import TrainProgress
