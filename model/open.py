@@ -44,6 +44,7 @@ from storage.atomic import write_atomically
 from storage.digests import seal_of
 from storage.errors import TrilightError, expected_one_of
 from storage.records.safe_read import open_plain, read_plain, read_safetensors
+from storage.typed_json import read_json
 
 WEIGHTS_NAME = "model.safetensors"
 CONFIG_NAME = "config.json"
@@ -310,12 +311,15 @@ def read_header(path: Path) -> dict[str, Any]:
     return dict(json.loads(read_metadata(path)[HEADER_KEY]))
 
 
-def read_checkpoint(path: Path) -> Checkpoint:
+def read_checkpoint(path: Path, header_type: type | None = None) -> Checkpoint:
     """Read a checkpoint and verify its bytes and weights.
 
+    Args:
+        header_type: type that the header must have in full, if the whole state is restored.
+
     Raises:
-        TrilightError: no checkpoint, other bytes than were written, or weights that are no finite
-            float32 numbers; the message has the path.
+        TrilightError: no checkpoint, another header or other bytes than were written, or weights
+            that are no finite float32 numbers; the message has the path.
     """
     try:
         data = read_plain(path)
@@ -333,11 +337,9 @@ def read_checkpoint(path: Path) -> Checkpoint:
             is_weight = name.startswith(("model/", "mean/"))
             if is_weight and not (array.dtype == np.float32 and np.isfinite(array).all()):
                 raise TrilightError(f"{name} is {array.dtype}; expected finite float32 numbers")
+        if header_type is not None:
+            read_json(metadata[HEADER_KEY], header_type, "its header")
     except (OSError, ValueError, RecursionError) as error:
-        raise unreadable_error(path, error) from error
+        reason = str(error).rstrip(".")
+        raise TrilightError(f"checkpoint {path} is not readable: {reason}.") from error
     return Checkpoint(header=header, arrays=arrays)
-
-
-def unreadable_error(path: Path, error: Exception) -> TrilightError:
-    """Return the error of a checkpoint that cannot be read."""
-    return TrilightError(f"checkpoint {path} is not readable: {str(error).rstrip('.')}.")

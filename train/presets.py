@@ -63,13 +63,7 @@ _HITS = dataclasses.replace(
     ema_decay=0.998,
     validate_every=200,
     checkpoint_every=200,
-    augmentation=AugmentationSettings(
-        rotation="uniform",
-        mirror=True,
-        channels=True,
-        vertex_order=True,
-        withheld_inputs=0.05,
-    ),
+    augmentation=dataclasses.replace(_SMOKE.augmentation, rotation="uniform", withheld_inputs=0.05),
 )
 """The run of a small network whose visible surfaces and direct light are traced.
 
@@ -169,9 +163,7 @@ _PRETRAIN = dataclasses.replace(
     _PAPER_PRETRAIN,
     run="pretrain",
     loss=LossSettings(perceptual="lpips", perceptual_weight=0.05, noise_half=0.03),
-    augmentation=AugmentationSettings(
-        rotation="uniform", mirror=True, channels=True, vertex_order=True, light_scale=2.0
-    ),
+    augmentation=dataclasses.replace(_SMOKE.augmentation, rotation="uniform", light_scale=2.0),
     num_steps=250_000,
     learning_rate=7e-4,
     base_widths=BaseWidths(width=64),

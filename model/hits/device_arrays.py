@@ -162,9 +162,7 @@ class DeviceArray(NDArrayOperatorsMixin):
     def cross(self, other: "DeviceArray") -> "DeviceArray":
         return self._like(torch.linalg.cross(self.tensor, other.tensor, dim=0))
 
-    def reshape(self, *shape: Any) -> "DeviceArray":
-        return self._like(self.tensor.reshape(*shape))
-
+    reshape = _method(Tensor.reshape)
     swapaxes = _method(torch.swapaxes)
     ravel = _method(torch.flatten)
     sum = _method(torch.sum)

@@ -16,8 +16,7 @@ from dataclasses import dataclass, fields
 import numpy as np
 from numpy.typing import NDArray
 
-from model.hits.lit_scene import LitScene, Points, off_surface
-from model.hits.reflectance import Gloss, lobe
+from model.hits.lit_scene import Gloss, LitScene, Points, lobe, off_surface
 from model.hits.vectors import Floats, as_rows, at_rows, brightest, cosine_direction, dot, spread
 
 _INV_PI = np.float32(1 / np.pi)
@@ -314,7 +313,7 @@ def escaped_light(
     Args:
         scene: has a sky.
         points, gloss: where the rays begin.
-        direction, weight: of `reflectance.sample_lobe`.
+        direction, weight: of `sample_lobe`.
         rays: as in `add_sky_light`.
     """
     cosine = dot(points.normal, direction)

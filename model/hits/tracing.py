@@ -46,12 +46,6 @@ def lit_scenes(batch: SceneBatch) -> tuple[LitScene, ...]:
     return tuple(scenes)
 
 
-def lit_scene_of(scene: SceneTensors) -> LitScene:
-    """Return the surfaces of a scene."""
-    (lit,) = lit_scenes(batch_scenes([scene]))
-    return lit
-
-
 def with_traced(
     scene: SceneTensors,
     resolution: int,
@@ -70,7 +64,7 @@ def with_traced(
     """
     if not config.hit_rays:
         return scene
-    lit = lit_scene_of(scene)
+    (lit,) = lit_scenes(batch_scenes([scene]))
     if not config.traces_hits:
         cameras = scene.c2w_V44, scene.fov_deg_V
         albedo_VRR6 = albedo_of_views(lit, *cameras, resolution, config.hit_rays)

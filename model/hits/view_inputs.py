@@ -33,8 +33,7 @@ from model.hits.direct_light import (
     lobe_ray_weight,
     no_light,
 )
-from model.hits.lit_scene import LitScene, PerPoint, Points
-from model.hits.reflectance import Gloss, gloss_at, lobe, sample_lobe
+from model.hits.lit_scene import Gloss, LitScene, PerPoint, Points, gloss_at, lobe, sample_lobe
 from model.hits.vectors import Floats, at_rows, brightest, dot, spread
 from storage.seeds import rng_for
 

@@ -204,12 +204,9 @@ def _add_swapped_scores(
 
 def sheet_views(config: EvalConfig, chosen: Sequence[JudgedView]) -> list[SheetView]:
     """Render some views again for a sheet, in the order of their rows."""
-    rows_of: dict[str, list[JudgedView]] = {}
-    for row in chosen:
-        rows_of.setdefault(row.key, []).append(row)
     sheet_of_view: dict[tuple[str, int], SheetView] = {}
     for sample in config.samples():
-        if rows := rows_of.get(sample.key):
+        if rows := [row for row in chosen if row.key == sample.key]:
             scene = training_scene(sample, config.resolution)
             pictures = predict(config.network, scene.tensors, config.resolution)
             traced = _traced_pictures(config, sample, [row.view for row in rows])

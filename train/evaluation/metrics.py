@@ -350,11 +350,10 @@ def by_group(views: Sequence[JudgedView]) -> dict[str, dict[str, dict[str, Any]]
     """Return the network's summary by grouping and group, in the order of the groups."""
     groups: dict[str, dict[str, dict[str, Any]]] = {}
     for name, part_of in SPLITS.items():
-        parts: dict[str, list[JudgedView]] = {}
-        for view in views:
-            parts.setdefault(part_of(view), []).append(view)
-        ordered = sorted(parts.items(), key=lambda part: _order(part[0]))
-        groups[name] = {part: summarize_views(members) for part, members in ordered}
+        groups[name] = {
+            part: summarize_views([view for view in views if part_of(view) == part])
+            for part in sorted(set(map(part_of, views)), key=_order)
+        }
     return groups
 
 

@@ -20,7 +20,7 @@ from typing import Annotated, Any
 import torch
 from safetensors.torch import save
 
-from model.open import HEADER_KEY, Checkpoint, path_of_step, saved_steps, unreadable_error
+from model.open import HEADER_KEY, Checkpoint, path_of_step, saved_steps
 from model.open import read_checkpoint as read_network_checkpoint
 from model.weights import encode_config, load_tensors
 from storage.atomic import atomic_writer, remove_leftovers
@@ -28,7 +28,7 @@ from storage.digests import seal_of
 from storage.errors import TrilightError
 from storage.extensions import extension_digests, require_same_extensions
 from storage.settings.ranges import Within
-from storage.typed_json import FINITE, Sha256, read_json
+from storage.typed_json import FINITE, Sha256
 from train.data.order import RECORD, Mixture
 from train.loop.distributed import DistributedContext
 from train.loop.step import StepReport
@@ -110,12 +110,7 @@ def _write_sealed(path: Path, data: bytes) -> None:
 
 def read_checkpoint(path: Path) -> Checkpoint:
     """Read and verify a checkpoint; raises TrilightError, with its path, if it is invalid."""
-    checkpoint = read_network_checkpoint(path)
-    try:
-        read_json(json.dumps(checkpoint.header), _Header, "its header")
-    except TrilightError as error:
-        raise unreadable_error(path, error) from error
-    return checkpoint
+    return read_network_checkpoint(path, _Header)
 
 
 def restore_state(

@@ -5,6 +5,7 @@ recorded with the scenes that may cause them. Some steps are traced by PyTorch's
 folder of the run.
 """
 
+import itertools
 import math
 import os
 import re
@@ -302,13 +303,12 @@ def merge_spikes(by_rank: Sequence[Sequence[Mapping[str, Any]]]) -> list[dict[st
     """Merge the spikes of all processes, which have equal values and different scenes."""
     rows = []
     for spike in by_rank[0]:
-        alike = [
-            other["keys"]
-            for rows_of_rank in by_rank
-            for other in rows_of_rank
+        keys = [
+            key
+            for other in itertools.chain(*by_rank)
             if (other["step"], other["what"]) == (spike["step"], spike["what"])
+            for key in other["keys"]
         ]
-        keys = [key for of_rank in alike for key in of_rank]
         rest = {name: spike[name] for name in ("what", "value", "bound")}
         rows.append({"step": spike["step"], "spike": {**rest, "keys": keys}})
     return rows
