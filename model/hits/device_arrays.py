@@ -162,7 +162,9 @@ class DeviceArray(NDArrayOperatorsMixin):
     def cross(self, other: "DeviceArray") -> "DeviceArray":
         return self._like(torch.linalg.cross(self.tensor, other.tensor, dim=0))
 
-    reshape = _method(Tensor.reshape)
+    def reshape(self, *shape: Any) -> "DeviceArray":
+        return self._like(self.tensor.reshape(*shape))
+
     swapaxes = _method(torch.swapaxes)
     ravel = _method(torch.flatten)
     sum = _method(torch.sum)
