@@ -16,7 +16,7 @@ from typing import Any, cast
 
 import torch
 from torch import Tensor, nn
-from torch.nn.functional import interpolate, pixel_shuffle, pixel_unshuffle, silu, softplus
+from torch.nn.functional import interpolate, pixel_unshuffle, silu, softplus
 
 from model.attention import Packing, Windows, cut_windows
 from model.config import NUM_TAPS, ModelConfig
@@ -54,7 +54,8 @@ def bundle_rays(direction_V3RR: Tensor, patch_px: int) -> Tensor:
 def unbundle(bundles_MQC: Tensor, patch_px: int) -> Tensor:
     """[M, Q, C P P] -> [M, C, R, R]: the inverse of `bundle_rays` for a square picture."""
     per_side = round(bundles_MQC.shape[1] ** 0.5)
-    return pixel_shuffle(bundles_MQC.mT.unflatten(2, (per_side, per_side)), patch_px)
+    grid = bundles_MQC.unflatten(2, (-1, patch_px, patch_px)).unflatten(1, (per_side, per_side))
+    return grid.permute(0, 3, 1, 4, 2, 5).flatten(4, 5).flatten(2, 3)
 
 
 _START_LIGHT = -1.5

@@ -4,7 +4,7 @@ import dataclasses
 import platform
 import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from contextlib import closing
+from contextlib import closing, suppress
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
@@ -420,15 +420,10 @@ def _write_settings(
         **({RECORD: dataclasses.asdict(state.mixture)} if state.mixture else {}),
         "history": [dataclasses.asdict(event) for event in state.history],
     }
-    write_atomically(folder.settings, pretty_json(origin | _read_settings(folder) | now))
-
-
-def _read_settings(folder: RunFolder) -> dict[str, Any]:
-    """Return the stored settings.json, or an empty record if it is missing or damaged."""
-    try:
-        return read_json(read_plain(folder.settings), dict[str, Any], str(folder.settings))
-    except (OSError, TrilightError):
-        return {}
+    stored = dict[str, Any]()
+    with suppress(OSError, TrilightError):  # it is missing or damaged
+        stored = read_json(read_plain(folder.settings), dict[str, Any], str(folder.settings))
+    write_atomically(folder.settings, pretty_json(origin | stored | now))
 
 
 def _execution_changes(
@@ -438,14 +433,12 @@ def _execution_changes(
     note: Callable[[str], None],
 ) -> Iterator[Event]:
     """Report and yield changed processes, threads and Muon precision."""
+    precision = state.optimizer.muon_precision
     now: dict[str, tuple[Any, Any]] = {
         "processes": (header["world_size"], dist_context.world_size),
         "threads": (header.get("threads"), torch.get_num_threads()),
-        # the only one that there was
-        "muon_precision": (
-            header.get("muon_precision", "bfloat16"),
-            state.optimizer.muon_precision,
-        ),
+        # the default is the only one that there was
+        "muon_precision": (header.get("muon_precision", "bfloat16"), precision),
     }
     for name, (before, after) in now.items():
         if None in (before, after) or before == after:

@@ -20,7 +20,6 @@ from storage.conventions import log10_radiance, radiance_from_log10
 from storage.errors import TrilightError
 from storage.raycast.first_hits import first_hits
 from storage.records.sample import Sample
-from storage.records.scene import Scene
 from storage.renderer import fingerprint
 from train.data.scenes import TrainingScene, block_mean, training_scene
 from train.evaluation.metrics import (
@@ -150,7 +149,7 @@ class ValidationScene:
     target_VRR3: NDArray[np.float64]
     """Linear radiance of the targets."""
     hits_VRR: NDArray[np.bool_]
-    """True for pixels that see geometry (`hit_masks`)."""
+    """True for pixels whose central ray hits a triangle; emitters do not count: cameras see none."""
 
     def scores(self, pictures_VRR3: NDArray) -> list[Scores]:
         """Score pictures [V, R, R, 3] of linear radiance by VALIDATED, view by view."""
@@ -214,10 +213,14 @@ class Judge:
 def validation_scene(sample: Sample, resolution: int) -> ValidationScene:
     """Return a sample with targets and hit masks, at the resolution of the run."""
     scene = training_scene(sample, resolution)
+    hits = [
+        first_hits(sample.scene, view=view, resolution=resolution).met
+        for view in range(sample.scene.num_views)
+    ]
     return ValidationScene(
         scene=scene,
         target_VRR3=radiance_from_log10(scene.target_VRR3.double().numpy()),
-        hits_VRR=hit_masks(sample.scene, resolution),
+        hits_VRR=np.stack(hits),
     )
 
 
@@ -231,15 +234,6 @@ def predict(model: RenderFormer, scene: SceneTensors, resolution: int) -> NDArra
     batch = map_tensors(batch_scenes([scene]), lambda tensor: tensor.to(device))
     log10_VRR3 = model(batch, resolution)[0]
     return np.maximum(radiance(log10_VRR3.double()).cpu().numpy(), 0)
-
-
-def hit_masks(scene: Scene, resolution: int) -> NDArray[np.bool_]:
-    """Return masks [V, R, R] of pixels whose central ray hits a triangle.
-
-    Emitters do not count, since they are hidden from the camera.
-    """
-    views = range(scene.num_views)
-    return np.stack([first_hits(scene, view=view, resolution=resolution).met for view in views])
 
 
 SHEET_SCENES = 8
