@@ -210,13 +210,11 @@ def sheet_views(config: EvalConfig, chosen: Sequence[JudgedView]) -> list[SheetV
             scene = training_scene(sample, config.resolution)
             pictures = predict(config.network, scene.tensors, config.resolution)
             traced = _traced_pictures(config, sample, [row.view for row in rows])
+            black = np.zeros_like(pictures[0])
             for row in rows:
-                sheet_view = _sheet_view(row, scene, pictures[row.view])
-                if config.tracer is not None:
-                    black = np.zeros_like(sheet_view.target_rgb)
-                    extra_rgb = {CAPTION: traced.get(row.view, black)}
-                    sheet_view = dataclasses.replace(sheet_view, extra_rgb=extra_rgb)
-                sheet_of_view[row.key, row.view] = sheet_view
+                view = _sheet_view(row, scene, pictures[row.view])
+                extra = {} if config.tracer is None else {CAPTION: traced.get(row.view, black)}
+                sheet_of_view[row.key, row.view] = dataclasses.replace(view, extra_rgb=extra)
     return [sheet_of_view[row.key, row.view] for row in chosen]
 
 

@@ -178,11 +178,15 @@ class Board:
     """Sentences on the methods, without full stops, which stand below the tables."""
     left_out: dict[tuple[int, str], str] = field(default_factory=dict)
     """Reason by (width, key) of scenes that a method cannot render."""
+    _renderer_digests: dict[int, str] = field(default_factory=dict, init=False)
+    """Digest of each renderer by its `id`."""
 
     def add(self, method: Method, kind: str) -> None:
         """Add a method of one width."""
         self.methods.append(method)
         self.kinds[method.name] = kind
+        if not isinstance(method, PictureSource):
+            self._renderer_digests[id(method)] = fingerprint(method.identity)
 
     @functools.cached_property
     def rows(self) -> Rows:
@@ -194,15 +198,6 @@ class Board:
         """Digest of the metrics' definitions."""
         meanings = {metric: METRICS[metric].meaning for metric in METRICS}
         return sha256_hex(canonical_json([meanings, self.lpips is not None]))
-
-    @functools.cached_property
-    def _renderer_digests(self) -> dict[int, str]:
-        """Digest of each renderer by its `id`."""
-        return {
-            id(method): fingerprint(method.identity)
-            for method in self.methods
-            if not isinstance(method, PictureSource)
-        }
 
     def key_of(self, method: Method, key: str, view: int) -> RowKey:
         """Return the key of a method's row."""

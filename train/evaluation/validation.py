@@ -149,7 +149,7 @@ class ValidationScene:
     target_VRR3: NDArray[np.float64]
     """Linear radiance of the targets."""
     hits_VRR: NDArray[np.bool_]
-    """True for pixels whose central ray hits a triangle; emitters do not count: cameras see none."""
+    """True for pixels whose central ray hits a triangle other than emitters, which are hidden."""
 
     def scores(self, pictures_VRR3: NDArray) -> list[Scores]:
         """Score pictures [V, R, R, 3] of linear radiance by VALIDATED, view by view."""

@@ -8,7 +8,6 @@ import json
 import os
 from collections.abc import Callable, Mapping
 from importlib import import_module
-from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -21,7 +20,6 @@ from train.evaluation.validation import Judge, draw_validation_sheet
 from train.folder import RunFolder, add_note, copy_rows, read_rows
 from train.loop.train_state import TrainState
 from train.progress import TrainProgress
-from train.settings import TrainSettings
 
 LAYER_COLUMNS = ("grad_norm", "weight_norm", "update_ratio")
 """Values of a layer in a row: norm of its gradient before clipping, norm of its weights, and norm
@@ -66,21 +64,6 @@ def require_wandb(project: str | None) -> Any:
         ) from error
 
 
-def _begin_wandb_run(project: str, folder: Path, settings: TrainSettings) -> Any:
-    """Begin a run that follows TensorBoard's files; each call of the trainer is one in a group.
-
-    Nothing leaves the machine unless WANDB_MODE is `online`: `wandb sync` uploads it later.
-    """
-    return require_wandb(project).init(
-        project=project,
-        group=folder.resolve().name,
-        dir=str(folder),
-        config=settings_record(settings),
-        mode=os.environ.get("WANDB_MODE", "offline"),
-        sync_tensorboard=True,
-    )
-
-
 class Recorder:
     """Writes log, notes and curves, and reports to the progress display; first process only."""
 
@@ -106,8 +89,17 @@ class Recorder:
         self._judge = judge
         copy_rows(folder.metrics, folder.metrics, state.step)  # later ones will be written again
         self._wandb_run = None
-        if wandb is not None:  # before the writer, whose files it follows
-            self._wandb_run = _begin_wandb_run(wandb, folder.root, state.settings)
+        # It begins before the writer, whose files it follows; each call of the trainer is one in a
+        # group. Nothing leaves the machine unless WANDB_MODE is `online`: `wandb sync` uploads it.
+        if wandb is not None:
+            self._wandb_run = require_wandb(wandb).init(
+                project=wandb,
+                group=folder.root.resolve().name,
+                dir=str(folder.root),
+                config=settings_record(state.settings),
+                mode=os.environ.get("WANDB_MODE", "offline"),
+                sync_tensorboard=True,
+            )
         from torch.utils.tensorboard import SummaryWriter  # half a second to import
 
         # a resumed run writes its rows after this step again
