@@ -118,9 +118,7 @@ def new_state(
         model.load_state_dict(begin_with.state_dict())
     model.recompute_activations(settings.recompute_activations)
     model.to(device)
-    ema_model = None
-    if settings.ema_decay:
-        ema_model = copy.deepcopy(model).requires_grad_(False)
+    ema_model = copy.deepcopy(model).requires_grad_(False) if settings.ema_decay else None
     return TrainState(
         settings=settings,
         model=model,
