@@ -16,7 +16,7 @@ from typing import Any, cast
 
 import torch
 from torch import Tensor, nn
-from torch.nn.functional import interpolate, pixel_unshuffle, silu, softplus
+from torch.nn.functional import interpolate, silu, softplus
 
 from model.attention import Packing, Windows, cut_windows
 from model.config import NUM_TAPS, ModelConfig
@@ -48,7 +48,10 @@ def ray_directions(fov_deg_V: Tensor, resolution: int) -> Tensor:
 
 def bundle_rays(direction_V3RR: Tensor, patch_px: int) -> Tensor:
     """[..., 3, R, R] -> [..., Q, 3 P P]: bundles row by row, each flattened channel-major."""
-    return pixel_unshuffle(direction_V3RR, patch_px).flatten(-2).mT.contiguous()
+    per_side = direction_V3RR.shape[-1] // patch_px
+    grid = direction_V3RR.unflatten(-1, (per_side, patch_px)).unflatten(-3, (per_side, patch_px))
+    bundles = torch.movedim(grid, (-4, -2), (-5, -4))
+    return bundles.flatten(-5, -4).flatten(-3)
 
 
 def unbundle(bundles_MQC: Tensor, patch_px: int) -> Tensor:

@@ -73,11 +73,10 @@ class _Header:
 def _encode_checkpoint(state: TrainState, world_size: int) -> bytes:
     """Return the bytes of a checkpoint without its sha256; later steps do not change them."""
     tensors = state.optimizer.optimizer_state()
-    for name, weight in state.model.named_parameters():
-        tensors[f"model/{name}"] = weight.detach()
-    if state.ema_model is not None:
-        for name, weight in state.ema_model.named_parameters():
-            tensors[f"mean/{name}"] = weight
+    for part, network in (("model", state.model), ("mean", state.ema_model)):
+        if network is not None:
+            for name, weight in network.named_parameters():
+                tensors[f"{part}/{name}"] = weight.detach()
     header = {
         "step": state.step,
         "skipped_steps": state.skipped_steps,

@@ -85,7 +85,6 @@ class Recorder:
         )
         self.progress = progress
         self._folder = folder
-        self._settings = state.settings
         self._judge = judge
         copy_rows(folder.metrics, folder.metrics, state.step)  # later ones will be written again
         self._wandb_run = None
@@ -136,7 +135,7 @@ class Recorder:
             return
         validation = self._judge.judge(state.eval_model, between)
         self.row({"step": state.step, "validation": validation.scores})
-        sheet = draw_validation_sheet(self._settings, self._judge, validation, state.step)
+        sheet = draw_validation_sheet(state.settings, self._judge, validation, state.step)
         median = {"median_picture_log_l1": self._judge.median_scores["log_l1"]}
         self._show_scalars({"step": state.step, "validation": median})
         self._board.add_image("validation", np.asarray(sheet), state.step, dataformats="HWC")

@@ -78,9 +78,8 @@ class TrainState:
         """
         if self.ema_model is None or decision.is_skipped:
             return
-        means: list[Tensor] = [*self.ema_model.parameters()]
-        weights: list[Tensor] = [*self.model.parameters()]
-        move_towards(means, weights, ema_step(self.settings.ema_decay, decision.updates), decision)
+        share = ema_step(self.settings.ema_decay, decision.updates)
+        move_towards([*self.ema_model.parameters()], [*self.model.parameters()], share, decision)
 
 
 def ema_step(decay: float, updates: Updates) -> float | Tensor:
