@@ -39,7 +39,7 @@ from storage.dataset.dataset import open_dataset
 from storage.metrics import psnr_log_db
 from storage.records.sample import Sample
 from storage.records.scene import Scene
-from train.evaluation.error_colors import ERROR_WHITE, heat_colors, mean_error
+from train.evaluation.sheet import ERROR_WHITE, heat_colors, mean_error
 
 GROUND = (22, 25, 29)
 INK = (240, 240, 236)

@@ -26,7 +26,6 @@ from typing import Any, NamedTuple
 
 import numpy as np
 import torch
-from numpy.typing import NDArray
 from torch import Tensor
 from torch.nn.functional import scaled_dot_product_attention
 
@@ -182,6 +181,7 @@ class Windows:
 
 
 @lru_cache
+@torch.inference_mode(False)  # training may use what inference has cached
 def cut_windows(per_side: int, width: int, *, shifted: bool, device: torch.device) -> Windows:
     """Return the partition of per_side x per_side bundles into windows of width x width.
 
@@ -196,15 +196,8 @@ def cut_windows(per_side: int, width: int, *, shifted: bool, device: torch.devic
     order_Q = np.lexsort((window_Q, -sizes_K[window_Q]))  # larger windows first
     sizes, counts = np.unique(sizes_K, return_counts=True)
     groups = zip(counts[::-1].tolist(), sizes[::-1].tolist(), strict=True)
-    return Windows(
-        order_Q=_on(device, order_Q), back_Q=_on(device, order_Q.argsort()), groups=tuple(groups)
-    )
-
-
-@torch.inference_mode(False)
-def _on(device: torch.device, indices: NDArray[np.int64]) -> Tensor:
-    """Return indices on a device, usable in training even if inference cached them."""
-    return torch.from_numpy(indices).to(device)
+    order, back = (torch.from_numpy(each).to(device) for each in (order_Q, order_Q.argsort()))
+    return Windows(order_Q=order, back_Q=back, groups=tuple(groups))
 
 
 def attend_in_windows(q_MHQD: Tensor, k_MHQD: Tensor, v_MHQD: Tensor, windows: Windows) -> Tensor:

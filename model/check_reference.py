@@ -1,15 +1,14 @@
 """`python -m model.check_reference FILE`: compares this network with the published one's outputs.
 
 Reads a file with a configuration, weights under published names, scenes, and the published code's
-outputs; runs this network on it, padded as in the file and each scene alone without padding. Prints
-the largest differences of the log10 output and exits with 1 above 5e-7, which is eight times
+outputs; runs this network on all scenes, padded to the longest, and on each alone. Prints the
+largest differences of the log10 output and exits with 1 above 5e-7, which is eight times
 float32's rounding: a tolerance of 1e-5 would accept ten real mistakes.
 """
 
-import dataclasses
 import json
 import sys
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 
 import torch
@@ -18,7 +17,7 @@ from torch.nn.functional import elu
 
 from model.published import NORMAL, decode_published_config, load_published_weights
 from model.renderformer import ELU_ALPHA
-from model.scene_tensors import SceneBatch
+from model.scene_tensors import SceneTensors, batch_scenes
 from model.weights import read_tensors
 from storage.errors import TrilightError
 
@@ -34,8 +33,8 @@ _OUTPUT = "output.log10_radiance_bvchw"
 def differences(path: Path) -> dict[str, float]:
     """Return the largest differences from the published network, and the scale of its output.
 
-    `padded` is that of the whole batch of a reference file, padding included; `unpadded` that of a
-    scene alone, on the triangles that exist; `std` the deviation of the expected output.
+    `padded` is that of the batch of all scenes of a reference file; `unpadded` that of a scene
+    alone; `std` the deviation of the expected output.
 
     Raises:
         TrilightError: the file lacks entries; the message names them.
@@ -57,52 +56,37 @@ def differences(path: Path) -> dict[str, float]:
     model = load_published_weights(parameters, config)
     expected_BVRR3 = tensors[_OUTPUT].float().movedim(2, -1)
 
-    def difference(scenes: SceneBatch, expected: Tensor) -> Tensor:
-        got = elu(model(scenes, int(metadata["resolution"])), alpha=ELU_ALPHA)
+    def difference(scenes: Sequence[SceneTensors], expected: Tensor) -> Tensor:
+        got = elu(model(batch_scenes(scenes), int(metadata["resolution"])), alpha=ELU_ALPHA)
         return (got - expected).abs().max()
 
-    batch, exists_BT = _batch(tensors)
-    alone = [
-        difference(_scene_alone(batch, scene, exists_T), expected_BVRR3[[scene]])
-        for scene, exists_T in enumerate(exists_BT)
-    ]
+    scenes = _scenes(tensors)
+    alone = [difference([scene], expected_BVRR3[[row]]) for row, scene in enumerate(scenes)]
     return {
-        "padded": difference(batch, expected_BVRR3).item(),
+        "padded": difference(scenes, expected_BVRR3).item(),
         "unpadded": torch.stack(alone).max().item(),
         "std": expected_BVRR3.std().item(),
     }
 
 
-def _batch(tensors: Mapping[str, Tensor]) -> tuple[SceneBatch, Tensor]:
-    """Return the batch with zero padding, encoded emission, no tangent normal; and its mask."""
+def _scenes(tensors: Mapping[str, Tensor]) -> list[SceneTensors]:
+    """Return the scenes without padding, with encoded emission and no tangent normal."""
     triangles, normals, material, mask, c2w, fov = (
         tensors[f"input.{name}"].float() for name in _INPUTS
     )
-    exists = mask.bool()
     ten = torch.cat(
         [material[..., : NORMAL.start], torch.log10(1 + material[..., NORMAL.stop :])], dim=-1
     )
-    batch = SceneBatch(
-        triangles_BT33=triangles.where(exists[..., None, None], 0),
-        normals_BT33=normals.where(exists[..., None, None], 0),
-        material_BTM=ten.where(exists[..., None], 0),
-        c2w_BV44=c2w,
-        fov_deg_BV=fov[..., 0],
-        is_triangle_BT=exists,
-    )
-    return batch, exists
-
-
-def _scene_alone(batch: SceneBatch, scene: int, exists_T: Tensor) -> SceneBatch:
-    return dataclasses.replace(
-        batch,
-        triangles_BT33=batch.triangles_BT33[[scene]][:, exists_T],
-        normals_BT33=batch.normals_BT33[[scene]][:, exists_T],
-        material_BTM=batch.material_BTM[[scene]][:, exists_T],
-        c2w_BV44=batch.c2w_BV44[[scene]],
-        fov_deg_BV=batch.fov_deg_BV[[scene]],
-        is_triangle_BT=None,
-    )
+    return [
+        SceneTensors(
+            triangles_T33=triangles[row, exists_T],
+            normals_T33=normals[row, exists_T],
+            material_TM=ten[row, exists_T],
+            c2w_V44=c2w[row],
+            fov_deg_V=fov[row, :, 0],
+        )
+        for row, exists_T in enumerate(mask.bool())
+    ]
 
 
 def main(arguments: list[str]) -> int:

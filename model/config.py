@@ -248,13 +248,6 @@ SIZES: Registry[Callable[[], ModelConfig]] = Registry(
 """Named sizes, ours first and smallest first. A checkpoint stores all numbers of its configuration
 and no name, so that it opens without its size being registered."""
 
-smoke = SIZES["smoke"]
-hits_smoke = SIZES["hits-smoke"]
-tiny = SIZES["tiny"]
-base = SIZES["base"]
-hits_base = SIZES["hits-base"]
-large = SIZES["large"]
-
 ModelConfig.PRESETS = SIZES
 
 

@@ -127,13 +127,13 @@ def _pairs(config: ModelConfig, per_side: int) -> int:
     """Return the number of (query, key) pairs of bundles, as a mean over the layers."""
     if not config.window_bundles:
         return per_side**4
-    pairs = []
-    for layer in range(config.decoder_layers):
-        cut = cut_windows(
-            per_side, config.window_bundles, shifted=layer % 2 == 1, device=torch.device("cpu")
-        )
-        pairs.append(sum(count * size**2 for count, size in cut.groups))
-    return sum(pairs) // len(pairs)
+    cuts = [
+        cut_windows(per_side, config.window_bundles, shifted=each, device=torch.device("cpu"))
+        for each in (False, True)
+    ]
+    pairs = [sum(count * size**2 for count, size in cut.groups) for cut in cuts]
+    layers = config.decoder_layers
+    return sum(pairs[layer % 2] for layer in range(layers)) // layers
 
 
 def _head(config: ModelConfig, per_side: int) -> int:

@@ -88,7 +88,6 @@ class TriangleRotary(nn.Module):
         super().__init__()
         self.num_freqs = num_freqs
         self.max_freq = max_freq
-        self.head_width = head_width
         self.half_width = head_width // 2
         self.register_buffer("freqs_F", None, persistent=False)
         self.reset()

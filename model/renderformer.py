@@ -13,11 +13,10 @@ from torch.nn.utils.rnn import pad_sequence
 
 from model.attention import Keys, Packing, pack_tokens
 from model.config import ModelConfig
-from model.demodulated import albedo_of_cameras, compose_radiance
 from model.hits.decoder import HitDecoder
 from model.hits.lit_scene import LitScene
 from model.hits.traced import Traced, denoise_traced
-from model.hits.tracing import as_tensor, like, lit_scenes, traced_cameras
+from model.hits.tracing import albedo_of_cameras, as_tensor, like, lit_scenes, traced_cameras
 from model.layers import TOKEN_NORM_EPS, EncoderLayer, Norm, dtype_of, run_layer
 from model.positions import (
     EncodedScene,
@@ -32,7 +31,7 @@ from model.positions import (
 )
 from model.precision import tf32, without_autocast
 from model.scene_tensors import Cameras, SceneBatch, in_light_units, require_known_sky
-from model.view_decoder import ViewDecoder
+from model.view_decoder import ViewDecoder, compose_radiance
 from storage.records.material import material_width
 
 SIDE_LIGHTS = 12
@@ -233,7 +232,6 @@ class RenderFormer(nn.Module):
         rays = self.config.hit_rays
         if rays and albedo_BVRR6 is None:
             albedo_BVRR6 = albedo_of_cameras(scene.surfaces, cameras, resolution, rays)
-            albedo_BVRR6 = like(albedo_BVRR6, cameras.fov_deg_BV)
         with tf32(self.tf32):
             picture_BVRRC: Tensor = self.decoder(scene, cameras, resolution)
         if albedo_BVRR6 is None:

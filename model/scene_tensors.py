@@ -57,7 +57,7 @@ class SceneTensors:
     """Traced inputs of these views, for the view stage `hits`; if None, the network traces them."""
     albedo_VRR6: Tensor | None = None
     """Albedo of visible surfaces, for a demodulated network; if None, the network computes it
-    (model.demodulated)."""
+    (model.hits.tracing)."""
     textures: SurfaceTextures | None = None
     """Textures that replace material columns at each hit; `material_TM` holds their means. None
     without textures."""

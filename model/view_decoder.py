@@ -7,15 +7,16 @@ patch, tested against storage.conventions.camera_rays, which is the definition.
 
 A head reads bundle tokens: the linear one is smaller and as good for minutes of training; the DPT
 (Ranftl et al. 2021) mixes neighboring bundles, so that their borders do not show. Both start at a
-black picture, or, where they predict light (model.demodulated), at equal dim light everywhere.
+black picture, or, where they predict light (`compose_radiance`), at equal dim light everywhere.
 """
 
+import math
 from collections.abc import Iterable, Sequence
 from typing import Any, cast
 
 import torch
 from torch import Tensor, nn
-from torch.nn.functional import interpolate, silu
+from torch.nn.functional import interpolate, silu, softplus
 
 from model.attention import Packing, Windows, cut_windows
 from model.config import NUM_TAPS, ModelConfig
@@ -40,17 +41,8 @@ def ray_directions(fov_deg_V: Tensor, resolution: int) -> Tensor:
     focal_px_V = 0.5 * resolution / torch.tan(torch.deg2rad(fov_deg_V) / 2)
     offset_R = torch.arange(resolution, dtype=fov_deg_V.dtype, device=fov_deg_V.device)
     offset_R = offset_R + 0.5 - 0.5 * resolution
-    ones_VRR = torch.ones_like(focal_px_V)[..., None, None].expand(
-        *focal_px_V.shape, resolution, resolution
-    )
-    direction_V3RR = torch.stack(
-        [
-            offset_R[None, :] * ones_VRR,
-            -offset_R[:, None] * ones_VRR,
-            -focal_px_V[..., None, None] * ones_VRR,
-        ],
-        dim=-3,
-    )
+    xyz_VRR = torch.broadcast_tensors(offset_R, -offset_R[:, None], -focal_px_V[..., None, None])
+    direction_V3RR = torch.stack(xyz_VRR, dim=-3)
     return direction_V3RR / direction_V3RR.norm(dim=-3, keepdim=True)
 
 
@@ -67,6 +59,33 @@ def unbundle(bundles_MQC: Tensor, patch_px: int) -> Tensor:
     per_side = round(bundles_MQC.shape[1] ** 0.5)
     grid = bundles_MQC.unflatten(2, (-1, patch_px, patch_px)).unflatten(1, (per_side, per_side))
     return grid.permute(0, 3, 1, 4, 2, 5).flatten(4, 5).flatten(2, 3)
+
+
+_START_LIGHT = -1.5
+"""Offset before softplus: the initial light of 0.6 in every pixel is about that of the scenes."""
+
+_BRIGHTEST = 8.0
+"""Maximum log10(1 + light): far above any lamp, and small enough for float32."""
+
+
+def compose_radiance(light_BVRR6: Tensor, albedo_BVRR6: Tensor) -> Tensor:
+    """Return log10(1 + radiance) [B, V, R, R, 3], at least 0, from predicted light and albedo.
+
+        radiance = diffuse albedo * diffuse light + specular albedo * specular light
+
+    The albedo of a pixel's visible surface is traced exactly, in milliseconds. So color textures,
+    silhouettes and the black background need not be learned. Diffuse light is irradiance over pi;
+    neither light is ever negative, and the network predicts both as log10(1 + x). Glossy reflection
+    has no exact factor: its light contains a blurred mirror image.
+
+    Args:
+        light_BVRR6: output of a head; diffuse, then specular.
+        albedo_BVRR6: albedo in the same order (model.hits.tracing).
+    """
+    with without_autocast(light_BVRR6.device):
+        log10_BVRR6 = softplus(light_BVRR6 + _START_LIGHT).clamp(max=_BRIGHTEST)
+        reflected = albedo_BVRR6 * torch.expm1(log10_BVRR6 * math.log(10))
+        return torch.log1p(reflected[..., :3] + reflected[..., 3:]) / math.log(10)
 
 
 LAST_CHANNELS = 32
@@ -199,11 +218,8 @@ class DptHead(nn.Module):
         grids = [self._grid(level, tokens) for level, tokens in enumerate(taps_MQW)]
         fused: Tensor | None = None
         for level in reversed(range(NUM_TAPS)):
-            height, width = grids[level - 1].shape[-2:]
-            if level == 0:
-                height = 2 * grids[0].shape[-2]
-                width = 2 * grids[0].shape[-1]
-            fused = self.fuse[level](fused, grids[level], (height, width))
+            side = grids[level - 1].shape[-1] if level else 2 * grids[0].shape[-1]
+            fused = self.fuse[level](fused, grids[level], (side, side))
         halved = self.halve(fused).to(self.last.weight.dtype)
         with without_autocast(halved.device):
             return self.last(silu(self.widen(halved)))
@@ -251,7 +267,7 @@ class ViewDecoder(nn.Module):
     def forward(self, scene: EncodedScene, cameras: Cameras, resolution: int) -> Tensor:
         """Return log10(1 + radiance) before the ELU, [B, V, R, R, 3].
 
-        A demodulated network returns light, [B, V, R, R, 6] (model.demodulated).
+        A demodulated network returns light, [B, V, R, R, 6] (`compose_radiance`).
         """
         # packed keys are grouped by view, so views come before scenes for the bundles too
         views_first = scene.packing is not None

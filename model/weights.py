@@ -42,10 +42,6 @@ class TrainedRange:
     resolution: int | None = None
     """Width of the pictures in pixels."""
 
-    def as_metadata(self) -> dict[str, str]:
-        """Return the entries for the metadata of a safetensors file."""
-        return {RANGE_KEY: json.dumps(asdict(self), sort_keys=True)}
-
 
 PUBLISHED_RANGE = TrainedRange(max_triangles=4096, resolution=512)
 """Range of the published checkpoints: their second stage (Zeng et al. 2025)."""
@@ -73,7 +69,7 @@ def encode_weights(model: RenderFormer, trained: TrainedRange | None = None) -> 
         trained: range of its training data, if known.
     """
     tensors = {name: tensor.contiguous() for name, tensor in model.state_dict().items()}
-    known = {} if trained is None else trained.as_metadata()
+    known = {} if trained is None else {RANGE_KEY: json.dumps(asdict(trained), sort_keys=True)}
     return _sort_metadata(
         save(tensors, metadata={CONFIG_KEY: encode_config(model.config), **known})
     )

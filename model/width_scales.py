@@ -47,12 +47,6 @@ class WidthScale:
     muon: float = 1.0
     """Factor of Muon's learning rate, if Muon updates it."""
 
-    def times(self, factor: float) -> "WidthScale":
-        """Return all factors multiplied by another one."""
-        return WidthScale(
-            start=self.start * factor, adamw=self.adamw * factor, muon=self.muon * factor
-        )
-
 
 def width_scales(model: RenderFormer, base: BaseWidths) -> dict[str, WidthScale]:
     """Return the factors of every weight by name; all are 1 without a base width."""
@@ -68,7 +62,8 @@ def width_scales(model: RenderFormer, base: BaseWidths) -> dict[str, WidthScale]
             base_fans = _fans(modules[name])
             scales[f"{name}.weight"] = _of_matrix(fans, base_fans)
     for name, factor in _query_scales(model, modules):
-        scales[name] = scales[name].times(factor)
+        factors = vars(scales[name])
+        scales[name] = WidthScale(**{each: factors[each] * factor for each in factors})
     return scales
 
 

@@ -24,7 +24,7 @@ class RunFolder:
         """Take the folder that the user names, such as by --out."""
         self.root = root
         self.checkpoints = root / "checkpoints"
-        """Folder of the checkpoints, one file per saved step; model.checkpoint_format reads it."""
+        """Folder of the checkpoints, one file per saved step; model.open reads it."""
         self.weights = root / "model.safetensors"
         """Weights of the finished network (model.weights), as inference reads them."""
         self.settings = root / "settings.json"

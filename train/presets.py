@@ -14,10 +14,7 @@ from collections.abc import Callable, Mapping
 from functools import partial
 from typing import Any
 
-from model.config import BaseWidths, hits_base, hits_smoke
-from model.config import base as base_model
-from model.config import large as large_model
-from model.config import smoke as smoke_model
+from model.config import SIZES, BaseWidths
 from storage.aliases import PRESET_ALIASES
 from storage.errors import TrilightError
 from storage.extensions import mistakes_of_entry
@@ -27,7 +24,7 @@ from train.settings import AugmentationSettings, LossSettings, TrainSettings
 
 _SMOKE = TrainSettings(
     run="smoke",
-    model=smoke_model(),
+    model=SIZES["smoke"](),
     resolution=64,
     loss=LossSettings(perceptual="none"),
     augmentation=AugmentationSettings(mirror=True, channels=True, vertex_order=True),
@@ -60,31 +57,25 @@ _BUILTIN = dataclasses.replace(
 _HITS = dataclasses.replace(
     _BUILTIN,
     run="hits",
-    model=dataclasses.replace(hits_smoke(), scene_tokens=False),
+    model=dataclasses.replace(SIZES["hits-smoke"](), scene_tokens=False),
     num_steps=2_400,
     views_per_scene=2,
     ema_decay=0.998,
     validate_every=200,
     checkpoint_every=200,
-    augmentation=AugmentationSettings(
-        rotation="uniform",
-        mirror=True,
-        channels=True,
-        vertex_order=True,
-        withheld_inputs=0.05,
-    ),
+    augmentation=dataclasses.replace(_SMOKE.augmentation, rotation="uniform", withheld_inputs=0.05),
 )
 """The run of a small network whose visible surfaces and direct light are traced.
 
 It has no scene tokens: with traced inputs they gain nothing at this size (study S72).
 """
 
-_HITS_TOKENS = dataclasses.replace(_HITS, run="hits-tokens", model=hits_smoke())
+_HITS_TOKENS = dataclasses.replace(_HITS, run="hits-tokens", model=SIZES["hits-smoke"]())
 """The run `hits` with scene tokens, to measure what they gain."""
 
 _PAPER_PRETRAIN = TrainSettings(
     run="paper-pretrain",
-    model=base_model(),
+    model=SIZES["base"](),
     resolution=256,
     most_triangles=1536,
     loss=LossSettings(perceptual="lpips", perceptual_weight=0.05),
@@ -139,7 +130,7 @@ _PAPER_FINETUNE = dataclasses.replace(
 _PAPER_PRETRAIN_LARGE = dataclasses.replace(
     _PAPER_PRETRAIN,
     run="paper-pretrain-large",
-    model=large_model(),
+    model=SIZES["large"](),
     num_steps=600_000,
     scenes_per_step=32,
     scenes_per_pass=4,
@@ -155,7 +146,7 @@ example, make the 32 scenes here. The validation and its intervals are ours, sin
 _PAPER_FINETUNE_LARGE = dataclasses.replace(
     _PAPER_FINETUNE,
     run="paper-finetune-large",
-    model=large_model(),
+    model=SIZES["large"](),
     num_steps=50_000,
     scenes_per_step=48,
     scenes_per_pass=6,
@@ -172,9 +163,7 @@ _PRETRAIN = dataclasses.replace(
     _PAPER_PRETRAIN,
     run="pretrain",
     loss=LossSettings(perceptual="lpips", perceptual_weight=0.05, noise_half=0.03),
-    augmentation=AugmentationSettings(
-        rotation="uniform", mirror=True, channels=True, vertex_order=True, light_scale=2.0
-    ),
+    augmentation=dataclasses.replace(_SMOKE.augmentation, rotation="uniform", light_scale=2.0),
     num_steps=250_000,
     learning_rate=7e-4,
     base_widths=BaseWidths(width=64),
@@ -221,7 +210,7 @@ Its rate, a third of the first stage's, has not been tried at this size either.
 _HITS_256 = dataclasses.replace(
     _PRETRAIN,
     run="hits-256",
-    model=hits_base(),
+    model=SIZES["hits-base"](),
     augmentation=dataclasses.replace(_PRETRAIN.augmentation, withheld_inputs=0.05),
 )
 """Our first stage with traced hits at Base size, for a GPU; only tried for some steps.

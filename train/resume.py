@@ -5,7 +5,6 @@ All other settings have to equal those of the checkpoint, except for named chang
 each of which the run records.
 """
 
-import dataclasses
 import json
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
@@ -181,11 +180,6 @@ def plan_resume(
         notes=tuple(_notes(before, settings, step, past_events, events)),
         changes_meaning=any(event.kind == "meaning" for event in events),
     )
-
-
-def event_records(events: Sequence[Event]) -> list[dict[str, Any]]:
-    """Return events as the JSON records of checkpoints, settings.json and summary.json."""
-    return [dataclasses.asdict(event) for event in events]
 
 
 def _differing(old: Mapping[str, Any], settings: TrainSettings) -> dict[str, Any]:

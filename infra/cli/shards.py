@@ -1,7 +1,6 @@
 """`trilight shards`: makes new datasets from finished ones."""
 
 from collections.abc import Sequence
-from dataclasses import fields
 from pathlib import Path
 from typing import Annotated
 

@@ -152,13 +152,13 @@ class DirectLightRenderer(RendererHere):
 
     def load(self, scene: Scene, name: str) -> SceneHere:
         """Sort the triangles of a scene for its rays."""
-        from model.config import hits_smoke
+        from model.config import SIZES
         from model.hits.lit_scene import LitScene
         from model.hits.radiosity import SceneLight
         from model.hits.view_inputs import Channel, view_inputs
         from storage.records.material import PUBLISHED_COLUMNS, chosen_columns
 
-        config = replace(hits_smoke(), gather_rays=0)
+        config = replace(SIZES["hits-smoke"](), gather_rays=0)
         began = time.perf_counter()
         began_s = time.process_time()
         rows = chosen_columns(scene.materials, PUBLISHED_COLUMNS)[scene.material_index]
@@ -187,10 +187,10 @@ def traced_network() -> "NeuralRenderer":
     Every gain is 1, nothing is added or filtered, and gathered light is weighted by the distance of
     anchors. Layers have the least possible size, so that only the tracing takes time.
     """
-    from model.config import VERTEX_COORDINATES, hits_smoke
+    from model.config import SIZES, VERTEX_COORDINATES
 
     smallest = replace(
-        hits_smoke(), width=2 * VERTEX_COORDINATES, num_heads=1, rope_num_freqs=1,
+        SIZES["hits-smoke"](), width=2 * VERTEX_COORDINATES, num_heads=1, rope_num_freqs=1,
         encoder_layers=1, decoder_layers=1, hidden_width=1, num_registers=0, pixel_width=1,
         filter_width=0, scene_tokens=False,
     )  # fmt: skip

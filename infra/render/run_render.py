@@ -36,7 +36,7 @@ from storage.records.safe_read import read_plain
 from storage.records.scene import Scene
 from storage.records.scene_file import scene_digest
 from storage.renderer import Camera, Fact, Facts, OnProgress, ReadyScene, Renderer
-from train.evaluation.error_colors import ERROR_WHITE, error_picture
+from train.evaluation.sheet import ERROR_WHITE, error_picture
 
 _CAPTION_PX = 24
 _GAP_PX = 8

@@ -11,7 +11,6 @@ import re
 import shlex
 import threading
 import time
-
 from abc import ABC, abstractmethod
 from array import array
 from collections import OrderedDict
@@ -52,8 +51,8 @@ from storage.records.lights import num_lights
 from storage.records.profiles import PACKED, PLAIN
 from storage.records.safe_read import safetensors_header, unpack_gzip
 from storage.remote.safe_url import safe_url
-from storage.settings.overrides import option_words
 from storage.renderer import Camera
+from storage.settings.overrides import option_words
 
 MOST_OPEN = 3
 """Maximum number of scenes whose pages stay open."""

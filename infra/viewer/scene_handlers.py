@@ -46,7 +46,7 @@ from storage.metrics import psnr_log_db
 from storage.records.lights import num_lights
 from storage.records.scene import Scene
 from storage.renderer import Image, ReadyScene, Sampling
-from train.evaluation.error_colors import ERROR_WHITE, error_picture
+from train.evaluation.sheet import ERROR_WHITE, error_picture
 
 MOST_KEPT = 32
 """Maximum number of pictures that are kept; one of 1024 pixels takes 13 MB."""

@@ -19,8 +19,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from model.hits.direct_light import chosen_lamp_light, lamp_chances, lobe_ray_weight
-from model.hits.lit_scene import LitScene, PerPoint, Points
-from model.hits.reflectance import gloss_at, lobe, sample_lobe
+from model.hits.lit_scene import LitScene, PerPoint, Points, gloss_at, lobe, sample_lobe
 from model.hits.vectors import Floats, at_rows, brightest, cosine_direction, dot, spread, unit
 from storage.conventions import focal_px
 from storage.seeds import rng_for

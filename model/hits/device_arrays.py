@@ -8,7 +8,8 @@ that it leaves out is dropped where it would be stored (`MaskedRows`).
 
 import copy
 import operator
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from typing import Any
 
 import numpy as np
@@ -237,18 +238,63 @@ def _interp(x: Tensor, known: Tensor, values: Tensor) -> Tensor:
     return values[right - 1] + share * (values[right] - values[right - 1])
 
 
-def _nonzero(mask: Tensor) -> tuple[NDArray, ...]:
-    """Return the places of all elements: those that the mask leaves out may be given no weight."""
-    return tuple(each.ravel() for each in np.indices(mask.shape))
-
-
 _FUNCTIONS: dict[str, Callable] = {
     "flatnonzero": lambda mask: MaskedRows(mask.flatten() != 0),
     "interp": _interp,
-    "nonzero": _nonzero,
+    # the places of all elements: those that the mask leaves out may be given no weight
+    "nonzero": lambda mask: tuple(each.ravel() for each in np.indices(mask.shape)),
     "take": _take,
     "take_along_axis": torch.take_along_dim,
     "tile": lambda a, count: a.repeat(count),
     "zeros_like": lambda a, shape=None: a.new_zeros(shape or a.shape),
 }
 """Functions that torch has not under numpy's name, or not alike."""
+
+
+class Replayed:
+    """A function of tensors, which a GPU runs once, records as a graph, and repeats from then on.
+
+    A view of `hits` is four thousand small kernels; submitting them one by one takes longer than
+    they.
+    It may read nothing back and use no array of the host that its first run has not brought to the
+    GPU. What it returns is overwritten by the next call.
+    """
+
+    def __init__(self, function: Callable[..., tuple[Tensor, ...]]) -> None:
+        self._function = function
+        self._calls = 0
+        self._inputs: tuple[Tensor, ...] = ()
+        self._graph: torch.cuda.CUDAGraph | None = None
+
+    def __call__(self, *inputs: Tensor) -> tuple[Tensor, ...]:
+        """Return the function's tensors, for tensors of always the same shapes on one GPU."""
+        self._calls += 1
+        if self._calls == 1:
+            return self._function(*inputs)
+        if self._graph is None:
+            self._inputs = tuple(each.clone() for each in inputs)
+            graph = torch.cuda.CUDAGraph()
+            with torch.cuda.graph(graph):
+                self._result = self._function(*self._inputs)
+            self._graph = graph
+        for held, new in zip(self._inputs, inputs, strict=True):
+            held.copy_(new)
+        self._graph.replay()
+        return self._result
+
+
+@contextmanager
+def aside(device: torch.device | None) -> Iterator[Callable[[], None]]:
+    """Let a graph that is being recorded do the block beside what follows it; else, in order.
+
+    Arrays that the block reads have to live until the function that it yields was called, from
+    which on its results may be read.
+    """
+    if device is None or device.type != "cuda" or not torch.cuda.is_current_stream_capturing():
+        yield lambda: None
+        return
+    main = torch.cuda.current_stream(device)
+    branch = torch.cuda.Stream(device)
+    branch.wait_stream(main)
+    with torch.cuda.stream(branch):
+        yield lambda: main.wait_stream(branch)

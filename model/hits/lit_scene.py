@@ -1,8 +1,12 @@
-"""`LitScene`: the triangles of a scene as rays need them, with their lobes and their emission."""
+"""`LitScene`: a scene as rays need it: triangles, their emission, its sky, and lobes at points.
+
+The specular lobe is GGX without Fresnel, compensated for multiple scattering: the arithmetic of
+pipeline.renders.ggx in numpy; tests hold the two beside each other.
+"""
 
 from collections.abc import Callable
 from dataclasses import dataclass, replace
-from functools import cached_property
+from functools import cache, cached_property
 from typing import TYPE_CHECKING, Any, Literal, Self
 
 import numpy as np
@@ -11,13 +15,19 @@ from numpy.typing import NDArray
 
 from model.hits.device_arrays import DeviceArray, DevicePlace
 from model.hits.device_rays import DeviceTriangles, compiled_kernel
-from model.hits.sky_sampler import SkySampler
 from model.hits.textures import DeviceTextures, SurfaceTextures
-from model.hits.vectors import Floats, as_rows, at_rows, brightest, dot, unit
+from model.hits.vectors import Floats, as_rows, at_rows, brightest, dot, tangents, unit
+from storage.conventions import latlong_uv
 from storage.optics.bsdf import bsdf_lobes
-from storage.optics.multiscatter import scattered_again
+from storage.optics.multiscatter import (
+    ROUGHNESS_STEPS,
+    X_STEPS,
+    albedo_table,
+    scattered_again,
+)
 from storage.raycast.caster import RayCaster, RayHits, Triangles
-from storage.records.environment import Environment
+from storage.records.environment import Environment, row_solid_angles, texel_means
+from storage.records.lookup import environment_values
 from storage.records.material import EMISSION, ROUGHNESS
 
 if TYPE_CHECKING:
@@ -31,6 +41,9 @@ _OFFSET = np.float32(1500 * 2.0**-24)
 """Distance from a surface at which rays start, as a fraction of 1 m plus their distance from the
 origin: as in the renderer (pipeline.renders.kernel_scene)."""
 
+
+_INV_PI = np.float32(1 / np.pi)
+_LEAST_COSINE = np.float32(1e-4)
 
 MaterialName = Literal["diffuse", "specular", "alpha", "multiscatter", "roughness"]
 
@@ -115,6 +128,77 @@ def off_surface(position: Floats, plane: Floats, direction: Floats) -> Floats:
     start: Floats = plane * np.copysign(off, dot(plane, direction))
     start += position
     return start
+
+
+_BLURRED_ROWS = 16
+"""Number of rows of the blurred map: 11 degrees each."""
+
+
+class SkySampler:
+    """Importance sampling of an environment map that is not all black.
+
+    A texel is sampled in proportion to its flux, and a direction within it uniformly by solid
+    angle, so that most samples hit a sun of one texel. Samples are drawn in the axes of the map, so
+    that a scene rotated together with its map has the same noise.
+    """
+
+    def __init__(self, sky: Environment) -> None:
+        # in double precision, in which rays are turned to the map
+        self.sky = replace(sky, rotation=sky.rotation.astype(np.float64))
+        height, width = sky.radiance_rgb.shape[:2]
+        angles = row_solid_angles(height)[:, None]
+        flux = texel_means(sky.radiance_rgb.mean(axis=-1, dtype=np.float64)) * angles
+        self._probability = flux.ravel() / flux.sum()
+        self._cumulative = np.cumsum(self._probability)
+        self._pdf = flux / flux.sum() / angles
+        self._edges = np.cos(np.pi * np.arange(height + 1) / height)
+        self._height = height
+        self._width = width
+
+    def sample_directions(self, u: Floats) -> Floats:
+        """Return unit world directions [3, P] for numbers u [2, P] in the unit square."""
+        first = u[0].astype(np.float64)
+        texel = np.searchsorted(self._cumulative, first, side="right").clip(
+            0, len(self._probability) - 1
+        )
+        share = self._probability[texel]
+        along = (first - (self._cumulative[texel] - share)) / np.maximum(share, 1e-300)
+        row = texel // self._width
+        column = texel % self._width
+        z = self._edges[row] + (self._edges[row + 1] - self._edges[row]) * u[1]
+        azimuth = (0.5 - (column + along.clip(0, 1)) / self._width) * 2 * np.pi
+        flat = np.sqrt(np.maximum(1 - z * z, 0))
+        local = np.stack([flat * np.cos(azimuth), flat * np.sin(azimuth), z])
+        return (self.sky.rotation @ local).astype(np.float32)
+
+    def pdf(self, direction: Floats) -> Floats:
+        """Return the probability density [P] of unit directions [3, P], per steradian."""
+        u, v = np.moveaxis(latlong_uv(self.sky.to_map(direction.T)), -1, 0)
+        row = ((1 - v) * self._height).astype(np.intp).clip(0, self._height - 1)
+        column = np.floor(u * self._width).astype(np.intp) % self._width
+        return self._pdf[row, column].astype(np.float32)
+
+    def radiance(self, direction: Floats) -> Floats:
+        """Return the radiance [3, P] from unit directions [3, P]."""
+        return environment_values(self.sky, as_rows(direction)).T.astype(np.float32)
+
+    def blurred_radiance(self, direction: Floats) -> Floats:
+        """Return the radiance [3, P] of a blurred map with few rows and the same total flux."""
+        return environment_values(self._coarse, as_rows(direction)).T.astype(np.float32)
+
+    @cached_property
+    def _coarse(self) -> Environment:
+        factor = max(self._height // _BLURRED_ROWS, 1)
+        while self._height % factor:
+            factor -= 1
+        rows = self._height // factor
+        angles: NDArray[np.float64] = row_solid_angles(self._height)[:, None, None]
+        light = (self.sky.radiance_rgb * angles).reshape(rows, factor, 2 * rows, factor, 3)
+        means = (
+            light.sum(axis=(1, 3))
+            / (factor**2 * angles.reshape(rows, factor).mean(axis=1))[:, None, None]
+        )
+        return Environment(radiance_rgb=means.astype(np.float32), rotation=self.sky.rotation)
 
 
 class LitScene:
@@ -282,3 +366,118 @@ def _between(corners: Floats, triangle: NDArray[np.intp], weights: Floats) -> Fl
     result += np.take(corners[1], triangle, axis=1) * weights[1]
     result += np.take(corners[2], triangle, axis=1) * weights[2]
     return result
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class Gloss(PerPoint):
+    """The specular lobes of P points, each as its viewer sees it."""
+
+    color: Floats
+    """[3, P] specular albedo times the scale that multiple scattering brings."""
+    alpha: Floats
+    """[P] GGX width, above 0 and at most 1."""
+    cos_seen: Floats
+    """[P] cosine between shading normal and viewer."""
+    stretch_seen: Floats
+    """[P] length of the viewer's direction on stretched facets."""
+    faces: NDArray[np.bool_]
+    """[P] True: the viewer is above the shading normal's horizon; below there is no lobe."""
+
+
+def gloss_at(scene: LitScene, points: Points, least_alpha: Floats | None = None) -> Gloss:
+    """Return the lobes of points, those that are narrower than `least_alpha` [P] widened to it."""
+    alpha = scene.material_at(points, "alpha")
+    if least_alpha is not None:
+        alpha = np.maximum(alpha, least_alpha)
+    cosine = dot(points.normal, points.to_viewer)
+    seen = np.maximum(cosine, _LEAST_COSINE)
+    stretch = stretched_length(seen, alpha)
+    albedo = np.maximum(_albedo(scene, seen / stretch, alpha), np.float32(1e-3))
+    lost = (1 - albedo) / albedo
+    specular = scene.material_at(points, "specular")
+    multiscatter = scene.material_at(points, "multiscatter")
+    return Gloss(
+        color=specular * (1 + multiscatter * lost),
+        alpha=alpha,
+        cos_seen=seen,
+        stretch_seen=stretch,
+        faces=cosine > _LEAST_COSINE,
+    )
+
+
+def stretched_length(cosine: Floats, alpha: Floats) -> Floats:
+    """Return the length of (alpha sin, cos)."""
+    square = cosine * cosine
+    length: Floats = np.sqrt(square + alpha * alpha * (1 - square))
+    return length
+
+
+def lobe(
+    gloss: Gloss, points: Points, to_light: Floats, cos_light: Floats
+) -> tuple[Floats, Floats]:
+    """Return D G2 / (4 cos_i cos_o) cos_o without color, and `sample_lobe`'s density, [P] each.
+
+    Args:
+        to_light: [3, P] unit vectors.
+        cos_light: [P] their cosine with the shading normal; where it is not above 0 the lobe is 0.
+    """
+    half = unit(to_light + points.to_viewer)
+    upright = dot(half, points.normal)
+    squared = gloss.alpha * gloss.alpha
+    # sin^2 + alpha^2 cos^2, with sin^2 from the part across: 1 - cos^2 cancels for a small alpha
+    across = half - points.normal * upright
+    denominator = dot(across, across) + squared * upright * upright
+    distribution = _INV_PI * squared / np.maximum(denominator * denominator, np.float32(1e-30))
+    above = np.maximum(cos_light, _LEAST_COSINE)
+    masked = gloss.stretch_seen / gloss.cos_seen + stretched_length(above, gloss.alpha) / above
+    value = distribution / (2 * gloss.cos_seen * masked)
+    density = distribution / (2 * (gloss.cos_seen + gloss.stretch_seen))
+    shines = gloss.faces & (cos_light > 0) & (dot(to_light, points.geometric_normal) > 0)
+    return np.where(shines, value, np.float32(0)), density
+
+
+def sample_lobe(gloss: Gloss, points: Points, u: Floats) -> tuple[Floats, Floats]:
+    """Return directions [3, P] drawn by visible normals from u [2, P], and their weights [P].
+
+    A weight is what the lobe sends along the direction, cosine included, over the density: G2 / G1.
+    Spherical caps (Dupuy and Benyoub 2023).
+    """
+    first, second = tangents(points.normal, points.edge)
+    seen = np.stack([dot(points.to_viewer, first), dot(points.to_viewer, second), gloss.cos_seen])
+    wide = np.stack([gloss.alpha, gloss.alpha, np.ones_like(gloss.alpha)])
+    bent = unit(seen * wide)
+    height = 1 - u[1] * (1 + bent[2])
+    radius = np.sqrt(np.maximum(1 - height * height, 0))
+    angle = np.float32(2 * np.pi) * u[0]
+    cap = np.stack([radius * np.cos(angle), radius * np.sin(angle), height]) + bent
+    half = unit(cap * wide)
+    local = half * (2 * dot(seen, half)) - seen
+    cosine = local[2]
+    above = np.maximum(cosine, _LEAST_COSINE)
+    masked_seen = gloss.stretch_seen / gloss.cos_seen
+    masked = stretched_length(above, gloss.alpha) / above
+    direction = first * local[0] + second * local[1] + points.normal * local[2]
+    goes = gloss.faces & (cosine > 0) & (dot(direction, points.geometric_normal) > 0)
+    weight = (1 + masked_seen) / (masked_seen + masked)
+    return direction, np.where(goes, weight, np.float32(0))
+
+
+def _albedo(scene: LitScene, stretched_cosine: Floats, alpha: Floats) -> Floats:
+    """Return the directional albedo [P] between the entries of the table."""
+    table = scene.here(_table())
+    u = np.sqrt(stretched_cosine) * np.float32(X_STEPS - 1)
+    v = np.sqrt(alpha) * np.float32(ROUGHNESS_STEPS - 1)
+    column = np.minimum(u.astype(np.int32), X_STEPS - 2)
+    row = np.minimum(v.astype(np.int32), ROUGHNESS_STEPS - 2)
+    u = u - column
+    v = v - row
+    at = row * X_STEPS + column
+    low = table[at] * (1 - u) + table[at + 1] * u
+    high = table[at + X_STEPS] * (1 - u) + table[at + X_STEPS + 1] * u
+    between: Floats = low * (1 - v) + high * v
+    return between
+
+
+@cache
+def _table() -> Floats:
+    return albedo_table("correlated").astype(np.float32).ravel()

@@ -10,9 +10,8 @@ from functools import cached_property
 import numpy as np
 from numpy.typing import NDArray
 
-from model.hits.direct_light import direct_light, no_light
+from model.hits.direct_light import add_sky_light, direct_light, no_light
 from model.hits.lit_scene import LitScene, Points
-from model.hits.sky_light import add_sky_light
 from model.hits.vectors import Floats, cosine_direction, spread
 from storage.seeds import rng_for
 

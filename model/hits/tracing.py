@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from model.config import ModelConfig
-from model.demodulated import albedo_of_views
+from model.hits.anchors import Rays
 from model.hits.device_arrays import DeviceArray
 from model.hits.lit_scene import LitScene
 from model.hits.traced import INPUTS, Traced, denoise_traced, stack_traced
@@ -46,12 +46,6 @@ def lit_scenes(batch: SceneBatch) -> tuple[LitScene, ...]:
     return tuple(scenes)
 
 
-def lit_scene_of(scene: SceneTensors) -> LitScene:
-    """Return the surfaces of a scene."""
-    (lit,) = lit_scenes(batch_scenes([scene]))
-    return lit
-
-
 def with_traced(
     scene: SceneTensors,
     resolution: int,
@@ -70,7 +64,7 @@ def with_traced(
     """
     if not config.hit_rays:
         return scene
-    lit = lit_scene_of(scene)
+    (lit,) = lit_scenes(batch_scenes([scene]))
     if not config.traces_hits:
         cameras = scene.c2w_V44, scene.fov_deg_V
         albedo_VRR6 = albedo_of_views(lit, *cameras, resolution, config.hit_rays)
@@ -133,6 +127,39 @@ def traced_views(
         gathered_VA3=as_tensor(np.stack([view.gathered for view in views])),
         given_VI=as_tensor(scene.here(given_VI)),
     )
+
+
+def albedo_of_cameras(
+    scenes: tuple[LitScene, ...], cameras: Cameras, resolution: int, rays_a_side: int
+) -> Tensor:
+    """Return the albedo [B, V, R, R, 6] that cameras see: where they are, and of their type."""
+    albedo = [
+        albedo_of_views(scene, c2w_V44, fov_deg_V, resolution, rays_a_side)
+        for scene, c2w_V44, fov_deg_V in zip(
+            scenes, cameras.c2w_BV44, cameras.fov_deg_BV, strict=True
+        )
+    ]
+    return like(torch.stack(albedo), cameras.fov_deg_BV)
+
+
+def albedo_of_views(
+    scene: LitScene, c2w_V44: Tensor, fov_deg_V: Tensor, resolution: int, rays_a_side: int
+) -> Tensor:
+    """Return the diffuse and specular albedo [V, R, R, 6] of visible surfaces, float32 on the CPU.
+
+    Rays go to the first triangle that is no lamp. Each pixel is the mean over its rays_a_side^2
+    rays; a miss counts as black.
+    """
+    nothing = np.zeros((6, 1), np.float32)  # the last column, which a miss picks
+    table = np.concatenate([np.concatenate([scene.diffuse, scene.specular]), nothing], axis=1)
+    views = []
+    for c2w_44, fov_deg in zip(c2w_V44.detach().cpu().numpy(), fov_deg_V, strict=True):
+        rays = Rays(c2w_44, float(fov_deg), resolution, rays_a_side)
+        total = np.zeros((6, resolution**2), np.float32)
+        for jitter in range(rays.rays_per_pixel):
+            total += table[:, scene.first_hits(rays.origin, rays.direction(jitter)).triangle]
+        views.append(total.T / np.float32(rays.rays_per_pixel))
+    return torch.from_numpy(np.stack(views)).unflatten(1, (resolution, resolution))
 
 
 def as_tensor(array: NDArray | DeviceArray) -> Tensor:

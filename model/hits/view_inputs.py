@@ -24,13 +24,17 @@ from model.hits.anchors import (
     gathered_at,
     outgoing_radiance,
 )
-from model.hits.device_arrays import DeviceArray
-from model.hits.direct_light import DirectLight, direct_light, lobe_ray_weight, no_light
-from model.hits.lit_scene import LitScene, PerPoint, Points
-from model.hits.reflectance import Gloss, gloss_at, lobe, sample_lobe
-from model.hits.sky_light import add_sky_light, escaped_light
+from model.hits.device_arrays import DeviceArray, aside
+from model.hits.direct_light import (
+    DirectLight,
+    add_sky_light,
+    direct_light,
+    escaped_light,
+    lobe_ray_weight,
+    no_light,
+)
+from model.hits.lit_scene import Gloss, LitScene, PerPoint, Points, gloss_at, lobe, sample_lobe
 from model.hits.vectors import Floats, at_rows, brightest, dot, spread
-from model.replayed import aside
 from storage.seeds import rng_for
 
 if TYPE_CHECKING:  # it loads pydantic

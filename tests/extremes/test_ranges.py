@@ -19,7 +19,7 @@ from numpy.typing import NDArray
 from infra.render.options import RenderOptions
 from infra.serving.train_model import TrainOptions
 from infra.setup.generated_pages import ROOTS, reachable
-from model.config import BaseWidths, ModelConfig, smoke, tiny
+from model.config import SIZES, BaseWidths, ModelConfig
 from pipeline.assets.settings import AssetSettings, GateSettings, OwnMaterialSettings
 from pipeline.flows.forms import DatasetInRuns
 from pipeline.generation.generate_options import CorePrice
@@ -94,7 +94,7 @@ EXAMPLES: dict[type, Any] = {
     CorePrice: CorePrice(),
     TrainOptions: TrainOptions(),
     TrainSettings: RUN,
-    ModelConfig: tiny(),
+    ModelConfig: SIZES["tiny"](),
     LossSettings: RUN.loss,
     AugmentationSettings: RUN.augmentation,
     BaseWidths: RUN.base_widths,
@@ -125,7 +125,9 @@ BESIDE: dict[tuple[type, str, End], dict[str, Any]] = {
        for name in ("seconds", "error_db", "spp") for end in ("low", "high")},
     (RenderSettings, "min_spp", "high"): {"max_spp": MAX_SPP},
     (RenderSettings, "max_spp", "low"): {"min_spp": 8},
-    (TrainSettings, "resolution", "low"): {"model": dataclasses.replace(smoke(), patch_px=1)},
+    (TrainSettings, "resolution", "low"): {
+        "model": dataclasses.replace(SIZES["smoke"](), patch_px=1)
+    },
     (TrainSettings, "num_steps", "low"): {"warmup_steps": 0},
     (TrainSettings, "warmup_steps", "high"): {"num_steps": _EVERY},
     (TrainSettings, "log_every", "high"): {"validate_every": _EVERY, "checkpoint_every": _EVERY},

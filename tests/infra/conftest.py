@@ -28,11 +28,11 @@ def write_network(path: Path, max_triangles: int | None = None, bias: float = 0.
     """Write a network of the size `smoke` that nobody trained: its pictures are a pattern."""
     import torch
 
-    from model.config import smoke
+    from model.config import SIZES
     from model.weights import TrainedRange, encode_weights
     from tests.model.kit import awake
 
-    model = awake(smoke(), torch.float32)
+    model = awake(SIZES["smoke"](), torch.float32)
     last = model.decoder.head.last
     assert last.bias is not None
     with torch.no_grad():

@@ -15,7 +15,7 @@ from torch.nn.attention import SDPBackend, sdpa_kernel
 from torch.utils.flop_counter import FlopCounterMode
 
 from model import positions, precision
-from model.config import SIZES, BaseWidths, ModelConfig, base, hits_smoke, smoke
+from model.config import SIZES, BaseWidths, ModelConfig
 from model.costs import Workload, costs, flops
 from model.precision import rounded_parts, set_precision, tf32
 from model.renderformer import RenderFormer, count_parameters
@@ -43,7 +43,7 @@ from tests.train.toy import toy_scene
 def test_base_has_the_published_parameters_but_for_the_texture_encoder() -> None:
     """Its first layer reads 13 x 32 x 32 equal numbers per triangle, and ours reads ten."""
     with torch.device("meta"):
-        got = count_parameters(RenderFormer(base()))
+        got = count_parameters(RenderFormer(SIZES["base"]()))
     # the published count is known to 5,000; the six frozen frequencies are not counted here
     assert abs(got - (205_170_000 - 768 * (13 * 32 * 32 - 10))) < 5_000
 
@@ -157,13 +157,13 @@ def wider(config: ModelConfig, times: int) -> ModelConfig:
 
 def test_without_a_base_width_or_at_it_nothing_follows_the_width() -> None:
     configs = [(SIZES[name](), BaseWidths()) for name in SIZES]
-    for config, base_widths in (*configs, (smoke(), BASE), (hits_smoke(), BASE)):
+    for config, base_widths in (*configs, (SIZES["smoke"](), BASE), (SIZES["hits-smoke"](), BASE)):
         assert set(width_scales(made(config), base_widths).values()) == {WidthScale()}
 
 
 def test_every_kind_of_weight_follows_its_own_rule() -> None:
     """By hand from Yang et al. 2021, table 3, four times as wide; Xavier's sqrt(2 / (n + m))."""
-    scales = width_scales(made(wider(smoke(), 4)), BASE)
+    scales = width_scales(made(wider(SIZES["smoke"](), 4)), BASE)
     hidden = WidthScale(start=1.0, adamw=1 / 4, muon=1 / 2)
     of_width = {
         "encoder.layers.0.attention.qkv.weight": hidden,
@@ -190,7 +190,7 @@ def test_every_kind_of_weight_follows_its_own_rule() -> None:
 
 def test_heads_that_grow_ask_less_loudly() -> None:
     """1 / d in place of 1 / sqrt(d): a gain of the query's norm, initial and moved, by hand."""
-    config = dataclasses.replace(wider(smoke(), 4), num_heads=2)
+    config = dataclasses.replace(wider(SIZES["smoke"](), 4), num_heads=2)
     gains = [s for n, s in width_scales(made(config), BASE).items() if n.endswith("q_norm.weight")]
     assert len(gains) == 2 + 2 * 4
     assert {round(gain.start, 12) for gain in gains} == {0.5}
@@ -198,7 +198,7 @@ def test_heads_that_grow_ask_less_loudly() -> None:
 
 
 def test_widths_of_pixels_and_filters_count_for_themselves() -> None:
-    config = dataclasses.replace(hits_smoke(), pixel_width=256, filter_width=64)
+    config = dataclasses.replace(SIZES["hits-smoke"](), pixel_width=256, filter_width=64)
     scales = width_scales(made(config), BASE)
     assert scales["decoder.head.second.weight"].adamw == 1 / 4
     # what pixels ask anchors by is asked by 1 / d as well
@@ -209,7 +209,7 @@ def test_widths_of_pixels_and_filters_count_for_themselves() -> None:
 
 
 def test_weights_start_as_large_as_their_rule_says() -> None:
-    model = RenderFormer(wider(smoke(), 2))
+    model = RenderFormer(wider(SIZES["smoke"](), 2))
     model.initialize(torch.Generator().manual_seed(0))
     scale_start(model, width_scales(model, BASE))
     weights = dict(model.named_parameters())

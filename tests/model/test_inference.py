@@ -4,6 +4,7 @@ Light of groups adds up to the scene's. Demodulated pictures: what reflects noth
 """
 
 import dataclasses
+import json
 import warnings
 from pathlib import Path
 from typing import Any
@@ -18,13 +19,12 @@ from torch import Tensor
 from torch.nn.functional import interpolate
 
 from model import inference
-from model.config import ModelConfig, smoke
-from model.demodulated import compose_radiance
+from model.config import SIZES, ModelConfig
 from model.hits.tracing import with_traced
 from model.inference import LightGroup, NeuralRenderer, light_groups
 from model.renderformer import RenderFormer, radiance
 from model.scene_tensors import SceneTensors, scene_tensors
-from model.view_decoder import BilinearUpsample, Fusion
+from model.view_decoder import BilinearUpsample, Fusion, compose_radiance
 from model.weights import RANGE_KEY, TrainedRange, encode_weights, trained_range
 from storage.conventions import look_at_c2w
 from storage.errors import TrilightError
@@ -121,7 +121,7 @@ def test_groups_give_what_a_linear_network_gives_at_once(
 
 
 def test_extremes_give_finite_pictures() -> None:
-    model = awake(smoke(), torch.float32)
+    model = awake(SIZES["smoke"](), torch.float32)
     with torch.no_grad():
         model.decoder.head.last.weight *= 0.1
     renderer = NeuralRenderer(model)
@@ -150,7 +150,7 @@ def test_more_triangles_than_trained_are_rendered_with_a_warning(tmp_path: Path)
 
 def test_what_it_was_trained_on_goes_round_through_metadata() -> None:
     for known in (TrainedRange(max_triangles=1536), TrainedRange(resolution=64), TrainedRange()):
-        assert trained_range(known.as_metadata()) == known
+        assert trained_range({RANGE_KEY: json.dumps(vars(known))}) == known
     assert trained_range({}) is None
     lies = ("", "[]", '{"max_triangles": "many"}', '{"resolution": Infinity}', "[" * 100_000)
     for text in lies:

@@ -9,8 +9,8 @@ from typing import Any
 
 import torch
 
-from model.checkpoint_format import path_of_step
 from model.config import ModelConfig
+from model.open import path_of_step
 from model.renderformer import RenderFormer
 from model.scene_tensors import SceneTensors
 from storage.dataset.dataset import Dataset

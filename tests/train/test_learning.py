@@ -19,8 +19,7 @@ import numpy as np
 import pytest
 import torch
 
-from model.config import ModelConfig
-from model.config import smoke as smoke_model
+from model.config import SIZES, ModelConfig
 from model.hits.traced import INPUTS
 from model.inference import NeuralRenderer
 from model.open import open_network
@@ -65,7 +64,7 @@ from train.run_training import run_training
 from train.settings import AugmentationSettings, TrainSettings, learning_rate
 
 SMALL = dataclasses.replace(
-    smoke_model(), width=64, num_heads=1, hidden_width=192, encoder_layers=2, decoder_layers=2
+    SIZES["smoke"](), width=64, num_heads=1, hidden_width=192, encoder_layers=2, decoder_layers=2
 )
 
 
@@ -91,7 +90,7 @@ def memorised(scenes: list[TrainingScene], model: ModelConfig, steps: int) -> Tr
 def score(state: TrainState, scene: TrainingScene, target: TrainingScene) -> float:
     """Return the psnr_log_db of one scene's picture against another's."""
     wanted = 10 ** target.target_VRR3[0].double().numpy() - 1
-    return psnr_log_db(predict(state.eval_model, scene)[0], wanted)
+    return psnr_log_db(predict(state.eval_model, scene.tensors, len(wanted))[0], wanted)
 
 
 @pytest.mark.slow("training")

@@ -11,7 +11,7 @@ from typing import Any
 import pydantic
 import pytest
 
-from model.config import SIZES, large
+from model.config import SIZES
 from storage.digests import canonical_json, sha256_hex
 from storage.errors import LAST_COMMIT, TrilightError
 from storage.settings.described import settings_record
@@ -23,7 +23,7 @@ from train.presets import (
     scale_intervals,
     training_preset,
 )
-from train.resume import ResumePlan, event_records, plan_resume
+from train.resume import ResumePlan, plan_resume
 from train.settings import AugmentationSettings, TrainSettings, known_settings, stored_settings
 
 DIGEST = "d" * 64
@@ -42,9 +42,9 @@ def header(settings: TrainSettings | None = None, *, step: int = 8, **more: Any)
 
 def following(before: dict[str, Any], going: ResumePlan, step: int) -> dict[str, Any]:
     """Return the header of a later checkpoint of a run that went on."""
-    return header(going.settings, step=step, history=event_records(going.history)) | {
-        "data_digest": before["data_digest"]
-    }
+    history = [dataclasses.asdict(event) for event in going.history]
+    later = header(going.settings, step=step, history=history)
+    return later | {"data_digest": before["data_digest"]}
 
 
 def test_the_same_command_goes_on_and_nothing_happens() -> None:
@@ -296,7 +296,7 @@ def test_every_size_can_be_asked_for_by_name() -> None:
     for name, make in SIZES.items():
         assert override_training_preset("smoke", {"model": name}).model == make()
     without = override_training_preset("pretrain", {"model.window_bundles": 0, "model": "large"})
-    assert without.model == dataclasses.replace(large(), window_bundles=0)
+    assert without.model == dataclasses.replace(SIZES["large"](), window_bundles=0)
     with pytest.raises(TrilightError, match="'model' is 'larg'; did you mean large"):
         override_training_preset("smoke", {"model": "larg"})
     with pytest.raises(TrilightError, match="resolution is 72; expected a multiple of 64"):

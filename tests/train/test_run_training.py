@@ -14,7 +14,6 @@ import socket
 import time
 from collections.abc import Iterator
 from pathlib import Path
-from types import ModuleType
 from typing import Any
 
 import pytest
@@ -22,9 +21,8 @@ import torch
 from PIL import Image
 from safetensors.torch import load
 
-from model.checkpoint_format import path_of_step, saved_steps
 from model.layers import Norm
-from model.open import open_network
+from model.open import open_network, path_of_step, saved_steps
 from model.weights import TrainedRange, decode_weights, trained_range
 from storage.dataset.dataset import Dataset
 from storage.dataset.training_data import NO_MANIFEST
@@ -106,7 +104,7 @@ def curve(out: Path) -> list[dict]:
 class SignalIn:
     """A signal within a call of a function of another module, after which that goes on."""
 
-    def __init__(self, patch: pytest.MonkeyPatch, module: ModuleType, name: str, call: int) -> None:
+    def __init__(self, patch: pytest.MonkeyPatch, module: object, name: str, call: int) -> None:
         function, self.calls = getattr(module, name), 0
 
         def asked(*given: object, **named: object) -> object:
@@ -124,8 +122,8 @@ def test_a_signal_in_a_validation_or_while_saving_loses_nothing(
     """A validation that was left is not finished first; the resumed run makes up for it."""
     for number, (module, name, call, step) in enumerate((
         (trainer, "save_checkpoint", 1, 4),
-        # one call for the median picture, and one for each of two scenes
-        (validation, "score_pictures", 2, 8),
+        # a call for the median picture of each of two scenes, and one for each scene
+        (validation.ValidationScene, "scores", 3, 8),
         # two scenes of step 8 that are made up for, and the first of the last step
         (validation, "predict", 3, 12),
         # the last scene of the last step, which is made up for

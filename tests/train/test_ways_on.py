@@ -11,8 +11,7 @@ import pytest
 import torch
 from torch import Tensor
 
-from model.checkpoint_format import path_of_step, saved_steps
-from model.open import open_network
+from model.open import open_network, path_of_step, saved_steps
 from storage.dataset.dataset import Dataset, open_dataset
 from storage.errors import TrilightError
 from tests.for_each import for_each

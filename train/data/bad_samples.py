@@ -69,14 +69,17 @@ class BadSampleCounter:
             ) from error
 
 
-def first_samples(shards: ShardSet, limit: int, unusable: BadSampleCounter) -> Iterator[Sample]:
+def first_samples(
+    shards: ShardSet, limit: int, unusable: BadSampleCounter | None = None
+) -> Iterator[Sample]:
     """Yield the first usable samples of a split, at most `limit`, in the order of the shards.
 
     Several datasets contribute equal numbers, or all that they have.
 
     Raises:
-        TrilightError: more samples are damaged than `unusable` allows.
+        TrilightError: more samples are damaged than `unusable` allows; by default, one is.
     """
+    unusable = unusable or BadSampleCounter(0)
     count = len(shards.parts)
     for source, part in enumerate(shards.parts):
         remaining = limit // count + (source < limit % count)

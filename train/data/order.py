@@ -228,10 +228,10 @@ def plan_mixture(
     if len(sources) == 1 and (old is None or old.digests == (sources[0].digest,)):
         if header is None or RECORD not in header:
             return None
-    position = 0 if header is None else header["step"] * settings.scenes_per_step
+    step = 0 if header is None else header["step"]
     seen_counts = dict[str, int]()
-    if old is not None and header is not None:
-        counts = old.counts_before(header["step"] * old.scenes_per_step)
+    if old is not None:
+        counts = old.counts_before(step * old.scenes_per_step)
         seen_counts = dict(zip(old.digests, counts, strict=True))
     shards = data.split("train")
     weights = tuple(map(float, settings.data_weights)) or tuple(
@@ -241,7 +241,7 @@ def plan_mixture(
         digests=tuple(source.digest for source in sources),
         names=tuple(source.name for source in sources),
         weights=weights,
-        first=position,
+        first=step * settings.scenes_per_step,
         before=tuple(seen_counts.get(source.digest, 0) for source in sources),
         scenes_per_step=settings.scenes_per_step,
     )
@@ -255,11 +255,9 @@ def plan_mixture(
 def _mixture_of_header(header: Mapping[str, Any]) -> Mixture:
     """Return the mixture of a checkpoint, or that of its single dataset."""
     if RECORD in header:
-        record: dict[str, Any] = {
-            name: tuple(value) if isinstance(value, list) else value
-            for name, value in header[RECORD].items()
-        }
-        return Mixture(**record)
+        from storage.settings.described import from_record  # it loads pydantic
+
+        return from_record(Mixture, header[RECORD])
     return single_dataset(header["data_digest"], header["settings"]["scenes_per_step"])
 
 

@@ -56,9 +56,7 @@ def training_scene(sample: Sample, resolution: int, *, lights_apart: bool = Fals
             single lights.
     """
     scene = _scene_of(sample.key, sample.scene, sample.views, sample.radiance_rgb, resolution)
-    if not lights_apart:
-        return scene
-    return _with_lights(scene, sample.lights_rgb, resolution)
+    return _with_lights(scene, sample.lights_rgb, resolution) if lights_apart else scene
 
 
 def scene_of_views(
@@ -81,8 +79,7 @@ def scene_of_views(
     training = _scene_of(sample.key, scene, records, pictures, resolution)
     if not per_light:
         return training
-    lights_rgb = sample.lights_rgb(views, pictures.shape[1])
-    return _with_lights(training, lights_rgb, resolution)
+    return _with_lights(training, sample.lights_rgb(views, pictures.shape[1]), resolution)
 
 
 def require_few_triangles(key: str, scene: Scene, most: int) -> None:

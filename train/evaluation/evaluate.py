@@ -33,7 +33,7 @@ from storage.records.sample import Sample
 from storage.records.scene import Scene
 from storage.renderer import Camera, ReadyScene, Renderer
 from storage.settings.described import checked
-from train.data.bad_samples import BadSampleCounter, first_samples
+from train.data.bad_samples import first_samples
 from train.data.scenes import TrainingScene, training_scene
 from train.evaluation.metrics import (
     GROUPED,
@@ -90,18 +90,18 @@ class EvalConfig:
 
     def samples(self) -> Iterator[Sample]:
         """Yield the samples; a damaged one raises, since the scores would be of another set."""
-        return first_samples(self.shards, self.most_scenes, BadSampleCounter(0))
+        return first_samples(self.shards, self.most_scenes)
 
 
 def make_baselines(shards: ShardSet, resolution: int) -> Baselines:
     """Return the baselines from the first scenes of a training split."""
-    samples = first_samples(shards, BASELINE_SCENES, BadSampleCounter(0))
+    samples = first_samples(shards, BASELINE_SCENES)
     return Baselines(training_scene(sample, resolution) for sample in samples)
 
 
 def stored_resolution(shards: ShardSet) -> int:
     """Return the width in pixels of the first sample's pictures."""
-    (sample,) = first_samples(shards, 1, BadSampleCounter(0))
+    (sample,) = first_samples(shards, 1)
     return int(sample.radiance_rgb.shape[1])
 
 
@@ -113,21 +113,15 @@ def judge_views(config: EvalConfig, scene_done: Callable[[], None]) -> list[Judg
     """
     rows: list[JudgedView] = []
     before: SceneTensors | None = None
+    device = next(config.network.parameters()).device
     every, first = spread_views(config.tracer_views, config.num_scenes)
     for number, sample in enumerate(config.samples()):
         scene = validation_scene(sample, config.resolution)
-        if config.network.config.view_stage == "hits":
-            tensors = with_traced(
-                scene.scene.tensors,
-                config.resolution,
-                config.network.config,
-                device=next(config.network.parameters()).device,
-            )  # traced once for all predictions
-            scene = dataclasses.replace(
-                scene, scene=dataclasses.replace(scene.scene, tensors=tensors)
-            )
-        contestants = {NETWORK: predict(config.network, scene.scene)}
-        contestants |= withheld_pictures(config.network, scene.scene)
+        tensors = with_traced(  # once for all predictions
+            scene.scene.tensors, config.resolution, config.network.config, device=device
+        )
+        contestants = {NETWORK: predict(config.network, tensors, config.resolution)}
+        contestants |= withheld_pictures(config.network, tensors, config.resolution)
         grouped_VRR3 = grouped_pictures(config.network, sample.scene, config.resolution)
         if grouped_VRR3 is not None:
             contestants[GROUPED] = grouped_VRR3
@@ -142,9 +136,9 @@ def judge_views(config: EvalConfig, scene_done: Callable[[], None]) -> list[Judg
                 pictures[TRACER] = traced[view]
             scene_rows.append(judge_view(sample, scene, view, pictures, config.lpips))
         if before is not None and config.network.config.scene_tokens:
-            scene_rows = _add_swapped_scores(scene_rows, config.network, scene, before)
+            scene_rows = _add_swapped_scores(config, scene_rows, scene, tensors, before)
         rows += scene_rows
-        before = scene.scene.tensors
+        before = tensors
         scene_done()
     if not rows:
         raise TrilightError("evaluate: the split holds no scene; expected at least one.")
@@ -186,7 +180,11 @@ def _traced_pictures(
 
 
 def _add_swapped_scores(
-    rows: Sequence[JudgedView], network: RenderFormer, judged: ValidationScene, other: SceneTensors
+    config: EvalConfig,
+    rows: Sequence[JudgedView],
+    judged: ValidationScene,
+    cameras: SceneTensors,
+    other: SceneTensors,
 ) -> list[JudgedView]:
     """Return rows with the scores of predictions that are given another scene's triangles.
 
@@ -194,11 +192,10 @@ def _add_swapped_scores(
     no worse with other triangles. A network of hits keeps its own hits; only the scene's tokens are
     replaced.
     """
-    cameras = judged.scene.tensors
     seen = dataclasses.replace(other, c2w_V44=cameras.c2w_V44, fov_deg_V=cameras.fov_deg_V)
     if cameras.traced is not None:
         seen = dataclasses.replace(seen, traced=with_others_tokens(cameras.traced, other.traced))
-    pictures_VRR3 = predict(network, dataclasses.replace(judged.scene, tensors=seen))
+    pictures_VRR3 = predict(config.network, seen, config.resolution)
     return [
         dataclasses.replace(row, swapped_psnr_log_db=psnr_log_db(picture, target))
         for row, picture, target in zip(rows, pictures_VRR3, judged.target_VRR3, strict=True)
@@ -207,22 +204,17 @@ def _add_swapped_scores(
 
 def sheet_views(config: EvalConfig, chosen: Sequence[JudgedView]) -> list[SheetView]:
     """Render some views again for a sheet, in the order of their rows."""
-    rows_of: dict[str, list[JudgedView]] = {}
-    for row in chosen:
-        rows_of.setdefault(row.key, []).append(row)
     sheet_of_view: dict[tuple[str, int], SheetView] = {}
     for sample in config.samples():
-        if rows := rows_of.get(sample.key):
+        if rows := [row for row in chosen if row.key == sample.key]:
             scene = training_scene(sample, config.resolution)
-            pictures = predict(config.network, scene)
+            pictures = predict(config.network, scene.tensors, config.resolution)
             traced = _traced_pictures(config, sample, [row.view for row in rows])
+            black = np.zeros_like(pictures[0])
             for row in rows:
-                sheet_view = _sheet_view(row, scene, pictures[row.view])
-                if config.tracer is not None:
-                    black = np.zeros_like(sheet_view.target_rgb)
-                    extra_rgb = {CAPTION: traced.get(row.view, black)}
-                    sheet_view = dataclasses.replace(sheet_view, extra_rgb=extra_rgb)
-                sheet_of_view[row.key, row.view] = sheet_view
+                view = _sheet_view(row, scene, pictures[row.view])
+                extra = {} if config.tracer is None else {CAPTION: traced.get(row.view, black)}
+                sheet_of_view[row.key, row.view] = dataclasses.replace(view, extra_rgb=extra)
     return [sheet_of_view[row.key, row.view] for row in chosen]
 
 
@@ -271,13 +263,13 @@ def grouped_pictures(
 
 
 def withheld_pictures(
-    network: RenderFormer, scene: TrainingScene
+    network: RenderFormer, scene: SceneTensors, resolution: int
 ) -> dict[str, NDArray[np.float64]]:
     """Predict a traced scene without each of the inputs, by the method's name.
 
     Scenes without traced inputs return an empty dict.
     """
-    traced = scene.tensors.traced
+    traced = scene.traced
     if traced is None:
         return {}
     pictures = {}
@@ -286,10 +278,8 @@ def withheld_pictures(
             continue
         kept_VI = torch.ones_like(traced.given_VI)
         kept_VI[:, index] = 0
-        tensors = dataclasses.replace(scene.tensors, traced=traced.without(kept_VI))
-        pictures[f"{NETWORK} without {name}"] = predict(
-            network, dataclasses.replace(scene, tensors=tensors)
-        )
+        without = dataclasses.replace(scene, traced=traced.without(kept_VI))
+        pictures[f"{NETWORK} without {name}"] = predict(network, without, resolution)
     return pictures
 
 

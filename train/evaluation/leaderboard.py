@@ -26,7 +26,7 @@ from storage.records.safe_read import read_plain
 from storage.records.sample import Sample
 from storage.renderer import Camera, Renderer, fingerprint
 from storage.typed_json import read_json_lines
-from train.data.bad_samples import BadSampleCounter, first_samples
+from train.data.bad_samples import first_samples
 from train.evaluation.cost_charts import on_front
 from train.evaluation.evaluate import Price, median_price, time_scene
 from train.evaluation.metrics import (
@@ -178,11 +178,15 @@ class Board:
     """Sentences on the methods, without full stops, which stand below the tables."""
     left_out: dict[tuple[int, str], str] = field(default_factory=dict)
     """Reason by (width, key) of scenes that a method cannot render."""
+    _renderer_digests: dict[int, str] = field(default_factory=dict, init=False)
+    """Digest of each renderer by its `id`."""
 
     def add(self, method: Method, kind: str) -> None:
         """Add a method of one width."""
         self.methods.append(method)
         self.kinds[method.name] = kind
+        if not isinstance(method, PictureSource):
+            self._renderer_digests[id(method)] = fingerprint(method.identity)
 
     @functools.cached_property
     def rows(self) -> Rows:
@@ -194,15 +198,6 @@ class Board:
         """Digest of the metrics' definitions."""
         meanings = {metric: METRICS[metric].meaning for metric in METRICS}
         return sha256_hex(canonical_json([meanings, self.lpips is not None]))
-
-    @functools.cached_property
-    def _renderer_digests(self) -> dict[int, str]:
-        """Digest of each renderer by its `id`."""
-        return {
-            id(method): fingerprint(method.identity)
-            for method in self.methods
-            if not isinstance(method, PictureSource)
-        }
 
     def key_of(self, method: Method, key: str, view: int) -> RowKey:
         """Return the key of a method's row."""
@@ -269,7 +264,7 @@ def judge_all(board: Board, on_progress: OnProgress) -> None:
         TrilightError: damaged data, or a network that cannot render a scene.
     """
     total = len(board.keys) * len(board.widths)
-    samples = first_samples(board.shards, len(board.keys), BadSampleCounter(0))
+    samples = first_samples(board.shards, len(board.keys))
     turns = ((row, sample, width) for row, sample in enumerate(samples) for width in board.widths)
     for done, (row, sample, width) in enumerate(turns):
         on_progress(done, total, "")

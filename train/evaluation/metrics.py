@@ -36,12 +36,6 @@ Scores = Mapping[str, float]
 """Score of a picture by metric."""
 
 
-def score_view(radiance_rgb: NDArray, target_rgb: NDArray, hits: NDArray[np.bool_]) -> Scores:
-    """Score one picture [R, R, 3] of linear radiance by VALIDATED; `hits` is as in `hit_masks`."""
-    scores = picture_scores(radiance_rgb, target_rgb, hits, None, VALIDATED)
-    return {name: score or 0.0 for name, score in scores.items()}
-
-
 def summarize_scores(views: Sequence[Scores]) -> dict[str, float]:
     """Return mean log_l1, and median and the worse 5th percentile of each dB value."""
     summary = {"log_l1": float(np.mean([view["log_l1"] for view in views]))}
@@ -356,11 +350,10 @@ def by_group(views: Sequence[JudgedView]) -> dict[str, dict[str, dict[str, Any]]
     """Return the network's summary by grouping and group, in the order of the groups."""
     groups: dict[str, dict[str, dict[str, Any]]] = {}
     for name, part_of in SPLITS.items():
-        parts: dict[str, list[JudgedView]] = {}
-        for view in views:
-            parts.setdefault(part_of(view), []).append(view)
-        ordered = sorted(parts.items(), key=lambda part: _order(part[0]))
-        groups[name] = {part: summarize_views(members) for part, members in ordered}
+        groups[name] = {
+            part: summarize_views([view for view in views if part_of(view) == part])
+            for part in sorted(set(map(part_of, views)), key=_order)
+        }
     return groups
 
 

@@ -1,4 +1,7 @@
-"""Contact sheet of an evaluation: target, prediction, error, and error relative to the noise."""
+"""Contact sheet of an evaluation: target, prediction, error, and error relative to the noise.
+
+Errors are shown in false color. Imports no torch.
+"""
 
 import dataclasses
 import io
@@ -11,15 +14,28 @@ from numpy.typing import NDArray
 from PIL import Image, ImageDraw, ImageFont
 
 from storage.atomic import write_atomically
-from storage.conventions import preview_srgb8
-from train.evaluation.error_colors import (
-    ERROR_WHITE,
-    error_picture,
-    heat_colors,
-    mean_error,
-)
-from train.evaluation.validation import Judge, ValidationResult
-from train.settings import TrainSettings
+from storage.conventions import log10_radiance, preview_srgb8
+
+ERROR_WHITE = 0.5
+"""|log10(1 + a) - log10(1 + b)| that the error picture shows as white."""
+
+
+def error_picture(predicted_rgb: NDArray, target_rgb: NDArray) -> NDArray[np.uint8]:
+    """Return the error of log10(1 + radiance) [R, R, 3], from black over red to white."""
+    return heat_colors(mean_error(predicted_rgb, target_rgb) / ERROR_WHITE)
+
+
+def mean_error(predicted_rgb: NDArray, target_rgb: NDArray) -> NDArray:
+    """Return |log10(1 + a) - log10(1 + b)| [R, R], averaged over channels."""
+    error: NDArray = np.abs(log10_radiance(predicted_rgb) - log10_radiance(target_rgb))
+    return error.mean(axis=-1)
+
+
+def heat_colors(level_RR: NDArray) -> NDArray[np.uint8]:
+    """Map 0 to 1 to black, red, yellow and white."""
+    ramp = np.clip(3 * level_RR[..., None] - np.array([0, 1, 2]), 0, 1)
+    return np.round(255 * ramp).astype(np.uint8)
+
 
 TILE_PX = 160
 """Maximum width of a tile, which is a whole multiple of the picture's width."""
@@ -116,40 +132,3 @@ def _block(view: SheetView) -> Image.Image:
 def _write(image: Image.Image, at: tuple[int, int], text: str) -> None:
     font = ImageFont.load_default(size=CAPTION_PX - 6)
     ImageDraw.Draw(image).text((at[0], at[1] + 1), text, fill=INK, font=font)
-
-
-SHEET_SCENES = 8
-"""Maximum number of scenes on a validation sheet, one view each."""
-
-
-def draw_validation_sheet(
-    settings: TrainSettings, judge: Judge, validation: ValidationResult, step: int
-) -> Image.Image:
-    """Draw the sheet of the first validation scenes after a step."""
-    views = []
-    at = 0
-    scene_pictures = zip(judge.scenes, validation.pictures, strict=True)
-    for judged, pictures in list(scene_pictures)[:SHEET_SCENES]:
-        score = validation.views[at]
-        median = judge.median_views[at]
-        at += len(pictures)
-        views.append(
-            SheetView(
-                name=f"scene {judged.scene.key}, view 0",
-                scores=(
-                    f"log L1 {score['log_l1']:.4f} (median picture {median['log_l1']:.4f}), "
-                    f"{score['psnr_log_db']:.1f} dB log, {score['psnr_linear_db']:.1f} dB linear"
-                ),
-                target_rgb=judged.target_VRR3[0],
-                predicted_rgb=pictures[0],
-                noise=float(judged.scene.noise_V[0]),
-            )
-        )
-    title = (
-        f"run {settings.run}, step {step} of {settings.num_steps}, {settings.resolution} pixels: "
-        f"validation scenes, never trained on",
-        f"log L1 {validation.scores['log_l1']:.4f}, median picture of the training views "
-        f"{judge.median_scores['log_l1']:.4f}, "
-        f"{validation.scores['better_than_median']:.0%} of views better than it",
-    )
-    return draw_sheet(views, title)

@@ -12,24 +12,27 @@ from dataclasses import dataclass
 import numpy as np
 import torch
 from numpy.typing import NDArray
+from PIL import Image
 
 from model.renderformer import RenderFormer, radiance
+from model.scene_tensors import SceneTensors, batch_scenes, map_tensors
 from storage.conventions import log10_radiance, radiance_from_log10
 from storage.errors import TrilightError
 from storage.raycast.first_hits import first_hits
 from storage.records.sample import Sample
-from storage.records.scene import Scene
 from storage.renderer import fingerprint
-from train.data.buckets import collate_batch
 from train.data.scenes import TrainingScene, block_mean, training_scene
 from train.evaluation.metrics import (
+    VALIDATED,
     Lead,
     Scores,
     fraction_better,
     lead,
-    score_view,
+    picture_scores,
     summarize_scores,
 )
+from train.evaluation.sheet import SheetView, draw_sheet
+from train.settings import TrainSettings
 
 MEDIAN = "median picture"
 NEAREST = "nearest training view"
@@ -90,12 +93,11 @@ def median_picture(log10_pictures: Sequence[NDArray]) -> NDArray[np.float64]:
 
 
 def _small(log10_MRR3: NDArray) -> NDArray[np.float32]:
-    count, resolution = log10_MRR3.shape[:2]
+    resolution = log10_MRR3.shape[1]
     factor = max(resolution // COMPARED_PX, 1)
-    cropped_px = resolution // factor * factor
-    cropped = log10_MRR3[:, :cropped_px, :cropped_px].astype(np.float32)
-    blocks = cropped.reshape(count, cropped_px // factor, factor, cropped_px // factor, factor, 3)
-    return blocks.mean(axis=(2, 4))
+    width = resolution // factor
+    cropped = log10_MRR3[:, : width * factor, : width * factor].astype(np.float32)
+    return block_mean(cropped, width)
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -147,7 +149,13 @@ class ValidationScene:
     target_VRR3: NDArray[np.float64]
     """Linear radiance of the targets."""
     hits_VRR: NDArray[np.bool_]
-    """True for pixels that see geometry (`hit_masks`)."""
+    """True for pixels whose central ray hits a triangle other than emitters, which are hidden."""
+
+    def scores(self, pictures_VRR3: NDArray) -> list[Scores]:
+        """Score pictures [V, R, R, 3] of linear radiance by VALIDATED, view by view."""
+        views = zip(pictures_VRR3, self.target_VRR3, self.hits_VRR, strict=True)
+        every = [picture_scores(*view, None, VALIDATED) for view in views]
+        return [{name: score or 0.0 for name, score in scores.items()} for scores in every]
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -168,9 +176,13 @@ class Judge:
     """Validation scenes, and the scores of the median picture on them."""
 
     def __init__(self, samples: Sequence[Sample], resolution: int, median_RR3: NDArray) -> None:
+        self._resolution = resolution
         self.scenes = [validation_scene(sample, resolution) for sample in samples]
-        stills = [np.broadcast_to(median_RR3, scene.target_VRR3.shape) for scene in self.scenes]
-        self.median_views = score_pictures(stills, self.scenes)
+        self.median_views = [
+            scores
+            for scene in self.scenes
+            for scores in scene.scores(np.broadcast_to(median_RR3, scene.target_VRR3.shape))
+        ]
         self.median_scores = summarize_scores(self.median_views)
 
     def judge(
@@ -186,10 +198,9 @@ class Judge:
         views = []
         for judged in self.scenes:
             between()
-            pictures.append(predict(model, judged.scene))
-        for picture, judged in zip(pictures, self.scenes, strict=True):
+            pictures.append(predict(model, judged.scene.tensors, self._resolution))
             between()
-            views += score_pictures([picture], [judged])
+            views += judged.scores(pictures[-1])
         scores = summarize_scores(views)
         scores["better_than_median"] = fraction_better(views, self.median_views)
         sizes = [len(scene.target_VRR3) for scene in self.scenes]
@@ -202,40 +213,61 @@ class Judge:
 def validation_scene(sample: Sample, resolution: int) -> ValidationScene:
     """Return a sample with targets and hit masks, at the resolution of the run."""
     scene = training_scene(sample, resolution)
+    hits = [
+        first_hits(sample.scene, view=view, resolution=resolution).met
+        for view in range(sample.scene.num_views)
+    ]
     return ValidationScene(
         scene=scene,
         target_VRR3=radiance_from_log10(scene.target_VRR3.double().numpy()),
-        hits_VRR=hit_masks(sample.scene, resolution),
+        hits_VRR=np.stack(hits),
     )
 
 
 @torch.no_grad()
-def predict(model: RenderFormer, scene: TrainingScene) -> NDArray[np.float64]:
+def predict(model: RenderFormer, scene: SceneTensors, resolution: int) -> NDArray[np.float64]:
     """Return the pictures of one scene, linear radiance [V, R, R, 3] of at least 0.
 
     The network computes in float32, on its own device.
     """
     device = next(model.parameters()).device
-    batch = collate_batch([scene]).to(device)
-    log10_VRR3 = model(batch.scenes, scene.target_VRR3.shape[1])[0]
+    batch = map_tensors(batch_scenes([scene]), lambda tensor: tensor.to(device))
+    log10_VRR3 = model(batch, resolution)[0]
     return np.maximum(radiance(log10_VRR3.double()).cpu().numpy(), 0)
 
 
-def score_pictures(pictures: Sequence[NDArray], judged: Sequence[ValidationScene]) -> list[Scores]:
-    """Score the pictures [V, R, R, 3] of each scene, view by view."""
-    return [
-        score_view(picture, target, hits)
-        for pictures_VRR3, entry in zip(pictures, judged, strict=True)
-        for picture, target, hits in zip(
-            pictures_VRR3, entry.target_VRR3, entry.hits_VRR, strict=True
+SHEET_SCENES = 8
+"""Maximum number of scenes on a validation sheet, one view each."""
+
+
+def draw_validation_sheet(
+    settings: TrainSettings, judge: Judge, validation: ValidationResult, step: int
+) -> Image.Image:
+    """Draw the sheet of the first validation scenes after a step."""
+    views = []
+    at = 0
+    scene_pictures = zip(judge.scenes, validation.pictures, strict=True)
+    for judged, pictures in list(scene_pictures)[:SHEET_SCENES]:
+        score = validation.views[at]
+        median = judge.median_views[at]
+        at += len(pictures)
+        views.append(
+            SheetView(
+                name=f"scene {judged.scene.key}, view 0",
+                scores=(
+                    f"log L1 {score['log_l1']:.4f} (median picture {median['log_l1']:.4f}), "
+                    f"{score['psnr_log_db']:.1f} dB log, {score['psnr_linear_db']:.1f} dB linear"
+                ),
+                target_rgb=judged.target_VRR3[0],
+                predicted_rgb=pictures[0],
+                noise=float(judged.scene.noise_V[0]),
+            )
         )
-    ]
-
-
-def hit_masks(scene: Scene, resolution: int) -> NDArray[np.bool_]:
-    """Return masks [V, R, R] of pixels whose central ray hits a triangle.
-
-    Emitters do not count, since they are hidden from the camera.
-    """
-    views = range(scene.num_views)
-    return np.stack([first_hits(scene, view=view, resolution=resolution).met for view in views])
+    title = (
+        f"run {settings.run}, step {step} of {settings.num_steps}, {settings.resolution} pixels: "
+        f"validation scenes, never trained on",
+        f"log L1 {validation.scores['log_l1']:.4f}, median picture of the training views "
+        f"{judge.median_scores['log_l1']:.4f}, "
+        f"{validation.scores['better_than_median']:.0%} of views better than it",
+    )
+    return draw_sheet(views, title)

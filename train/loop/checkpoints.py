@@ -20,26 +20,20 @@ from typing import Annotated, Any
 import torch
 from safetensors.torch import save
 
-from model import checkpoint_format
-from model.checkpoint_format import (
-    HEADER_KEY,
-    Checkpoint,
-    path_of_step,
-    saved_steps,
-    unreadable_error,
-)
+from model.open import HEADER_KEY, Checkpoint, path_of_step, saved_steps
+from model.open import read_checkpoint as read_network_checkpoint
 from model.weights import encode_config, load_tensors
 from storage.atomic import atomic_writer, remove_leftovers
 from storage.digests import seal_of
 from storage.errors import TrilightError
 from storage.extensions import extension_digests, require_same_extensions
 from storage.settings.ranges import Within
-from storage.typed_json import FINITE, Sha256, read_json
+from storage.typed_json import FINITE, Sha256
 from train.data.order import RECORD, Mixture
 from train.loop.distributed import DistributedContext
 from train.loop.step import StepReport
 from train.loop.train_state import TrainState, new_state
-from train.resume import Event, ResumePlan, event_records
+from train.resume import Event, ResumePlan
 from train.settings import Precision, decay_start_step, stored_settings
 
 UNSEALED = "0" * 64
@@ -79,11 +73,10 @@ class _Header:
 def _encode_checkpoint(state: TrainState, world_size: int) -> bytes:
     """Return the bytes of a checkpoint without its sha256; later steps do not change them."""
     tensors = state.optimizer.optimizer_state()
-    for name, weight in state.model.named_parameters():
-        tensors[f"model/{name}"] = weight.detach()
-    if state.ema_model is not None:
-        for name, weight in state.ema_model.named_parameters():
-            tensors[f"mean/{name}"] = weight
+    for part, network in (("model", state.model), ("mean", state.ema_model)):
+        if network is not None:
+            for name, weight in network.named_parameters():
+                tensors[f"{part}/{name}"] = weight.detach()
     header = {
         "step": state.step,
         "skipped_steps": state.skipped_steps,
@@ -94,7 +87,7 @@ def _encode_checkpoint(state: TrainState, world_size: int) -> bytes:
         "model": encode_config(state.settings.model),
         "data_digest": state.data_digest,
         **({RECORD: dataclasses.asdict(state.mixture)} if state.mixture else {}),
-        "history": event_records(state.history),
+        "history": [dataclasses.asdict(event) for event in state.history],
         "world_size": world_size,
         "threads": torch.get_num_threads(),
         "muon_precision": state.optimizer.muon_precision,
@@ -116,12 +109,7 @@ def _write_sealed(path: Path, data: bytes) -> None:
 
 def read_checkpoint(path: Path) -> Checkpoint:
     """Read and verify a checkpoint; raises TrilightError, with its path, if it is invalid."""
-    checkpoint = checkpoint_format.read_checkpoint(path)
-    try:
-        read_json(json.dumps(checkpoint.header), _Header, "its header")
-    except TrilightError as error:
-        raise unreadable_error(path, error) from error
-    return checkpoint
+    return read_network_checkpoint(path, _Header)
 
 
 def restore_state(

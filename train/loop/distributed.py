@@ -5,7 +5,7 @@ averages gradients over nccl or gloo. Only the first process logs, validates and
 """
 
 import os
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
 from typing import TypeVar
@@ -34,18 +34,11 @@ class DistributedContext(RankSlice):
         """True in the process that logs, validates and saves."""
         return self.rank == 0
 
-    def mean(self, values: Sequence[float]) -> list[float]:
-        """Return the means over all processes, equal on each; all must call it."""
-        if self.world_size == 1:
-            return list(values)
-        # float32, because nccl and gloo both have it everywhere
-        mine = torch.tensor(values, dtype=torch.float32, device=self.device)
-        return list(map(float, self.mean_on_device(mine)))
-
     def mean_on_device(self, values: Tensor) -> Tensor:
         """Return the means [N] over all processes, on the device and without a wait.
 
-        All processes must call it. With several processes the means are float32, as in `mean`.
+        All processes must call it. With several processes the means are float32, because nccl and
+        gloo both have it everywhere.
         """
         if self.world_size == 1:
             return values
@@ -72,7 +65,9 @@ class DistributedContext(RankSlice):
 
     def any(self, flag: bool) -> bool:
         """Return whether the flag is set in any process, equal on each; all must call it."""
-        return self.mean([float(flag)])[0] > 0
+        if self.world_size == 1:
+            return flag
+        return bool(self.mean_on_device(torch.tensor([float(flag)], device=self.device)) > 0)
 
     def barrier(self) -> None:
         """Wait until all processes have called it."""

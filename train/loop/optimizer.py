@@ -20,6 +20,7 @@ import torch
 import torch.distributed as dist
 from torch import Tensor
 
+from model.precision import PRECISIONS
 from model.renderformer import RenderFormer
 from model.width_scales import width_scales
 from train.loop.distributed import DistributedContext
@@ -140,10 +141,6 @@ def choose_muon_precision(dist_context: DistributedContext) -> Precision:
     return "float32" if dist_context.any(not quick) else "bfloat16"
 
 
-PRODUCTS = {"float32": torch.float32, "bfloat16": torch.bfloat16}
-"""Types of matrix products, by precision."""
-
-
 class StackedMuon(torch.optim.Muon):
     """torch's Muon with matrices of one shape in one product, split over the processes.
 
@@ -173,7 +170,7 @@ class StackedMuon(torch.optim.Muon):
             thirds: those of the weights that are three stacked matrices.
         """
         super().__init__(matrices, weight_decay=weight_decay, adjust_lr_fn="match_rms_adamw")
-        self._products = PRODUCTS[precision]
+        self._products = PRECISIONS[precision].dtype
         cut = {id(weight) for weight in thirds}
         self._thirds = [
             [id(weight) in cut for weight in group["params"]] for group in self.param_groups

@@ -8,7 +8,6 @@ import json
 import os
 from collections.abc import Callable, Mapping
 from importlib import import_module
-from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -17,12 +16,10 @@ from model.renderformer import count_parameters
 from storage.atomic import append_line
 from storage.errors import TrilightError
 from storage.settings.described import settings_record
-from train.evaluation.sheet import draw_validation_sheet
-from train.evaluation.validation import Judge
+from train.evaluation.validation import Judge, draw_validation_sheet
 from train.folder import RunFolder, add_note, copy_rows, read_rows
 from train.loop.train_state import TrainState
 from train.progress import TrainProgress
-from train.settings import TrainSettings
 
 LAYER_COLUMNS = ("grad_norm", "weight_norm", "update_ratio")
 """Values of a layer in a row: norm of its gradient before clipping, norm of its weights, and norm
@@ -67,21 +64,6 @@ def require_wandb(project: str | None) -> Any:
         ) from error
 
 
-def _begin_wandb_run(project: str, folder: Path, settings: TrainSettings) -> Any:
-    """Begin a run that follows TensorBoard's files; each call of the trainer is one in a group.
-
-    Nothing leaves the machine unless WANDB_MODE is `online`: `wandb sync` uploads it later.
-    """
-    return require_wandb(project).init(
-        project=project,
-        group=folder.resolve().name,
-        dir=str(folder),
-        config=settings_record(settings),
-        mode=os.environ.get("WANDB_MODE", "offline"),
-        sync_tensorboard=True,
-    )
-
-
 class Recorder:
     """Writes log, notes and curves, and reports to the progress display; first process only."""
 
@@ -103,12 +85,20 @@ class Recorder:
         )
         self.progress = progress
         self._folder = folder
-        self._settings = state.settings
         self._judge = judge
         copy_rows(folder.metrics, folder.metrics, state.step)  # later ones will be written again
         self._wandb_run = None
-        if wandb is not None:  # before the writer, whose files it follows
-            self._wandb_run = _begin_wandb_run(wandb, folder.root, state.settings)
+        # It begins before the writer, whose files it follows; each call of the trainer is one in a
+        # group. Nothing leaves the machine unless WANDB_MODE is `online`: `wandb sync` uploads it.
+        if wandb is not None:
+            self._wandb_run = require_wandb(wandb).init(
+                project=wandb,
+                group=folder.root.resolve().name,
+                dir=str(folder.root),
+                config=settings_record(state.settings),
+                mode=os.environ.get("WANDB_MODE", "offline"),
+                sync_tensorboard=True,
+            )
         from torch.utils.tensorboard import SummaryWriter  # half a second to import
 
         # a resumed run writes its rows after this step again
@@ -145,7 +135,7 @@ class Recorder:
             return
         validation = self._judge.judge(state.eval_model, between)
         self.row({"step": state.step, "validation": validation.scores})
-        sheet = draw_validation_sheet(self._settings, self._judge, validation, state.step)
+        sheet = draw_validation_sheet(state.settings, self._judge, validation, state.step)
         median = {"median_picture_log_l1": self._judge.median_scores["log_l1"]}
         self._show_scalars({"step": state.step, "validation": median})
         self._board.add_image("validation", np.asarray(sheet), state.step, dataformats="HWC")

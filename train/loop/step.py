@@ -22,7 +22,7 @@ from train.loop.distributed import DistributedContext
 from train.loop.optimizer import Decision, defers_sync
 from train.loop.train_state import TrainState
 from train.loss.training_loss import TrainingLoss
-from train.monitoring.activity import Activity, LayerNorms
+from train.monitoring.process_monitor import Activity, LayerNorms
 from train.settings import Precision, TrainSettings
 
 

@@ -78,9 +78,8 @@ class TrainState:
         """
         if self.ema_model is None or decision.is_skipped:
             return
-        means: list[Tensor] = [*self.ema_model.parameters()]
-        weights: list[Tensor] = [*self.model.parameters()]
-        move_towards(means, weights, ema_step(self.settings.ema_decay, decision.updates), decision)
+        share = ema_step(self.settings.ema_decay, decision.updates)
+        move_towards([*self.ema_model.parameters()], [*self.model.parameters()], share, decision)
 
 
 def ema_step(decay: float, updates: Updates) -> float | Tensor:
@@ -118,9 +117,7 @@ def new_state(
         model.load_state_dict(begin_with.state_dict())
     model.recompute_activations(settings.recompute_activations)
     model.to(device)
-    ema_model = None
-    if settings.ema_decay:
-        ema_model = copy.deepcopy(model).requires_grad_(False)
+    ema_model = copy.deepcopy(model).requires_grad_(False) if settings.ema_decay else None
     return TrainState(
         settings=settings,
         model=model,

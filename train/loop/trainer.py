@@ -14,13 +14,13 @@ from functools import lru_cache
 import torch
 
 from model.costs import Workload, training_flops
+from model.precision import PRECISIONS
 from storage.errors import TrilightError
 from train.data.buckets import CopyStream, StepScenes
 from train.folder import RunFolder
 from train.loop.checkpoints import BackgroundWriter, save_checkpoint
 from train.loop.distributed import DistributedContext
 from train.loop.interrupts import Stopped, ValidationInterrupted, deferred_interrupts
-from train.loop.optimizer import PRODUCTS
 from train.loop.recorder import Recorder
 from train.loop.step import PendingStats, Stepper, StepReport, explain_out_of_memory
 from train.loop.train_state import TrainState
@@ -395,7 +395,8 @@ class Trainer:
                 "views_per_s": self._views_per_s(working_s),
                 "data_wait_share": taken_s["data"] / working_s,
                 "flops_per_s": flops_per_s,
-                "peak_share": flops_per_s / device_peak(device, PRODUCTS[self.settings.precision]),
+                "peak_share": flops_per_s
+                / device_peak(device, PRECISIONS[self.settings.precision].dtype),
             }
             assert all(value is None or math.isfinite(value) for value in row.values())
             seen = {

@@ -12,7 +12,7 @@ from pathlib import Path
 
 from storage.errors import TrilightError
 from train.loop.distributed import DistributedContext
-from train.monitoring.activity import PHASES, Activity
+from train.monitoring.process_monitor import PHASES, Activity
 from train.settings import WatchSettings
 
 MIN_SAMPLES = 3

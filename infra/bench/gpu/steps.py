@@ -22,7 +22,7 @@ import torch
 from numpy.typing import NDArray
 
 from infra.bench.workloads.named_scenes import cost_scene
-from model.config import ModelConfig, hits_smoke, smoke, tiny
+from model.config import SIZES, ModelConfig
 from model.costs import Workload, training_flops
 from model.inference import NeuralRenderer
 from model.open import BUILTIN_NETWORKS
@@ -149,8 +149,8 @@ def step_settings(run: str, device: torch.device) -> TrainSettings:
 
 def _small(model: ModelConfig) -> ModelConfig:
     if model.view_stage == "hits":
-        return dataclasses.replace(hits_smoke(), scene_tokens=model.scene_tokens)
-    return tiny() if model.head == "dpt" else smoke()
+        return dataclasses.replace(SIZES["hits-smoke"](), scene_tokens=model.scene_tokens)
+    return SIZES["tiny" if model.head == "dpt" else "smoke"]()
 
 
 def step_figures(run: str, steps: int, device: torch.device) -> dict[str, float]:

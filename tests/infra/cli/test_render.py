@@ -42,7 +42,7 @@ from tests.infra.conftest import write_network
 from tests.model.test_inference import many_lights
 from tests.pipeline.exchange.exchange_kit import write_stage
 from tests.scenes_by_hand import tiny_sample, tiny_scene
-from train.evaluation.error_colors import error_picture
+from train.evaluation.sheet import error_picture
 
 pytestmark = pytest.mark.usefixtures("children_here")
 

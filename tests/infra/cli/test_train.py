@@ -22,7 +22,7 @@ from infra.cli.overrides import (
     with_base_settings,
 )
 from infra.cli.train import _BarProgress, _report
-from model.checkpoint_format import saved_steps
+from model.open import saved_steps
 from pipeline.generation.generate_options import GenerateOptions
 from pipeline.presets.registry import DATASET_PRESETS, preset_settings
 from storage.dataset.manifest import read_manifest

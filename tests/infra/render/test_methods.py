@@ -33,7 +33,7 @@ from infra.render.plan import (
 from infra.render.quality import FixedSamples, ToStatedError
 from infra.render.raw_references import RawReference, true_error, true_error_db
 from infra.render.run_render import Frame, flicker
-from model.config import hits_smoke
+from model.config import SIZES
 from model.inference import NeuralRenderer
 from pipeline.exchange.open_scene import SceneSource
 from pipeline.exchange.reader import SceneReader
@@ -68,7 +68,7 @@ def network(opened: NeuralRenderer) -> NetworkRenderer:
 def test_light_of_lamps_is_what_is_left_when_nothing_is_gathered() -> None:
     """And the smallest layers show what large ones show."""
     of_lamps = shown(DirectLightRenderer(resolution=PX))
-    config = dataclasses.replace(hits_smoke(), gather_rays=0)
+    config = dataclasses.replace(SIZES["hits-smoke"](), gather_rays=0)
     # the network's picture went through log10(1 + radiance) in float32
     np.testing.assert_allclose(
         of_lamps, shown(network(untrained_network(config))), rtol=1e-4, atol=1e-5
@@ -76,7 +76,7 @@ def test_light_of_lamps_is_what_is_left_when_nothing_is_gathered() -> None:
     assert of_lamps.max() > 0.01
     small = shown(network(traced_network()))
     assert small.mean() > of_lamps.mean(), "other surfaces send light too"
-    unfiltered = dataclasses.replace(hits_smoke(), filter_width=0)
+    unfiltered = dataclasses.replace(SIZES["hits-smoke"](), filter_width=0)
     large = shown(network(untrained_network(unfiltered)))
     np.testing.assert_allclose(small, large, rtol=1e-3, atol=1e-4)  # sums in another order
 

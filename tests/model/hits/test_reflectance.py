@@ -6,7 +6,7 @@ import torch
 from torch import Tensor
 
 from model.hits.anchors import anchor_pixels
-from model.hits.light_filter import (
+from model.hits.decoder import (
     _ALIKE,
     _MOST_DOUBT,
     STEPS_PX,
@@ -14,9 +14,8 @@ from model.hits.light_filter import (
     LightFilter,
     _mean_around,
 )
-from model.hits.lit_scene import LitScene, Points
+from model.hits.lit_scene import LitScene, Points, gloss_at, lobe, sample_lobe
 from model.hits.radiosity import BOUNCES, scene_light
-from model.hits.reflectance import gloss_at, lobe, sample_lobe
 from model.hits.vectors import dot, unit
 from model.hits.view_inputs import Channel
 from storage.optics.multiscatter import directional_albedo

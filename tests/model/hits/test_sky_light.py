@@ -12,12 +12,9 @@ import torch
 from numpy.typing import NDArray
 
 from model.config import ModelConfig
-from model.hits.direct_light import no_light
-from model.hits.lit_scene import LitScene, Points
+from model.hits.direct_light import add_sky_light, escaped_light, no_light, sees_sky
+from model.hits.lit_scene import LitScene, Points, SkySampler, gloss_at, sample_lobe
 from model.hits.radiosity import scene_light
-from model.hits.reflectance import gloss_at, sample_lobe
-from model.hits.sky_light import add_sky_light, escaped_light, sees_sky
-from model.hits.sky_sampler import SkySampler
 from model.hits.view_inputs import Channel
 from model.inference import NeuralRenderer
 from model.renderformer import radiance

@@ -10,7 +10,7 @@ from scipy.spatial.transform import Rotation
 from torch import Tensor
 
 from model.hits.traced import Traced, denoise_traced
-from model.hits.tracing import lit_scene_of, traced_views, with_traced
+from model.hits.tracing import lit_scenes, traced_views, with_traced
 from model.hits.view_inputs import NUM_CHANNELS, Channel
 from model.inference import NeuralRenderer
 from model.renderformer import radiance
@@ -293,7 +293,8 @@ def test_wide_pictures_are_denoised_wherever_their_light_is_traced() -> None:
     assert below[0] is not None and below[1] is not None
     assert torch.equal(below[0].pixels_VRRC, below[1].pixels_VRRC)
     cameras = tensors.c2w_V44[:1], tensors.fov_deg_V[:1]
-    noisy = traced_views(lit_scene_of(tensors), *cameras, WIDE_PX, config)
+    (lit,) = lit_scenes(batch_scenes([tensors]))
+    noisy = traced_views(lit, *cameras, WIDE_PX, config)
     wide = with_traced(tensors, WIDE_PX, config).traced
     assert wide is not None
     assert torch.equal(wide.pixels_VRRC, _denoise(noisy.pixels_VRRC, noisy.unit_3))

@@ -13,9 +13,9 @@ import pytest
 import torch
 from numpy.typing import NDArray
 
-from model.hits.tracing import lit_scene_of
+from model.hits.tracing import lit_scenes
 from model.hits.view_inputs import Channel, view_inputs
-from model.scene_tensors import SceneTensors, scene_tensors
+from model.scene_tensors import SceneTensors, batch_scenes, scene_tensors
 from storage.errors import TrilightError
 from storage.records.sample import StoredSample, encode_sample, stored_sample
 from storage.records.scene import Scene
@@ -175,7 +175,7 @@ ORDER = np.array([2, 0, 1])
 
 def _pixels(tensors: SceneTensors, **changes: int) -> NDArray:
     """Return what rays find of the first view, 32 pixels wide."""
-    lit = lit_scene_of(tensors)
+    (lit,) = lit_scenes(batch_scenes([tensors]))
     camera = tensors.c2w_V44[0].numpy(), float(tensors.fov_deg_V[0])
     seed = changes.pop("seed", 0)
     return view_inputs(lit, *camera, 32, rays(gather_rays=0, **changes), seed).pixels

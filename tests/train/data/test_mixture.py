@@ -18,7 +18,7 @@ import pytest
 import torch
 from torch import Tensor
 
-from model.checkpoint_format import path_of_step
+from model.open import path_of_step
 from storage.conventions import log10_radiance
 from storage.dataset.dataset import Dataset
 from storage.dataset.training_data import TrainingData, open_mixture, open_training_data

@@ -13,6 +13,7 @@ from PIL import Image
 
 from infra import judging
 from model.inference import light_groups
+from model.scene_tensors import scene_tensors
 from model.weights import encode_weights
 from pipeline.presets.frozen_v1 import PRESETS_FOR_JUDGING
 from storage.dataset.dataset import Dataset
@@ -190,7 +191,7 @@ def test_another_scenes_triangles_and_what_swapping_costs_are_told(dataset: Data
     before, judged = samples[1], validation_scene(samples[2], judging.resolution)
     seen = before.scene.with_cameras(samples[2].scene.c2w, samples[2].scene.fov_deg)
     mixed = training_scene(dataclasses.replace(samples[2], scene=seen), judging.resolution)
-    shown = predict(judging.network, mixed)
+    shown = predict(judging.network, mixed.tensors, judging.resolution)
     for view, picture, target in zip(rows[4:], shown, judged.target_VRR3, strict=True):
         assert view.swapped_psnr_log_db == psnr_log_db(picture, target)
     swapped = [None, 28.0, 20.0, 34.0]
@@ -241,8 +242,7 @@ def test_many_lights_are_judged_in_one_pass_and_in_groups(dataset: Dataset) -> N
     assert grouped is not None and grouped.shape == (2, 16, 16, 3)
     # by hand: every group's picture times its share, the same sums in another order
     expected = sum(
-        fraction
-        * predict(network, training_scene(dataclasses.replace(toy_sample(0), scene=alone), 16))
+        fraction * predict(network, scene_tensors(alone), 16)
         for alone, fraction in light_groups(many, 8)
     )
     np.testing.assert_allclose(grouped, expected, rtol=1e-5, atol=1e-6)

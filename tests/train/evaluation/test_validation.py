@@ -28,7 +28,6 @@ from tests.train.kit import eval_config
 from tests.train.loss.test_training_loss import small_weights
 from tests.train.toy import toy_sample, write_toy_dataset
 from train.data.scenes import training_scene
-from train.evaluation.error_colors import ERROR_WHITE, error_picture
 from train.evaluation.evaluate import (
     CAPTION,
     TRACER,
@@ -59,9 +58,11 @@ from train.evaluation.metrics import (
 )
 from train.evaluation.report_pages import evaluation_page, record
 from train.evaluation.sheet import (
+    ERROR_WHITE,
     NOISE_WHITE,
     SheetView,
     draw_sheet,
+    error_picture,
     noise_picture,
     write_picture,
 )

@@ -18,9 +18,8 @@ import pytest
 import torch
 from safetensors.torch import save as save_tensors
 
-from model.checkpoint_format import HEADER_KEY, path_of_step, saved_steps
 from model.inference import NeuralRenderer
-from model.open import find_network, open_network
+from model.open import HEADER_KEY, find_network, open_network, path_of_step, saved_steps
 from model.weights import encode_weights
 from storage.dataset.dataset import Dataset
 from storage.digests import seal_of
@@ -336,7 +335,7 @@ def test_without_torchrun_a_process_is_alone_and_no_missing_device_is_taken(
     monkeypatch.delenv("WORLD_SIZE", raising=False)
     with join_processes("cpu") as crew:
         assert (crew.rank, crew.world_size, crew.is_first) == (0, 1, True)
-        assert crew.mean([1.0, 2.0]) == [1.0, 2.0]
+        assert crew.mean_on_device(torch.ones(2)).tolist() == [1.0, 1.0]
         assert crew.any(True) and not crew.any(False)
         assert crew.gather_text("å") == ["å"]
     assert choose_device("cpu").type == "cpu"

@@ -15,7 +15,7 @@ import numpy as np
 import pytest
 from safetensors.numpy import load_file
 
-from model.checkpoint_format import saved_steps
+from model.open import saved_steps
 from storage.dataset.dataset import Dataset
 from storage.seeds import rng_for
 from tests.conftest import ROOT

@@ -18,8 +18,8 @@ from torch import Tensor, nn
 from torch._dynamo.testing import CompileCounterWithBackend
 from torch._inductor.utils import run_and_get_code
 
-from model.checkpoint_format import path_of_step, saved_steps
 from model.layers import Norm
+from model.open import path_of_step, saved_steps
 from model.renderformer import RenderFormer
 from model.scene_tensors import batch_scenes
 from model.view_decoder import Fusion

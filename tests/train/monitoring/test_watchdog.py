@@ -40,12 +40,15 @@ from train.loop.recorder import require_wandb, scalars
 from train.loop.step import StepReport
 from train.loop.train_state import new_state
 from train.monitoring import process_monitor, watchdog
-from train.monitoring.activity import PHASES, Activity, LayerNorms, layer_of
 from train.monitoring.process_monitor import (
     LEAST_REMEMBERED,
     OWN_PHASES,
+    PHASES,
+    Activity,
+    LayerNorms,
     SpikeDetector,
     StepProfiler,
+    layer_of,
     own_seconds,
     slowest_rank,
     spike_bound,
