@@ -38,9 +38,9 @@ from storage.errors import TrilightError
 from storage.markdown import front_matter
 from storage.records.objects import read_objects_lock
 from storage.renderer import Camera, Renderer
-from train.evaluation.error_colors import ERROR_WHITE, error_picture
 from train.evaluation.evaluate import judge_view
 from train.evaluation.metrics import METRIC
+from train.evaluation.sheet import ERROR_WHITE, error_picture
 from train.evaluation.validation import validation_scene
 
 FREE = {"CC0-1.0"}

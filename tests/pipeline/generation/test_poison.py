@@ -98,13 +98,13 @@ def test_an_object_whose_children_are_all_killed_is_tried_again_by_the_next_run(
     deaths, small = workshop / poison.DEATHS, {"scenes": 4}
     deaths.write_text("3")
     begun = prepare_dataset(order(workshop, cold / "without", **small))
-    assert begun.accepted.num_objects == 7
+    assert begun.job.accepted.num_objects == 7
     (failure,) = open_dataset(str(cold / "without")).failures()
     assert (failure.item, failure.reason) == ("knot0", "killed")
     (record,) = caplog.records
     assert "1 could not be prepared this time (1 x killed)" in record.getMessage()
     begun = prepare_dataset(order(workshop, cold / "with", **small))
-    assert begun.accepted.num_objects == 8
+    assert begun.job.accepted.num_objects == 8
     shutil.rmtree(cold / "cache")
     begun.publication.folder.staged_index.unlink()
     deaths.write_text("3")
@@ -113,7 +113,9 @@ def test_an_object_whose_children_are_all_killed_is_tried_again_by_the_next_run(
     ):
         prepare_dataset(order(workshop, cold / "with", **small))
     assert open_dataset(str(cold / "with")).failures() == []
-    assert prepare_dataset(order(workshop, cold / "with", **small)).accepted == begun.accepted
+    assert (
+        prepare_dataset(order(workshop, cold / "with", **small)).job.accepted == begun.job.accepted
+    )
 
 
 def test_meshes_that_are_away_are_made_again_where_a_scene_draws_them(
@@ -131,7 +133,7 @@ def test_meshes_that_are_away_are_made_again_where_a_scene_draws_them(
         for row in sample.scene.objects
     }
     assert "knot0" in drawn
-    assert prepare_dataset(order(workshop, tmp_path / "set")).accepted == begun.accepted
+    assert prepare_dataset(order(workshop, tmp_path / "set")).job.accepted == begun.job.accepted
     with pytest.raises(EnvironmentFailure, match="'knot0', which .*killed.*run the same"):
         make(workshop, tmp_path / "set")
     mesh = workshop / "objects" / "knot0.obj"
