@@ -20,7 +20,7 @@ from pipeline.exchange.gltf.read_gltf import read_gltf
 from pipeline.exchange.gltf.write_gltf import write_gltf
 from pipeline.exchange.renderformer_h5 import read_renderformer_h5, write_renderformer_h5
 from pipeline.exchange.renderformer_json import describe_scene
-from pipeline.exchange.scene_files import build_scene, read_scene_cameras
+from pipeline.exchange.scene_files import build_scene, read_scene_cameras, read_scene_description
 from pipeline.exchange.textured_triangles import LoadedScene as LoadedScene
 from pipeline.exchange.textured_triangles import Pictures as Pictures
 from pipeline.exchange.usd.read_usd import read_usd, usd_keys
@@ -109,7 +109,8 @@ def _list_usd_pictures(target: Path) -> Sequence[Path]:
 def _read_json(source: SceneSource, pictures: bool) -> LoadedScene:
     root = source.path.parent.resolve()
     name = source.path.name
-    notes = list[str]()
+    description = read_scene_description(root, name)
+    notes = [f"unknown field {field}" for field in description.unknown_fields]
     scene, _ = build_scene(
         root,
         name,

@@ -17,6 +17,7 @@ from pipeline.exchange.from_description import (
     AlbedoOverOne,
     Cameras,
     LoadedMesh,
+    SceneDescription,
     build_cameras,
     scene_from_description,
 )
@@ -42,7 +43,8 @@ class SceneFiles:
     """Reason why no scene can be made of a file, by the name of each such file."""
     num_cameras: Mapping[str, int] = field(default_factory=dict)  # by the name of each usable file
     albedo_over_one: AlbedoOverOne = "scale"  # treatment of albedos over 1
-    notes: tuple[str, ...] = ()  # sentences about the built scenes
+    notes: tuple[str, ...] = ()
+    """Sentences for the user: on unknown fields, and on the scenes once they are built."""
     sha256: Mapping[str, str] = field(default_factory=dict)
     """Digest of every locked file by its path below `root`; empty before they are locked."""
     licence: str = ""  # licence of every object
@@ -104,6 +106,11 @@ class SceneFiles:
         return scene
 
 
+def read_scene_description(root: Path, name: str) -> SceneDescription:
+    """Read and parse a scene file of the folder `root`; raises TrilightError."""
+    return read_renderformer_json(_read_scene_file(root, name), name)
+
+
 def read_scene_cameras(root: Path, name: str) -> Cameras:
     """Read the poses [C, 4, 4] and angles [C] in degrees of a scene file or a list of cameras.
 
@@ -128,16 +135,14 @@ def build_scene(
     """Build the scene of one file; only child processes call this, since it reads meshes.
 
     `num_views` cameras are taken, or all; index and seed stand in the provenance only. `notes`
-    receives a sentence for each unknown field and each ignored part of a mesh file. The scene comes
-    with the sha256 of each of its files by path below `root`, a folder whose links are resolved.
+    receives a sentence for each ignored part of a mesh file. The scene comes with the sha256 of
+    each of its files by path below `root`, a folder whose links are resolved.
 
     Raises:
         TrilightError: the file or a mesh is unusable; the message names it.
     """
     data = _read_scene_file(root, name)
     description = read_renderformer_json(data, name)
-    if notes is not None:
-        notes += (f"unknown field {field}" for field in description.unknown_fields)
     num_views = len(description.cameras) if num_views is None else num_views
     digests = {name: sha256_hex(data)}
     meshes: dict[tuple[str, int | None], LoadedMesh] = {}
@@ -279,11 +284,13 @@ def find_scene_files(folder: str, albedo_over_one: AlbedoOverOne = "scale") -> S
                 f"--scenes-from {folder}: rename {name!r}; expected printable text."
             )
     num_cameras = {}
+    notes: list[str] = []
     unusable = {}
     for name in names:
         try:
-            description = read_renderformer_json(_read_scene_file(root, name), name)
+            description = read_scene_description(root, name)
             num_cameras[name] = len(description.cameras)
+            notes += (f"{name}: unknown field {field}" for field in description.unknown_fields)
         except EnvironmentFailure:
             raise
         except TrilightError as mistake:
@@ -295,6 +302,7 @@ def find_scene_files(folder: str, albedo_over_one: AlbedoOverOne = "scale") -> S
         unusable=unusable,
         num_cameras=num_cameras,
         albedo_over_one=albedo_over_one,
+        notes=tuple(notes),
     )
 
 

@@ -210,9 +210,9 @@ class SceneParts:
         with prefix_errors(self._file):
             require_at_most(
                 {
-                    "triangles": (self._num_triangles, MAX_TRIANGLES),
-                    "materials": (len(self._texture_sets), MAX_ROWS),
-                    "objects": (len(self._pieces), MAX_ROWS),
+                    "triangles so far": (self._num_triangles, MAX_TRIANGLES),
+                    "materials so far": (len(self._texture_sets), MAX_ROWS),
+                    "objects so far": (len(self._pieces), MAX_ROWS),
                 }
             )
 

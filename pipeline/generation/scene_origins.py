@@ -375,7 +375,7 @@ def _build_all(
             count_object(out)
     require_usable(folder.names, unusable)
     left_out = (f"{name} is left out: {why.rstrip('.')}" for name, why in unusable.items())
-    notes += (*left_out, *folder.unused_camera_notes(num_views))
+    notes += (*left_out, *folder.notes, *folder.unused_camera_notes(num_views))
     return dataclasses.replace(
         folder, sha256=sha256, unusable=unusable, licence=licence, notes=tuple(notes)
     )

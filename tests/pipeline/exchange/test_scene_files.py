@@ -4,7 +4,6 @@ import dataclasses
 import json
 import os
 import shutil
-from collections.abc import Mapping
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any, cast
@@ -74,8 +73,9 @@ def _build(folder: Path, name: str = "a.json") -> Scene:
     return build_json(folder, name, licence="MIT", num_views=1, scene_index=3, seed=9)
 
 
-def _build_once(folder: Path, name: str) -> tuple[Mapping[str, str], tuple[str, ...]]:
-    return build_once(folder.resolve(), name, preset_settings("smoke").assets, 1, "scale")
+def _digests(folder: Path, name: str) -> dict[str, str]:
+    assets = preset_settings("smoke").assets
+    return dict(build_once(folder.resolve(), name, assets, 1, "scale")[0])
 
 
 def _settings(folder: Path, views: int | None = None) -> DatasetSettings:
@@ -83,7 +83,7 @@ def _settings(folder: Path, views: int | None = None) -> DatasetSettings:
 
 
 def _files(folder: Path, *names: str, **unusable: str) -> SceneFiles:
-    sha256 = {uid: digest for name in names for uid, digest in _build_once(folder, name)[0].items()}
+    sha256 = {uid: digest for name in names for uid, digest in _digests(folder, name).items()}
     return SceneFiles(
         root=folder.resolve(), names=names, sha256=sha256, unusable=unusable, licence="MIT"
     )
@@ -171,7 +171,7 @@ def test_without_wish_there_are_as_many_views_as_every_file_has(folder: Path) ->
     found = find_scene_files(str(folder))
     assert found.unused_camera_notes(1) == ("b.json: 1 of 2 cameras not used, from cameras[1] on",)
     _change(folder, "a.json", colour="red")
-    assert _build_once(folder, "a.json")[1] == ("a.json: unknown field objects.green.colour",)
+    assert find_scene_files(str(folder)).notes == ("a.json: unknown field objects.green.colour",)
     with pytest.raises(TrilightError, match="--views is 2; expected 1 to 1.*in a.json"):
         _settings(folder, views=2)
     with pytest.raises(TrilightError, match="--views is 0"):
@@ -276,7 +276,7 @@ def test_a_bad_file_keeps_its_number_and_stops_nobody(folder: Path, tmp_path: Pa
     (folder / "aa.json").write_text("{")
     shutil.copy(folder / "a.json", folder / "c.json")
     (folder / "broken.obj").write_bytes(b"")
-    _change(folder, "c.json", mesh_path="broken.obj")
+    _change(folder, "c.json", mesh_path="broken.obj", colour="red")
     found, settings = find_scene_files(str(folder)), _settings(folder)
     assert found.names == ("a.json", "aa.json", "b.json", "c.json")
     assert settings.splits.listed_scenes == 4
@@ -289,6 +289,6 @@ def test_a_bad_file_keeps_its_number_and_stops_nobody(folder: Path, tmp_path: Pa
         assert found.names[scene_index] in rejection.value.message
     assert _scene(files, 2, settings).provenance["scene_file"]["name"] == "b.json"
     assert {"aa.json", "c.json"} & set(files.sha256) == set()
-    assert any("c.json is left out: c.json: objects.green" in note for note in files.notes), (
-        files.notes
-    )
+    _, left_out, unknown, _ = files.notes
+    assert left_out.startswith("c.json is left out: c.json: objects.green")
+    assert unknown == "c.json: unknown field objects.green.colour"

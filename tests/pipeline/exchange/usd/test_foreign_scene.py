@@ -256,6 +256,15 @@ def test_inputs_of_a_texture_are_applied_bounded_and_said(
         assert row_at(found.scene, *place)[:3] == pytest.approx(expected, abs=CODED)
 
 
+def test_too_many_triangles_are_refused_before_all_are_read(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    path = write_stage(tmp_path)
+    monkeypatch.setattr("pipeline.exchange.textured_triangles.MAX_TRIANGLES", 1)
+    with pytest.raises(TrilightError, match=r"usda: \d+ triangles so far; expected at most 1 in"):
+        read_usd(path)
+
+
 def test_a_huge_picture_is_refused(tmp_path: Path) -> None:
     path = write_stage(tmp_path)
     Image.new("L", (9000, 9000)).save(tmp_path / "tex.png")
