@@ -3,7 +3,9 @@
 import hashlib
 import json
 from pathlib import Path
-from typing import Any, BinaryIO, cast
+from typing import Any, BinaryIO
+
+_PIECE_BYTES = 1 << 20
 
 
 def sha256_hex(data: bytes) -> str:
@@ -19,7 +21,10 @@ def sha256_of_file(path: Path) -> str:
 
 def sha256_of_stream(stream: BinaryIO) -> str:
     """Return the sha256 of an open file from where it stands to its end, read in pieces."""
-    return hashlib.file_digest(cast(Any, stream), "sha256").hexdigest()
+    digest = hashlib.sha256()  # hashlib.file_digest reads a BytesIO from its first byte
+    while piece := stream.read(_PIECE_BYTES):
+        digest.update(piece)
+    return digest.hexdigest()
 
 
 def seal_of(data: bytes, sha256: str) -> str:

@@ -59,9 +59,11 @@ class SkyTexels:
 
     @functools.cached_property
     def solid_angle(self) -> Numbers:
-        """[H, 1] steradians of each texel of a row; those of all texels sum to 4 pi."""
+        """[H, 1] steradians of each texel of a row, in sum 4 pi over all texels; read-only."""
         edges = sine((0.5 - np.arange(self.height + 1) / self.height) * np.pi)
-        return ((edges[:-1] - edges[1:]) * np.pi / self.height)[:, None]
+        solid_angle_sr = ((edges[:-1] - edges[1:]) * np.pi / self.height)[:, None]
+        solid_angle_sr.setflags(write=False)
+        return solid_angle_sr
 
     def flux(self, radiance: NDArray) -> Numbers:
         """Return the integral over the sphere of a map [H, 2H] or [H, 2H, 3]."""

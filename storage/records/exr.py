@@ -114,7 +114,8 @@ def encode_channels(
                 f"picture: attribute {name} is {value!r}; expected a number {within}, or text."
             )
     packing = {"compression": OpenEXR.ZIP_COMPRESSION}
-    if dwa_level is not None:  # an int would be another type
+    if dwa_level is not None:
+        # an int would be an attribute of another type
         packing = {"compression": OpenEXR.DWAB_COMPRESSION, "dwaCompressionLevel": float(dwa_level)}
     header = {"type": OpenEXR.scanlineimage, **packing, **(attributes or {})}
     stream = io.BytesIO()

@@ -55,6 +55,12 @@ def test_solid_angles_sum_to_the_sphere(height: int) -> None:
     assert texels.solid_angle.shape == (height, 1) and (texels.solid_angle > 0).all()
 
 
+def test_a_sky_cannot_write_into_the_arrays_of_the_next_one() -> None:
+    texels = SkyTexels(4)
+    shared = (texels.directions, texels.z, texels.solid_angle)
+    assert not any(array.flags.writeable for array in shared)
+
+
 def test_a_white_sky_sends_pi_onto_the_ground() -> None:
     found = SkyTexels(64).irradiance(np.ones((64, 128, 3)))
     # the midpoint rule on 64 rows errs by (pi / 64)^2 / 6
