@@ -1,5 +1,6 @@
 """A scene through one form and back, and a USD stage as another program would write it."""
 
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -14,6 +15,7 @@ from pipeline.assets.settings import AssetSettings
 from pipeline.exchange.renderformer_h5 import read_renderformer_h5, write_renderformer_h5
 from pipeline.exchange.renderformer_json import describe_scene
 from pipeline.exchange.scene_files import build_scene
+from pipeline.exchange.textured_triangles import LoadedScene
 from pipeline.exchange.usd.read_usd import read_usd
 from pipeline.exchange.usd.write_usd import write_usd
 from storage.records.lookup import textured_rows
@@ -53,6 +55,15 @@ def json_and_back(scene: Scene, folder: Path) -> tuple[Scene, tuple[str, ...]]:
 def h5_and_back(scene: Scene, folder: Path) -> Scene:
     write_renderformer_h5(folder / "again.h5", scene)
     return read_renderformer_h5(folder / "again.h5").scene
+
+
+def edited_layer(folder: Path, scene: Scene, edit: Callable[[Any], object]) -> LoadedScene:
+    """Return what is read after an edit of the layer that we wrote."""
+    write_usd(folder / "a.usda", scene)
+    layer = Sdf.Layer.OpenAsAnonymous(str(folder / "a.usda"))
+    edit(layer)
+    layer.Export(str(folder / "b.usda"))
+    return read_usd(folder / "b.usda")
 
 
 def assert_usd_keeps_all(scene: Scene, folder: Path, suffix: str) -> None:

@@ -2,6 +2,7 @@
 
 import dataclasses
 from typing import Any
+from unittest.mock import Mock
 
 import drjit as dr
 import mitsuba as mi
@@ -24,7 +25,6 @@ from pipeline.renders.guide_table import (
     bin_of,
     learn,
 )
-from pipeline.renders.kernel_scene import KernelScene
 from pipeline.renders.renderer import RenderedView, SceneRenderer
 from pipeline.renders.settings import RenderSettings
 from pipeline.renders.tracer import PixelCamera, load_tracer
@@ -430,14 +430,8 @@ def test_a_matt_scene_has_nothing_to_learn() -> None:
 
 def test_only_views_that_miss_their_floor_are_guided(monkeypatch: pytest.MonkeyPatch) -> None:
     """A scene is learnt once, whatever its views and lights, and not for views that need little."""
-    learnt = list[Scene]()
-    learn = vector_tracer._learn_guide
-
-    def counted(record: Scene, scene: KernelScene) -> GuideTable | None:
-        learnt.append(record)
-        return learn(record, scene)
-
-    monkeypatch.setattr(vector_tracer, "_learn_guide", counted)
+    learn = Mock(wraps=vector_tracer._learn_guide)
+    monkeypatch.setattr(vector_tracer, "_learn_guide", learn)
     scene = mirrors()
     camera = camera_of(scene, 16)
     for floor_db, max_spp, times in ((1.0, 512, 0), (90.0, 256, 0), (90.0, 512, 1)):
@@ -449,7 +443,7 @@ def test_only_views_that_miss_their_floor_are_guided(monkeypatch: pytest.MonkeyP
         renderer = SceneRenderer(scene, settings)
         for seed in range(2):
             renderer.render_view(camera.c2w, camera.fov_deg, seed)
-        assert len(learnt) == times
+        assert learn.call_count == times
 
 
 def test_lights_apart_share_a_table_and_add_up() -> None:

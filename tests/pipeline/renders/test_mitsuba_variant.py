@@ -37,12 +37,8 @@ from storage.records.scene_file import encode_scene
 from tests.command_line import trilight
 from tests.for_each import for_each
 from tests.oracle.kernel_bsdf import exact_twin
-from tests.pipeline.renders.sampling import (
-    Estimate,
-    assert_agree,
-    printed_by,
-    render_blocks,
-)
+from tests.pipeline.programs import printed_by
+from tests.pipeline.renders.sampling import Estimate, assert_agree, render_blocks
 from tests.scenes_by_hand import tiny_scene
 
 

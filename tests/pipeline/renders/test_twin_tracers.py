@@ -36,6 +36,7 @@ from storage.records.sample import decode_sample, encode_sample
 from storage.records.scene import Scene
 from storage.records.texture import Texture
 from tests.oracle.kernel_bsdf import exact_twin
+from tests.pipeline.programs import printed_by
 from tests.pipeline.renders.sampling import (
     assert_agree,
     assert_honest,
@@ -43,7 +44,6 @@ from tests.pipeline.renders.sampling import (
     camera_of,
     exact,
     lambert_irradiance,
-    printed_by,
     render_blocks,
     render_view,
     scores,
