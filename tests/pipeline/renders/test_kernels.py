@@ -48,7 +48,6 @@ pytestmark = pytest.mark.usefixtures("llvm")
 
 PX = 32
 
-
 SETTINGS = RenderSettings(
     resolution=32, noise_floor_db=99.0, min_spp=8, max_spp=8, aux_spp=4, min_mean_radiance=0.0
 )
@@ -382,21 +381,15 @@ def test_the_way_back_has_the_density_that_a_path_from_there_draws() -> None:
 
 
 SAMPLES = 300_000
-
-
 SIGNIFICANCE = 0.01
 """Chance that any of all cases is rejected although it is right; the seeds are fixed."""
-
 
 MIRRORS = [(0.01, 0.5), (0.03, 0.02), (0.03, 0.95), (0.1, 0.15), (0.3, 0.5), (1.0, 0.02),
            (1.0, 0.95)]  # fmt: skip
 """Roughness and cosine. Not 0.01 at 0.02: wi + wo is 0.04 long there, so that float32 rounds the
 half vector by 2 % of the lobe's width, and the histogram shows the rounding."""
 
-
 MIXTURES = [(0.5, 0.15), (0.7, 0.5), (1.0, 0.95)]
-
-
 CASES = len(MIRRORS) + len(MIXTURES)
 
 

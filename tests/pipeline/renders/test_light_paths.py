@@ -64,8 +64,6 @@ from tests.pipeline.renders.test_renderer import lit_scene
 from tests.sky_maps import smooth
 
 pytestmark = pytest.mark.usefixtures("llvm")
-
-
 _ALMOST_ALL = 2.0**30
 """Light paths for each camera path, of which weights leave a millionth to the other strategies."""
 
@@ -86,11 +84,7 @@ class CameraPathsLeft(CameraPathsOnly):
 
 
 LAMP = [[0.8, 0.3, 1.6], [1.1, 0.3, 1.6], [0.9, 0.6, 1.7]]
-
-
 WIDE = [[-2, -2, 0], [2, -2, 0], [2, 2, 0], [-2, 2, 0]]
-
-
 WALL = [[-2, 1, 0], [2, 1, 0], [2, 1, 2], [-2, 1, 2]]
 
 
@@ -175,6 +169,10 @@ def test_a_caustic_has_a_fraction_of_the_noise() -> None:
 _SEEDS = ((11, 5), (12, 6), (13, 7))
 """Of the camera paths and of the light paths of three passes."""
 
+SHARED = RenderSettings(
+    resolution=32, noise_floor_db=99.0, min_spp=64, max_spp=64, light_paths="scene"
+)
+
 
 def _orbit() -> tuple[Scene, list[PixelCamera]]:
     """A scene with three cameras around it."""
@@ -222,9 +220,6 @@ def test_light_paths_of_another_seed_are_those_of_a_pass_of_that_seed() -> None:
 
 def test_views_of_a_scene_trace_their_light_paths_once(monkeypatch: pytest.MonkeyPatch) -> None:
     scene, _ = _orbit()
-    settings = RenderSettings(
-        resolution=32, noise_floor_db=99.0, min_spp=64, max_spp=64, light_paths="scene"
-    )
     joined = list[int]()
     landed = vector_tracer._land
 
@@ -237,7 +232,7 @@ def test_views_of_a_scene_trace_their_light_paths_once(monkeypatch: pytest.Monke
 
     def views(light_seed: int | None, order: tuple[int, ...]) -> list[NDArray]:
         joined.clear()
-        renderer = SceneRenderer(scene, settings, light_seed=light_seed)
+        renderer = SceneRenderer(scene, SHARED, light_seed=light_seed)
         poses = ((scene.c2w[view], float(scene.fov_deg[view]), view) for view in order)
         return [renderer.render_view(*pose).radiance_rgb for pose in poses]
 
@@ -252,12 +247,9 @@ def test_views_of_a_scene_trace_their_light_paths_once(monkeypatch: pytest.Monke
 
 def test_lamps_apart_share_the_light_paths_of_a_scene() -> None:
     scene = lit_scene()
-    settings = RenderSettings(
-        resolution=32, noise_floor_db=99.0, min_spp=64, max_spp=64, light_paths="scene"
-    )
 
     def view(*, per_light: bool) -> RenderedView:
-        told = dataclasses.replace(settings, per_light=per_light)
+        told = dataclasses.replace(SHARED, per_light=per_light)
         renderer = SceneRenderer(scene, told, light_seed=5)
         return renderer.render_view(scene.c2w[0], float(scene.fov_deg[0]), 0)
 

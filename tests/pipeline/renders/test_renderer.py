@@ -55,8 +55,6 @@ from tests.scenes_by_hand import tiny_scene
 from tests.sky_maps import constant
 
 CHEAP = RenderSettings(resolution=32, noise_floor_db=60.0, min_spp=32, max_spp=32)
-
-
 GROWING = dataclasses.replace(CHEAP, min_spp=16, max_spp=256)
 """Its first look is at 64 samples: the picture is narrow."""
 

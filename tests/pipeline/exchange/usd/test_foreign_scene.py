@@ -186,8 +186,6 @@ PICTURE = np.array([[RED, GREEN], [BLUE, GREY]], np.uint8)
 """The top row first; the stage's floor has u along +X and v along -Y."""
 
 CORNERS = {(-0.5, -0.5): RED, (0.5, -0.5): GREEN, (-0.5, 0.5): BLUE, (0.5, 0.5): GREY}
-
-
 CODED = 0.005
 """Half a step of 8 sRGB-encoded bits is at most 0.0045 in linear light."""
 

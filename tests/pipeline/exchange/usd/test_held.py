@@ -143,10 +143,8 @@ def test_constants_beside_textures_are_read_where_they_were_changed(tmp_path: Pa
     for folder, (column, path, value, _, place) in with_folders(tmp_path, constants):
         scene = textured_scene()
         found = edited(folder, scene, set_values((path, value)))
-        assert (
-            rows(found.scene)[:, COLUMNS[column][0]].tolist().count(pytest.approx(value, rel=1e-6))
-            == 2
-        )
+        values = rows(found.scene)[:, COLUMNS[column][0]].tolist()
+        assert values.count(pytest.approx(value, rel=1e-6)) == 2
         (said,) = [text for text in found.notes if " was changed since" in text]
         assert f"{column} was changed" in said and f"the value of {place} is used" in said
     found = edited(tmp_path, textured_scene(), set_values((".trilight:diffuseAlbedo", (0, 0, 0))))

@@ -18,6 +18,7 @@ from storage.errors import Rejected, TrilightError
 from storage.records.material import DIFFUSE, EMISSION, ROUGHNESS
 from tests.for_each import for_each
 from tests.pipeline.assets.source_materials.textured_kit import KEEP, F, new_stage
+from tests.pipeline.exchange.exchange_kit import mesh
 
 POINTS = ((0, 0, 0), (1, 0, 0), (0, 2, 0), (0, 0, 3))
 SIDES = ((0, 2, 1), (0, 1, 3), (0, 3, 2), (1, 2, 3))
@@ -75,12 +76,7 @@ def of_scene(path: Path) -> Looks:
 
 
 def solid(stage: Usd.Stage, path: str) -> UsdGeom.Mesh:
-    made = UsdGeom.Mesh.Define(stage, path)
-    made.CreatePointsAttr([Gf.Vec3f(*point) for point in POINTS])
-    made.CreateFaceVertexCountsAttr([3] * 4)
-    made.CreateFaceVertexIndicesAttr(np.ravel(SIDES).tolist())
-    made.CreateSubdivisionSchemeAttr("none")
-    return made
+    return mesh(stage, path, POINTS, [3] * 4, np.ravel(SIDES).tolist())
 
 
 def saved(stage: Usd.Stage, path: Path) -> Path:
@@ -172,17 +168,17 @@ def computed(stage: Usd.Stage) -> Counter[Row]:
     found, time = Counter[Row](), Usd.TimeCode.Default()
     unit = UsdGeom.GetStageMetersPerUnit(stage)
     for prim in Usd.PrimRange.Stage(stage, Usd.TraverseInstanceProxies()):
-        mesh = UsdGeom.Mesh(prim)
-        if not mesh or mesh.ComputeVisibility() == "invisible":
+        shape = UsdGeom.Mesh(prim)
+        if not shape or shape.ComputeVisibility() == "invisible":
             continue
-        if mesh.ComputePurpose() not in ("default", "render"):
+        if shape.ComputePurpose() not in ("default", "render"):
             continue
-        place = mesh.ComputeLocalToWorldTransform(time)
+        place = shape.ComputeLocalToWorldTransform(time)
         points = np.array([place.Transform(Gf.Vec3d(*point)) for point in POINTS]) * unit
         if UsdGeom.GetStageUpAxis(stage) == "Y":
             points = points[:, [0, 2, 1]] * [1, -1, 1]
         turned = place.GetDeterminant() < 0
-        step = -1 if turned != (mesh.GetOrientationAttr().Get() == "leftHanded") else 1
+        step = -1 if turned != (shape.GetOrientationAttr().Get() == "leftHanded") else 1
         found.update(as_row(points[list(side)[::step]]) for side in SIDES)
     return found
 
