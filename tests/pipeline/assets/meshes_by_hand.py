@@ -22,15 +22,8 @@ from tests.pipeline.foreign.gltf.gltf_writer import GltfWriter
 
 
 def record_of(path: Path, uid: str = "object") -> ObjectRecord:
-    return ObjectRecord(
-        uid=uid,
-        path=str(path),
-        title="",
-        licence="CC0-1.0",
-        licence_source="tests",
-        attribution="",
-        source_url="",
-    )
+    rights = {"licence": "CC0-1.0", "licence_source": "tests", "attribution": "", "source_url": ""}
+    return ObjectRecord(uid=uid, path=str(path), title="", **rights)
 
 
 def prepare(

@@ -197,18 +197,13 @@ def finest(path: Path, epsilon: float | None, budgets: tuple[int, ...] = (BUDGET
     return prepare(path, AssetSettings(budgets=budgets, epsilon=epsilon)).levels[0]
 
 
-def rung_below(faces: int) -> int:
-    """The largest of the budgets that the search knows below a number of faces."""
-    rungs = [round(BUDGET / 2 ** (k / 8)) for k in range(80)]
-    return max(rung for rung in rungs if rung < faces)
-
-
 def test_the_bound_is_kept_and_the_next_smaller_budget_breaks_it(path: Path) -> None:
+    rungs = [round(BUDGET / 2 ** (k / 8)) for k in range(80)]  # the budgets that the search knows
     for epsilon in (0.003, 0.01):
         level = finest(path, epsilon)
         assert level.record.budget == BUDGET
         assert level.record.quality.error_p99 <= epsilon
-        smaller = finest(path, None, (rung_below(len(level.faces)),))
+        smaller = finest(path, None, (max(rung for rung in rungs if rung < len(level.faces)),))
         assert len(smaller.faces) < len(level.faces)
         assert smaller.record.quality.error_p99 > epsilon
 

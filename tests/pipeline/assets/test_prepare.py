@@ -2,10 +2,7 @@
 
 import hashlib
 import json
-import os
 import re
-import subprocess
-import sys
 from collections import Counter
 from pathlib import Path
 from typing import Any
@@ -45,6 +42,7 @@ from tests.pipeline.assets.meshes_by_hand import (
     write_glb,
     write_obj,
 )
+from tests.pipeline.programs import printed_by
 
 SETTINGS = AssetSettings()
 SMALL = knot(segments=80)
@@ -102,18 +100,6 @@ def test_formats_agree_and_buffers_beside_a_gltf_are_read_and_counted(tmp_path: 
     assert prepare(paths[-1]).source_sha256 != assets[-1].source_sha256
 
 
-def output_of(code: str, *words: str, **environment: str) -> str:
-    """Return what a program in a process of its own printed."""
-    return subprocess.run(
-        [sys.executable, "-c", code, *words],
-        cwd=ROOT,
-        env=os.environ | {"PYTHONPATH": str(ROOT)} | environment,
-        capture_output=True,
-        text=True,
-        check=True,
-    ).stdout
-
-
 def test_two_processes_write_the_same_bytes(tmp_path: Path, asset: Asset) -> None:
     path = write_obj(tmp_path / "knot.obj", SMALL)
     code = (
@@ -122,8 +108,8 @@ def test_two_processes_write_the_same_bytes(tmp_path: Path, asset: Asset) -> Non
         "asset = prepare(Path(sys.argv[1]));"
         "print(hashlib.sha256(encode_asset(asset)).hexdigest())"
     )
-    digest = output_of(code, str(path), OMP_NUM_THREADS="1", OPENBLAS_NUM_THREADS="1")
-    assert digest.strip() == hashlib.sha256(encode_asset(asset)).hexdigest()
+    digest = printed_by(code, str(path), OMP_NUM_THREADS="1", OPENBLAS_NUM_THREADS="1")
+    assert digest == hashlib.sha256(encode_asset(asset)).hexdigest()
 
 
 def test_what_the_parent_needs_loads_no_mesh_library() -> None:
@@ -133,7 +119,7 @@ def test_what_the_parent_needs_loads_no_mesh_library() -> None:
         "print(*sys.modules)"
     )
     heavy = {"trimesh", "igl", "pymeshlab", "embreex", "wasmtime"}
-    assert not heavy & set(output_of(code).split())
+    assert not heavy & set(printed_by(code).split())
 
 
 NO_SETTINGS: list[dict[str, Any]] = [
@@ -291,7 +277,7 @@ print(json.dumps({
 
 def test_faithful_works_without_pymeshlab_and_uniform_says_what_to_do(shared: Path) -> None:
     """In a process without it, of a real object; the recipe says so, and nothing is loaded."""
-    output = output_of(PROGRAM, str(shared / "objects" / "classic" / "spot.obj"))
+    output = printed_by(PROGRAM, str(shared / "objects" / "classic" / "spot.obj"))
     told = json.loads(output.splitlines()[-1])
     assert told["methods"] == ["libigl_qslim", "meshoptimizer", "meshoptimizer_sloppy"]
     assert [method for method, _ in told["levels"]] == ["libigl_qslim"] * 2

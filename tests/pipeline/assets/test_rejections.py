@@ -7,8 +7,6 @@ import gzip
 import json
 import os
 import struct
-import subprocess
-import sys
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -20,7 +18,6 @@ from pipeline.assets.settings import AssetSettings, GateSettings
 from pipeline.foreign.mesh import TriangleMesh
 from storage.errors import Rejected
 from storage.records.asset import Asset
-from tests.conftest import ROOT
 from tests.for_each import for_each
 from tests.pipeline.assets.child_kit import Bench
 from tests.pipeline.assets.meshes_by_hand import (
@@ -46,6 +43,7 @@ from tests.pipeline.assets.meshes_by_hand import (
     write_ply,
     write_stl,
 )
+from tests.pipeline.programs import printed_by
 
 BALL = sphere(rings=5, columns=8)
 NUMBERS: dict[str, tuple[str, TriangleMesh]] = {
@@ -354,14 +352,8 @@ def test_an_obj_opens_no_material_and_a_gltf_its_buffers_and_no_picture(tmp_path
     (tmp_path / "a.bin").write_bytes(buffer)
     textured = tmp_path / "a.gltf"
     textured.write_text(json.dumps(tree))
-    result = subprocess.run(
-        [sys.executable, "-c", WATCH, str(material), str(textured)],
-        cwd=ROOT,
-        capture_output=True,
-        text=True,
-        check=True,
-    )
-    assert [json.loads(line) for line in result.stdout.splitlines()[-2:]] == [
+    output = printed_by(WATCH, str(material), str(textured))
+    assert [json.loads(line) for line in output.splitlines()[-2:]] == [
         [str(material)],
         [str(textured), str(tmp_path / "a.bin")],
     ]

@@ -9,7 +9,7 @@ And pages as a browser would read them, with text and rows of objects that mean 
 import contextlib
 import dataclasses
 import json
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from html.parser import HTMLParser
 from pathlib import Path
 from typing import Any
@@ -23,6 +23,7 @@ from storage.dataset.shard import write_shard
 from storage.errors import TrilightError
 from storage.records.asset import AssetRow
 from storage.records.objects import Failure, LockedObject, write_failures, write_objects_lock
+from storage.records.profiles import Profile
 from storage.records.sample import Sample, encode_sample, sample_key
 from storage.records.scene import Scene, SceneObject
 from tests.pipeline.scenes.small_pool import QUALITY, SOURCE
@@ -83,11 +84,20 @@ def write_dataset(
     *,
     objects: Sequence[LockedObject] = (),
     failures: Sequence[Failure] = (),
+    profiles: Sequence[Profile] = (),
+    order: Callable[[Iterable[str]], Iterable[str]] = sorted,
+    **changes: Any,
 ) -> Dataset:
-    """Write shards (samples by file name) with all that stands beside them, and open the whole."""
+    """Write shards (samples by file name) with all that stands beside them, and open the whole.
+
+    Shards are packed by `profiles`, one for each, or all without loss. `changes` replace fields of
+    the manifest, which lists the names of shards in an order.
+    """
     folder = DatasetFolder(root)
-    for name, samples in shards.items():
-        write_shard(folder.shard(name), [(entry.key, encode_sample(entry)) for entry in samples])
+    for row, (name, samples) in enumerate(shards.items()):
+        profile = profiles[row] if profiles else "lossless"
+        members = [(entry.key, encode_sample(entry, profile)) for entry in samples]
+        write_shard(folder.shard(name), members)
     write_objects_lock(folder.objects_lock, objects)
     write_failures(folder.failures, failures)
     manifest = Manifest(
@@ -97,9 +107,9 @@ def write_dataset(
         num_scenes=sum(len(samples) for samples in shards.values()),
         num_views=2,
         objects_lock_sha256="",
-        shards=tuple(index_shard(folder.shard(name)) for name in sorted(shards)),
+        shards=tuple(index_shard(folder.shard(name)) for name in order(shards)),
     )
-    write_manifest(folder.manifest, manifest)
+    write_manifest(folder.manifest, dataclasses.replace(manifest, **changes))
     return open_dataset(str(root))
 
 

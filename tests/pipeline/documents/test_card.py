@@ -1,4 +1,7 @@
-"""The numbers of a dataset against those counted by hand, and the card that states them."""
+"""The numbers of a dataset against those counted by hand, the card and Croissant that state them.
+
+Croissant passes MLCommons' own validator, and a huge dataset is described by a sample.
+"""
 
 import contextlib
 import dataclasses
@@ -14,12 +17,15 @@ import numpy as np
 import pytest
 import yaml
 
+from pipeline.documents import croissant
+from pipeline.documents.croissant import encode_croissant
 from pipeline.documents.dataset_documents import _size_category, encode_card, write_documents
 from pipeline.documents.distributions import Distributions, dataset_distributions
 from pipeline.documents.pages import render_markdown
 from pipeline.documents.rights import rights_of
 from storage.dataset.dataset import Dataset, open_dataset
-from storage.dataset.statistics import dataset_statistics
+from storage.dataset.layout import DatasetFolder
+from storage.dataset.statistics import dataset_statistics, described_shards
 from storage.errors import TrilightError
 from storage.markdown import code, front_matter, plain, text
 from storage.records.objects import read_objects_lock, write_objects_lock
@@ -35,7 +41,6 @@ from tests.pipeline.documents.dataset_by_hand import (
     sample,
     write_dataset,
 )
-from tests.pipeline.generation.test_derive_dataset import finished
 from tests.scenes_by_hand import tiny_scene
 from tests.textured_by_hand import sky, textured_scene
 
@@ -285,11 +290,8 @@ def test_expected_errors_stand_beside_the_promised_ones(tmp_path: Path) -> None:
 @pytest.mark.parametrize("profiles", [["lossless"] * 2, ["compact"] * 2, ["lossless", "compact"]])
 def test_the_example_of_the_card_runs_as_it_stands(tmp_path: Path, profiles: list[Profile]) -> None:
     """Whichever way the arrays are packed; a merged dataset may hold both."""
-    finished(tmp_path, {
-        f"train-00000{row}.tar": [sample(row, furnished(["a"]))]
-        for row in range(2)
-    }, profiles=profiles)  # fmt: skip
-    _, body = card_of(open_dataset(str(tmp_path)))
+    shards = {f"train-00000{row}.tar": [sample(row, furnished(["a"]))] for row in range(2)}
+    _, body = card_of(write_dataset(tmp_path, shards, profiles=profiles))
     (example,) = re.findall(r"```python\n(.*?)```", body, re.DOTALL)
     assert len(example.strip().splitlines()) <= 10
     shown = "\n    print(sample['json']['schema_version'])\n"
@@ -353,3 +355,89 @@ def test_text_stays_in_its_line_its_code_span_and_its_yaml() -> None:
         "f": [], "g": 3,
     }  # fmt: skip
     assert yaml.safe_load(front_matter(values).strip("-")) == values
+
+
+@pytest.fixture
+def mlcroissant() -> Any:
+    return pytest.importorskip("mlcroissant", reason="run make setup-all")
+
+
+def test_the_validator_has_no_error_and_every_shard_and_scene_is_found(
+    mlcroissant: Any, tmp_path: Path
+) -> None:
+    dataset = five_scenes(tmp_path)
+    manifest, path = dataset.manifest, dataset.folder.croissant
+    rights = rights_of(read_objects_lock(dataset.folder.objects_lock))
+    path.write_bytes(encode_croissant(manifest, rights))
+    read = mlcroissant.Dataset(jsonld=str(path))
+    issues = read.metadata.ctx.issues
+    assert not issues.errors
+    missed = {message.split('"')[1].rsplit("/", 1)[-1] for message in map(str, issues.warnings)}
+    assert missed == {"citeAs", "datePublished"}
+    assert read.metadata.ctx.conforms_to.value == "http://mlcommons.org/croissant/1.1"
+    assert sorted(read.metadata.license) == [
+        "https://spdx.org/licenses/CC-BY-4.0.html",
+        "https://spdx.org/licenses/CC0-1.0.html",
+    ]
+    files = {entry.id: entry.sha256 for entry in read.metadata.file_objects}
+    assert files == {shard.name: shard.sha256 for shard in manifest.shards}
+    scenes = {row["scenes/key"].decode(): row["scenes/json"] for row in read.records("scenes")}
+    assert sorted(scenes) == sorted(key for shard in manifest.shards for key in dataset.keys(shard))
+    assert json.loads(scenes["000000020"])["provenance"]["template"] == "wall"
+    assert [row["splits/name"] for row in read.records("splits")] == ["train", "test"]
+
+
+@pytest.mark.parametrize("licence", ['"}, {', "x\n\ud800", "LicenseRef-a"])
+def test_it_is_json_whatever_the_licences_are_called(tmp_path: Path, licence: str) -> None:
+    dataset = five_scenes(tmp_path)
+    document = json.loads(encode_croissant(dataset.manifest, rights_of([locked("a", licence)])))
+    assert document["license"] == [licence]
+
+
+def test_a_dataset_without_shards_is_valid_too(mlcroissant: Any, tmp_path: Path) -> None:
+    manifest = dataclasses.replace(five_scenes(tmp_path / "a").manifest, shards=())
+    path = tmp_path / "croissant.json"
+    path.write_bytes(encode_croissant(manifest, rights_of([])))
+    assert not mlcroissant.Dataset(jsonld=str(path)).metadata.ctx.issues.errors
+
+
+@pytest.fixture
+def eleven(tmp_path: Path) -> Dataset:
+    """Return 11 shards of one scene each, one of them for testing."""
+    shards = {f"train-{row:06d}.tar": [sample(row, tiny_scene())] for row in range(10)}
+    return write_dataset(
+        tmp_path / "set", {**shards, "test-000010.tar": [sample(10, tiny_scene())]}
+    )
+
+
+def test_shards_are_spread_over_each_split(
+    eleven: Dataset, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("storage.dataset.statistics.MOST_SCENES", 11)
+    assert described_shards(eleven) == list(eleven.manifest.shards)
+    monkeypatch.setattr("storage.dataset.statistics.MOST_SCENES", 4)
+    names = [shard.name for shard in described_shards(eleven)]
+    assert names == ["test-000010.tar", *(f"train-{row:06d}.tar" for row in (0, 3, 6, 9))]
+
+
+@pytest.mark.usefixtures("bare_reports")
+def test_documents_of_a_sample_say_so(
+    mlcroissant: Any, eleven: Dataset, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    whole = dataset_statistics(eleven)
+    assert whole.scene_digest and "what follows is" not in dict(whole.lines())
+    monkeypatch.setattr("storage.dataset.statistics.MOST_SCENES", 4)
+    monkeypatch.setattr(croissant, "MOST_LISTED", 3)
+    out = DatasetFolder(tmp_path / "documents")
+    out.root.mkdir()
+    statistics = write_documents(eleven, out)
+    said = "of a sample of 5 of 11 scenes"
+    lines = dict(statistics.lines())
+    assert lines["what follows is"] == said and "scene digest" not in lines
+    assert lines["scenes"] == "11 (1 test, 10 train)" and statistics.num_views == 10
+    assert f"Views, errors and contents are those {said}." in out.card.read_text()
+    assert said in out.report.read_text()
+    assert dataset_distributions(eleven).sample == said
+    record = json.loads(out.croissant.read_bytes())
+    assert "train-000000.tar" not in json.dumps(record)  # 250,000 of them would take 200 MB
+    assert not mlcroissant.Dataset(jsonld=str(out.croissant)).metadata.issues.errors

@@ -43,7 +43,6 @@ from storage.records.asset import AssetRow, OwnMaterials
 from storage.records.objects import Failure
 from storage.records.passes.pictures import decode_passes_exr, view_passes
 from storage.records.sample import Sample
-from storage.records.scene import Scene
 from tests.command_line import trilight
 from tests.pipeline.documents.dataset_by_hand import (
     HARM,
@@ -64,16 +63,8 @@ def failure(item: str = "bad", message: str = "a sentence") -> Failure:
     return Failure(stage="assets", item=item, reason="no_faces", message=message)
 
 
-def pairs(entry: AssetRow) -> dict[str, list[Pair]]:
-    picture = np.full((8, 8), 128, np.uint8)
-    return {"Worst": [Pair(row=entry, source=picture, result=picture)], "Best": []}
-
-
-def quality_page(
-    rows: list[AssetRow], failures: list[Failure], **more: dict[str, list[Pair]]
-) -> Tags:
-    shown = more.get("pairs", {})
-    return read(encode_quality_page(rows, failures, shown, budget=1400, target="faithful"))
+def quality_page(rows: list[AssetRow], failures: list[Failure]) -> Tags:
+    return read(encode_quality_page(rows, failures, {}, budget=1400, target="faithful"))
 
 
 RIGHTS = {"licence": HARM, "attribution": HARM, "source_url": "javascript:alert(3)"}
@@ -81,7 +72,8 @@ HARMFUL = row(HARM, title=HARM, method="pymeshlab_collapse", **RIGHTS)
 
 
 def test_text_from_outside_stays_text_and_nothing_is_loaded_from_elsewhere() -> None:
-    shown = pairs(HARMFUL)
+    picture = np.full((8, 8), 128, np.uint8)
+    shown = {"Worst": [Pair(row=HARMFUL, source=picture, result=picture)], "Best": []}
     failures = [failure(HARM, HARM)]
     data = encode_quality_page([HARMFUL, row()], failures, shown, budget=1400, target="x")
     plain = data.replace(html.escape(HARM).encode(), b"")
@@ -220,13 +212,6 @@ def commands(page: str) -> list[str]:
     ]
 
 
-def looking_away() -> Scene:
-    """Return the tiny scene, whose second camera has its back to it."""
-    away = look_at_c2w(eye=[3, 0, 1], target=[4, 0, 2], up=[0, 0, 1])
-    scene = tiny_scene()
-    return tiny_scene(c2w=np.stack([scene.c2w[0], away]).astype(np.float32))
-
-
 def test_colours_and_captions_say_the_value() -> None:
     scene = furnished(["a"])
     shown = figures(page_of(sample(0, scene)))
@@ -264,7 +249,10 @@ def test_the_table_of_objects_has_the_colours_of_the_ids() -> None:
 
 
 def test_a_view_of_nothing_is_black() -> None:
-    shown = figures(page_of(sample(0, looking_away())))
+    """The second camera has its back to the scene."""
+    away = look_at_c2w(eye=[3, 0, 1], target=[4, 0, 2], up=[0, 0, 1])
+    poses = np.stack([tiny_scene().c2w[0], away]).astype(np.float32)
+    shown = figures(page_of(sample(0, tiny_scene(c2w=poses))))
     for word in WORDS:
         picture, caption = shown[f"view 1, {word}"]
         assert not picture.any() and caption == f"view 1, {word}: nothing is met"

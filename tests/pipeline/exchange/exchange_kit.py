@@ -1,5 +1,6 @@
 """A scene through one form and back, and a USD stage as another program would write it."""
 
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -8,18 +9,24 @@ import pytest
 import trimesh
 from numpy.typing import NDArray
 from PIL import Image
-from pxr import Gf, Sdf, Usd, UsdGeom, UsdLux, UsdShade, UsdValidation
+from pxr import Gf, Sdf, Usd, UsdGeom, UsdLux, UsdValidation
 
 from pipeline.assets.settings import AssetSettings
 from pipeline.exchange.renderformer_h5 import read_renderformer_h5, write_renderformer_h5
 from pipeline.exchange.renderformer_json import describe_scene
 from pipeline.exchange.scene_files import build_scene
+from pipeline.exchange.textured_triangles import LoadedScene
 from pipeline.exchange.usd.read_usd import read_usd
 from pipeline.exchange.usd.write_usd import write_usd
 from storage.records.lookup import textured_rows
 from storage.records.material import EMISSION
 from storage.records.scene import Scene
 from storage.records.scene_file import encode_scene
+from tests.pipeline.assets.source_materials.textured_kit import (
+    connect_texture,
+    coordinates,
+    material,
+)
 
 
 def errors_of(stage: Any) -> list[str]:
@@ -53,6 +60,15 @@ def json_and_back(scene: Scene, folder: Path) -> tuple[Scene, tuple[str, ...]]:
 def h5_and_back(scene: Scene, folder: Path) -> Scene:
     write_renderformer_h5(folder / "again.h5", scene)
     return read_renderformer_h5(folder / "again.h5").scene
+
+
+def edited_layer(folder: Path, scene: Scene, edit: Callable[[Any], object]) -> LoadedScene:
+    """Return what is read after an edit of the layer that we wrote."""
+    write_usd(folder / "a.usda", scene)
+    layer = Sdf.Layer.OpenAsAnonymous(str(folder / "a.usda"))
+    edit(layer)
+    layer.Export(str(folder / "b.usda"))
+    return read_usd(folder / "b.usda")
 
 
 def assert_usd_keeps_all(scene: Scene, folder: Path, suffix: str) -> None:
@@ -152,28 +168,9 @@ def mesh(stage: Any, path: str, points: Any, counts: list[int], indices: list[in
 def _grid(stage: Any) -> None:
     corners = ((-100, 0, -100), (100, 0, -100), (100, 0, 100), (-100, 0, 100))
     grid = mesh(stage, "/W/Grid", corners, [4], [0, 3, 2, 1])
-    coordinates = UsdGeom.PrimvarsAPI(grid).CreatePrimvar(
-        "st", Sdf.ValueTypeNames.TexCoord2fArray, "vertex"
-    )
-    coordinates.Set([(0, 0), (1, 0), (1, 1), (0, 1)])
-    material = UsdShade.Material.Define(stage, "/W/mat")
-    shader = UsdShade.Shader.Define(stage, "/W/mat/preview")
-    shader.CreateIdAttr("UsdPreviewSurface")
-    texture = UsdShade.Shader.Define(stage, "/W/mat/texture")
-    texture.CreateIdAttr("UsdUVTexture")
-    texture.CreateInput("file", Sdf.ValueTypeNames.Asset).Set("./tex.png")
-    reader = UsdShade.Shader.Define(stage, "/W/mat/reader")
-    reader.CreateIdAttr("UsdPrimvarReader_float2")
-    reader.CreateInput("varname", Sdf.ValueTypeNames.String).Set("st")
-    texture.CreateInput("st", Sdf.ValueTypeNames.Float2).ConnectToSource(
-        reader.ConnectableAPI(), "result"
-    )
-    shader.CreateInput("diffuseColor", Sdf.ValueTypeNames.Color3f).ConnectToSource(
-        texture.ConnectableAPI(), "rgb"
-    )
-    shader.CreateInput("roughness", Sdf.ValueTypeNames.Float).Set(0.3)
-    material.CreateSurfaceOutput().ConnectToSource(shader.ConnectableAPI(), "surface")
-    UsdShade.MaterialBindingAPI.Apply(grid.GetPrim()).Bind(material)
+    coordinates(grid, [(0, 0), (1, 0), (1, 1), (0, 1)])
+    material(stage, grid, {"roughness": 0.3})
+    connect_texture(stage, "./tex.png")
 
 
 def _lights(stage: Any) -> None:

@@ -2,7 +2,7 @@
 
 import dataclasses
 import json
-from collections.abc import Iterator
+from contextlib import closing
 from pathlib import Path
 from typing import Any
 
@@ -11,9 +11,8 @@ import pytest
 import trimesh
 
 from infra.bench.workloads.named_scenes import cost_scene
-from pipeline.exchange import formats
 from pipeline.exchange.convert import convert_scene, within_budget, write_scene
-from pipeline.exchange.formats import LoadedScene, list_lost_members
+from pipeline.exchange.formats import FORMATS, LoadedScene, list_lost_members
 from pipeline.exchange.open_scene import SceneSource, load_source, scene_source
 from pipeline.isolation import ChildLimits, IsolatedChild
 from pipeline.presets.registry import preset_settings
@@ -24,7 +23,7 @@ from storage.records.material import PUBLISHED_COLUMNS, columns_in_use, laid_out
 from storage.records.scene import Scene, SceneObject
 from storage.records.scene_file import encode_scene
 from tests.columns_kit import COAT, TINT, WAVES, declared
-from tests.for_each import for_each
+from tests.for_each import for_each, with_folders
 from tests.pipeline.exchange.exchange_kit import (
     assert_h5_keeps_light,
     assert_json_keeps_light,
@@ -144,9 +143,7 @@ NAMES = (
 
 
 def test_any_names_become_names_of_files(tmp_path: Path) -> None:
-    for number, (shell, emitter) in enumerate(NAMES):
-        folder = tmp_path / str(number)
-        folder.mkdir()
+    for folder, (shell, emitter) in with_folders(tmp_path, NAMES):
         objects = (
             SceneObject(name=shell, kind="shell"),
             SceneObject(name=emitter, kind="emitter"),
@@ -189,11 +186,8 @@ def test_scenes_do_not_pile_up(tmp_path: Path, form: str) -> None:
     One layer of this scene takes 170 kB, so that keeping each of 150 would be 25 MB.
     """
     limits = ChildLimits(memory_bytes=8 << 30, wall_s=1800, calls_per_child=1)
-    child = IsolatedChild(limits=limits)
-    try:
+    with closing(IsolatedChild(limits=limits)) as child:
         assert child.call(grown_bytes, tmp_path, form) < 12e6
-    finally:
-        child.close()
 
 
 def coated(coat: float) -> Scene:
@@ -238,27 +232,21 @@ def test_what_carries_everything_carries_new_columns(tmp_path: Path, form: str) 
         load_source(scene_source(str(path)))
 
 
-@pytest.fixture
-def more_columns() -> Iterator[None]:
-    with declared(COAT, TINT, WAVES):
-        yield
-
-
-@pytest.mark.usefixtures("more_columns")
 def test_a_usd_file_that_somebody_changed_keeps_the_columns(tmp_path: Path) -> None:
     path = tmp_path / "a.usda"
-    write_scene(path, coated(0.3))
-    changed = path.read_text().replace("inputs:roughness = 0.5", "inputs:roughness = 0.4")
-    path.write_text(changed)
-    back = load_source(scene_source(str(path))).scene
-    assert columns_in_use(back.materials) == (*PUBLISHED_COLUMNS, "coat", "tint", "waves")
-    outside = changed.replace("trilight:column:coat = 0.3", "trilight:column:coat = 7")
-    path.write_text(outside.replace("trilight:column:tint", "trilight:column:shade"))
-    with pytest.raises(TrilightError, match="'shade' is not declared here"):
-        load_source(scene_source(str(path)))
-    path.write_text(outside)
-    loaded = load_source(scene_source(str(path)))
-    assert columns_in_use(loaded.scene.materials) == (*PUBLISHED_COLUMNS, "tint", "waves")
+    with declared(COAT, TINT, WAVES):
+        write_scene(path, coated(0.3))
+        changed = path.read_text().replace("inputs:roughness = 0.5", "inputs:roughness = 0.4")
+        path.write_text(changed)
+        back = load_source(scene_source(str(path))).scene
+        assert columns_in_use(back.materials) == (*PUBLISHED_COLUMNS, "coat", "tint", "waves")
+        outside = changed.replace("trilight:column:coat = 0.3", "trilight:column:coat = 7")
+        path.write_text(outside.replace("trilight:column:tint", "trilight:column:shade"))
+        with pytest.raises(TrilightError, match="'shade' is not declared here"):
+            load_source(scene_source(str(path)))
+        path.write_text(outside)
+        loaded = load_source(scene_source(str(path)))
+        assert columns_in_use(loaded.scene.materials) == (*PUBLISHED_COLUMNS, "tint", "waves")
     assert any("coat: expected 1 numbers from 0 to 1" in note for note in loaded.notes)
 
 
@@ -326,11 +314,9 @@ def test_a_smaller_budget_says_that_textures_go() -> None:
 
 def test_the_names_of_members_are_those_of_a_scene() -> None:
     """A claim that is mistyped would claim nothing, and be noticed only as a note too many."""
-    from pipeline.exchange.formats import FORMATS
-
     known = {f"objects.{field.name}" for field in dataclasses.fields(SceneObject)}
     known |= {f"materials.{name}" for name in PUBLISHED_COLUMNS}
     known |= {field.name for field in dataclasses.fields(Scene)}
     for form in FORMATS.values():
         assert set(form.carried) <= known
-    assert formats.list_lost_members(tiny_scene(), known) == ()
+    assert list_lost_members(tiny_scene(), known) == ()

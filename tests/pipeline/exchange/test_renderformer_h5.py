@@ -351,17 +351,14 @@ def _filter_of_a_plug_in(file: Any) -> None:
     h5py.h5d.create(file.id, b"triangles", h5py.h5t.IEEE_F32LE, h5py.h5s.create_simple(SHAPE), plan)
 
 
-def _raw_chunk(data: bytes) -> Callable[[Any], None]:
+def _raw_chunk(data: bytes, *, skipped: int = 0) -> Callable[[Any], None]:
+    """Store bytes as they are; `skipped` is the mask of filters that they claim to lack."""
+
     def change(file: Any) -> None:
         made = file.create_dataset("triangles", SHAPE, "<f4", chunks=SHAPE, compression="gzip")
-        made.id.write_direct_chunk((0, 0, 0), data)
+        made.id.write_direct_chunk((0, 0, 0), data, filter_mask=skipped)
 
     return change
-
-
-def _skipped_filter(file: Any) -> None:
-    made = file.create_dataset("triangles", SHAPE, "<f4", chunks=SHAPE, compression="gzip")
-    made.id.write_direct_chunk((0, 0, 0), bytes(108), filter_mask=1)
 
 
 def _of(values: Any) -> Callable[[Any], None]:
@@ -399,7 +396,7 @@ HOSTILE: dict[str, tuple[Callable[[Any], None], str]] = {
     "chunk too small": (_raw_chunk(b"x\x9c\x03\x00\x00\x00\x00\x01"), "other bytes"),
     "chunk is no zlib": (_raw_chunk(b"nonsense" * 20), "damaged"),
     "chunk inflates": (_bomb, "too early or too late"),
-    "filter skipped": (_skipped_filter, "chunk at .* is missing"),
+    "filter skipped": (_raw_chunk(bytes(108), skipped=1), "chunk at .* is missing"),
     "integers": (_of(np.ones(SHAPE, np.int32)), "another type"),
     "big-endian": (_of(np.ones(SHAPE, ">f4")), "another type"),
     "text": (_of(TEXT), "another type"),

@@ -6,7 +6,6 @@ import json
 import os
 import shlex
 import subprocess
-import sys
 from collections.abc import Callable
 from importlib import import_module
 from pathlib import Path
@@ -33,9 +32,9 @@ from storage.dataset.verify import verify_dataset
 from storage.errors import TrilightError
 from storage.number_ranges import number_ranges, numbers_of
 from tests.command_line import trilight
-from tests.conftest import ROOT
 from tests.for_each import for_each
 from tests.pipeline.generation.tiny_scenes_kit import Undocumented, tiny_order, without_rendering
+from tests.pipeline.programs import printed_by
 
 
 def _array(task: int, first: int, last: int, count: int, **more: str) -> dict[str, str]:
@@ -289,10 +288,7 @@ def test_names_of_executors_load_neither_prefect_nor_the_stages() -> None:
         "print([name for name in ('prefect', 'distributed', 'pipeline.generation.pipeline') "
         "if name in sys.modules])"
     )
-    done = subprocess.run(
-        [sys.executable, "-c", code], cwd=ROOT, capture_output=True, text=True, check=True
-    )
-    assert done.stdout == "[]\n"
+    assert printed_by(code) == "[]"
 
 
 IMAGE = "registry.example/trilight@sha256:1"

@@ -455,12 +455,9 @@ def test_who_watches_alone_asks_for_nothing_and_waits_so_long(
     assert cluster == [] and tables == []
 
 
+@pytest.mark.usefixtures("tables", "cluster")
 def test_a_page_that_cannot_be_shown_ends_neither_a_run_nor_an_array(
-    tables: Shown,
-    cluster: list[list[int]],
-    tmp_path: Path,
-    monkeypatch: pytest.MonkeyPatch,
-    caplog: pytest.LogCaptureFixture,
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
 ) -> None:
     def gone(*args: object, **named: object) -> None:
         raise ConnectionError("gone")

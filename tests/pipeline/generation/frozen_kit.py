@@ -28,8 +28,6 @@ from tests.pipeline.scenes.small_pool import small_pool
 LICENCES = ("CC0-1.0", "CC-BY-SA-4.0", "CC-BY-4.0", "CC-BY-SA-3.0")
 SOURCE = "objects-by-hand"
 BUILD = preset_settings("smoke", resolution=16)
-
-
 _pool = functools.cache(small_pool)
 
 

@@ -27,7 +27,7 @@ from pipeline.shards.pack_shards import PublishedShards, pack_shard
 from storage.dataset import layout
 from storage.dataset.dataset import Dataset, open_dataset
 from storage.dataset.layout import DatasetFolder
-from storage.dataset.manifest import Manifest, index_shard, write_manifest
+from storage.dataset.manifest import index_shard, write_manifest
 from storage.dataset.planned import derivation_of
 from storage.dataset.shard import open_shard, write_shard
 from storage.dataset.staging import read_staged_scene
@@ -40,14 +40,11 @@ from storage.records.objects import (
     encode_objects_lock,
     read_failures,
     read_objects_lock,
-    write_failures,
-    write_objects_lock,
 )
-from storage.records.profiles import Profile
 from storage.records.sample import Sample, encode_sample, sample_key
 from storage.records.scene import Scene
 from tests.for_each import for_each
-from tests.pipeline.documents.dataset_by_hand import furnished, locked, sample
+from tests.pipeline.documents.dataset_by_hand import furnished, locked, sample, write_dataset
 from tests.pipeline.generation.test_dataset_writer import ENVIRONMENT, _build
 from tests.scenes_by_hand import stage_scene
 from tests.textured_by_hand import (
@@ -89,32 +86,17 @@ def finished(
     shards: Mapping[str, Sequence[Sample]],
     *,
     objects: Sequence[LockedObject] = (TRAIN_OBJECT, TEST_OBJECT, locked("unused", "MIT")),
-    failures: Sequence[Failure] = (),
     seed: int = 0,
-    profiles: Sequence[Profile] = (),
-    **changes: object,
+    **more: Any,
 ) -> Path:
-    """Write a finished dataset; `changes` replace fields of its manifest.
-
-    Shards are packed by `profiles`, one for each, or all without loss.
-    """
-    folder = DatasetFolder(root)
-    for row, (name, of_shard) in enumerate(shards.items()):
-        profile = profiles[row] if profiles else "lossless"
-        members = [(entry.key, encode_sample(entry, profile)) for entry in of_shard]
-        write_shard(folder.shard(name), members)
-    write_objects_lock(folder.objects_lock, objects)
-    write_failures(folder.failures, failures)
-    manifest = Manifest(
-        build="smoke",
-        settings={**SETTINGS, "seed": seed},
-        environment={"mitsuba_variant": "none"},
-        num_scenes=2 * len(shards),
-        num_views=2,
-        objects_lock_sha256=sha256_hex(encode_objects_lock(objects)),
-        shards=tuple(index_shard(folder.shard(name)) for name in shards),
-    )
-    write_manifest(folder.manifest, dataclasses.replace(manifest, **changes))  # type: ignore[arg-type]
+    """Write a finished dataset, as `write_dataset` does with more of its arguments."""
+    stated = {
+        "build": "smoke",
+        "settings": {**SETTINGS, "seed": seed},
+        "num_scenes": 2 * len(shards),
+        "objects_lock_sha256": sha256_hex(encode_objects_lock(objects)),
+    }
+    write_dataset(root, shards, objects=objects, order=list, **{**stated, **more})
     return root
 
 

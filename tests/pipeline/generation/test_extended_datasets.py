@@ -3,6 +3,7 @@
 import dataclasses
 import json
 import re
+from contextlib import closing
 from pathlib import Path
 
 import pytest
@@ -87,16 +88,13 @@ def test_a_worker_without_the_extension_is_refused(tmp_path: Path) -> None:
 
 def test_children_know_what_is_registered() -> None:
     """Also those of a fork server that was started before."""
-    child = IsolatedChild(limits=LIMITS, confined_to=NO_FILES)
-    try:
+    with closing(IsolatedChild(limits=LIMITS, confined_to=NO_FILES)) as child:
         with pytest.raises(TrilightError, match="template 'corridor' is unknown"):
             child.call(parts_of, "corridor")
         child.retire()
         with loaded(TEMPLATE):
             assert child.call(parts_of, "corridor") == ("floor", "wall1", "wall2")
             child.retire()
-    finally:
-        child.close()
 
 
 BUG = """
@@ -263,11 +261,8 @@ DATASET_PRESETS.register("late", DatasetPreset(settings=wrong, num_scenes=1))
     path = written(tmp_path, text)
     with room_for_extensions():
         name = resolve_dataset_preset(f"{path}:mine")
-        assert (name, preset_settings(name).build, DATASET_PRESETS[name].num_scenes) == (
-            "own.py:mine",
-            "mine",
-            32,
-        )
+        assert (name, preset_settings(name).build) == ("own.py:mine", "mine")
+        assert DATASET_PRESETS[name].num_scenes == 32
         with pytest.raises(TrilightError, match="build='smoke', which is one of Trilight's own"):
             preset_settings(resolve_dataset_preset(f"{path}:posing"))
         with pytest.raises(TrilightError, match=r"own\.py: it returned a NoneType; expected Data"):

@@ -8,6 +8,7 @@ from collections.abc import Iterator
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
+from unittest.mock import Mock
 
 import numpy as np
 import pytest
@@ -29,7 +30,7 @@ from scene_templates.textures import UserMap, draw_user_map
 from storage.conventions import SPLITS
 from storage.dataset.verify import check_sample
 from storage.errors import Rejected, TrilightError
-from storage.records.asset import Asset, decode_asset
+from storage.records.asset import decode_asset
 from storage.records.object_index import ObjectIndex
 from storage.records.objects import (
     SKY,
@@ -106,18 +107,13 @@ def test_only_a_few_objects_are_open(
     made: tuple[DatasetWriter, AcceptedObjects], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(scene_worker, "_MOST_OPEN", 3)
-    read: list[bytes] = []
-
-    def counted(data: bytes) -> Asset:
-        read.append(data)
-        return decode_asset(data)
-
-    monkeypatch.setattr(scene_worker, "decode_asset", counted)
+    decode = Mock(wraps=decode_asset)
+    monkeypatch.setattr(scene_worker, "decode_asset", decode)
     pool = _opened(made[1])
-    assert not read
+    assert not decode.called
     for row in (0, 1, 2, 0, 3, 0, 1):
         assert pool[row].locked.uid == _rows(made[0])[row].uid
-    assert len(read) == 5  # 0, 1, 2, 3, and 1 again
+    assert decode.call_count == 5  # 0, 1, 2, 3, and 1 again
     assert pool._open.cache_info().currsize == 3
     for row in (-1, len(pool)):
         with pytest.raises(IndexError):
@@ -315,9 +311,7 @@ def test_no_texture_or_map_of_test_is_in_train(
     assert all(split_of[uid] == split for split in SPLITS for uid in uids[split])
 
 
-def test_without_own_ones_a_scene_is_what_it_was(
-    accepted: AcceptedMaps, settings: DatasetSettings
-) -> None:
+def test_without_own_ones_a_scene_is_what_it_was(accepted: AcceptedMaps) -> None:
     """Folders change no draw while their shares are 0, and procedural ones stay where none is."""
     changes = {name: 0.0 for name in SHARES if name.endswith("own_share")}
     plain = preset_settings("smoke", changes=SHARES | changes).scenes

@@ -133,9 +133,8 @@ def killed_at(step: int) -> Iterator[list[int]]:
         yield left
 
 
-def test_growth_that_is_killed_anywhere_is_finished_by_the_next_command(
-    tmp_path: Path, made: Counter[int]
-) -> None:
+@pytest.mark.usefixtures("made")
+def test_growth_that_is_killed_anywhere_is_finished_by_the_next_command(tmp_path: Path) -> None:
     make(tmp_path / "small", 6)
     whole, small = make(tmp_path / "whole", 11), read_manifest(tmp_path / "small/manifest.json")
     for step in range(200):
@@ -235,12 +234,9 @@ def test_who_packs_a_growing_shard_second_without_locks_has_the_first_ones_resul
         pack.pack_shard(folder, "train-000001.tar", range(4, 8))
 
 
+@pytest.mark.usefixtures("made")
 def test_a_bucket_grows_whoever_dies_when(
-    tmp_path: Path,
-    made: Counter[int],
-    bucket: Any,
-    machines: Machines,
-    monkeypatch: pytest.MonkeyPatch,
+    tmp_path: Path, bucket: Any, machines: Machines, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """The n-th write of each run never happens; three machines take turns until one is through."""
     machines.use("plain")
@@ -264,9 +260,8 @@ def test_a_bucket_grows_whoever_dies_when(
         assert bucket.cat_file(f"shards/set/{name}") == data, name
 
 
-def test_a_bucket_without_notes_grows(
-    tmp_path: Path, made: Counter[int], bucket: Any, machines: Machines
-) -> None:
+@pytest.mark.usefixtures("made")
+def test_a_bucket_without_notes_grows(tmp_path: Path, bucket: Any, machines: Machines) -> None:
     """A finished set that was copied, grown by two machines to two numbers of scenes."""
     machines.use("plain")
     whole = make(tmp_path / "whole", 7)
@@ -396,7 +391,7 @@ ASKED = GenerateOptions(
 )
 
 
-def test_every_option_that_was_given_is_there() -> None:
+def test_words_are_every_option_that_was_given_and_no_more() -> None:
     words = generate_words(ASKED)
     assert words[:4] == ["generate", "pretrain-256", "--objects", "my objects"]
     assert set(pairwise(words)) >= {
@@ -412,17 +407,12 @@ def test_every_option_that_was_given_is_there() -> None:
         ("--failure-budget", "0.2"),
     }
     assert "--accept-environment" in words
-    changes = [words[i + 1] for i, word in enumerate(words) if word == "--set"]
-    assert parse_overrides(changes) == json.loads(json.dumps(dict(ASKED.changes)))
+    stated = [words[i + 1] for i, word in enumerate(words) if word == "--set"]
+    assert parse_overrides(stated) == json.loads(json.dumps(dict(ASKED.changes)))
     shown = trilight(["generate", "--help-all"], env={"COLUMNS": "200"}).output
     assert all(word in shown for word in words if word.startswith("--"))
-
-
-def test_words_are_what_was_asked_for_and_no_more() -> None:
-    assert generate_words(GenerateOptions(workers=3, shards="0:2", out="x")) == [
-        "generate",
-        "smoke",
-    ]
+    plain = generate_words(GenerateOptions(workers=3, shards="0:2", out="x"))
+    assert plain == ["generate", "smoke"]
     changes = {"source": "12", "storage.profile": "true"}  # words that are JSON stay words
     assert parse_overrides(generate_words(GenerateOptions(changes=changes))[3::2]) == changes
     with_password = GenerateOptions(objects="https://me:secret@host/objects?key=1")

@@ -3,9 +3,12 @@
 from pathlib import Path
 from typing import Any
 
+import pytest
+
 from pipeline.objects.licences import DEFAULT_ALLOWED
 from pipeline.objects.listing import Listing
 from pipeline.objects.sources import list_objects
+from storage.errors import TrilightError
 
 
 def touch(folder: Path, *names: str) -> None:
@@ -19,6 +22,15 @@ def find(source: Path | str, **options: Any) -> Listing:
     options = {"allowed_licences": DEFAULT_ALLOWED, "work_dir": Path("unused"), **options}
     selection = {name: options.pop(name) for name in {*options} & {"downloaded"}}
     return list_objects(str(source), **options).fetch_selected(**selection)
+
+
+def refusal(source: Path | str, message: str, **options: Any) -> str:
+    """Return the one line in which a source is refused, which says what was expected."""
+    with pytest.raises(TrilightError, match=message) as caught:
+        find(source, **options)
+    text = str(caught.value)
+    assert "expected" in text and "\n" not in text
+    return text
 
 
 def reasons(found: Listing) -> dict[str, str]:

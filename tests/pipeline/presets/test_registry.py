@@ -1,8 +1,6 @@
 """Every dataset preset is complete; published ones stay what they are, whatever changes later."""
 
 import json
-import subprocess
-import sys
 import types
 from typing import Any, cast
 
@@ -25,6 +23,7 @@ from storage.seeds import rng_for
 from storage.settings.described import from_record
 from storage.settings.overrides import differences
 from tests.for_each import for_each
+from tests.pipeline.programs import printed_by
 from tests.scene_templates.balls import one_drawn
 
 JUDGED = ["out-of-range", "out-of-range-2", "benchmark-v1", "benchmark-v1-mini"]
@@ -189,13 +188,10 @@ FROZEN = {
 """Digest of each set's settings."""
 
 
-def test_the_settings_of_a_frozen_set_stay_what_they_are() -> None:
+def test_the_settings_and_tries_of_a_frozen_set_stay_what_they_are() -> None:
+    """Tries are seldom used up, so that the layouts below may not show it."""
     assert {name: preset_settings(name).digest for name in FROZEN} == FROZEN
     assert set(FROZEN) == {*PRESETS_FOR_JUDGING, *RENDERFORMER_PRESETS}
-
-
-def test_tries_of_a_frozen_set_stay_as_many() -> None:
-    """They are seldom used up, so that the layouts below may not show it."""
     assert (placement.ARRANGEMENT_TRIES, placement.PLACE_TRIES) == (100, 16)
     assert (emitters.SPACING_TRIES, emitters.PALEST) == (256, 0.2)
 
@@ -290,9 +286,5 @@ def _digests_after(code: str) -> dict[str, str]:
     lines = "\n".join(line.removeprefix(" " * 8) for line in code.splitlines())
     digests = "{n: b.settings().digest for n, b in DATASET_PRESETS.items()}"
     tail = f"import json\nprint(json.dumps({digests}))"
-    ran = subprocess.run(
-        [sys.executable, "-c", f"{lines}\n{tail}"], capture_output=True, text=True, check=False
-    )
-    assert ran.returncode == 0, ran.stderr
-    found: dict[str, str] = json.loads(ran.stdout)
+    found: dict[str, str] = json.loads(printed_by(f"{lines}\n{tail}"))
     return found

@@ -1,7 +1,5 @@
 """Pictures with their own standard errors, for tests that compare estimates, and a closed form."""
 
-import subprocess
-import sys
 from dataclasses import dataclass
 from typing import Any, NamedTuple
 
@@ -23,7 +21,6 @@ from pipeline.renders.renderer import RenderedView, SceneRenderer
 from pipeline.renders.settings import RenderSettings
 from pipeline.renders.tracer import PixelCamera, load_tracer, pixel_camera
 from storage.records.scene import Scene
-from tests.conftest import ROOT
 
 SIGMAS = 5.0
 """How many standard errors an honest estimate may be off: 1 in 2 million for one value, so that a
@@ -155,13 +152,6 @@ def floor_of(a: Half, b: Half, hits: NDArray[np.bool_]) -> MeasuredFloor:
 
 def exact(mean: NDArray[np.float64]) -> Estimate:
     return Estimate(mean=mean, error=np.zeros_like(mean))
-
-
-def printed_by(code: str) -> str:
-    """Return what another process prints that runs this code."""
-    words = [sys.executable, "-c", code]
-    done = subprocess.run(words, cwd=ROOT, capture_output=True, text=True, check=True)
-    return done.stdout.strip()
 
 
 def lambert_irradiance(

@@ -7,6 +7,7 @@ import weakref
 from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
+from unittest.mock import Mock, create_autospec
 
 import drjit as dr
 import mitsuba as mi
@@ -22,10 +23,9 @@ from pipeline.renders.device_memory import KernelInputs, read_back, record_launc
 from pipeline.renders.device_pictures import DevicePictures
 from pipeline.renders.ggx import AlbedoLookup, KernelLobes
 from pipeline.renders.renderer import RenderedView, SceneRenderer
-from pipeline.renders.settings import Filtered, RenderSettings
+from pipeline.renders.settings import RenderSettings
 from pipeline.renders.tracer import load_tracer
 from pipeline.renders.vector_tracer import VectorTracer
-from pipeline.renders.view_pictures import MeasuredLook
 from storage.optics.bsdf import bsdf_lobes
 from storage.optics.multiscatter import directional_albedo, scattered_again
 from storage.records.scene import Scene
@@ -47,7 +47,6 @@ from tests.storage.optics.test_multiscatter import stretched
 pytestmark = pytest.mark.usefixtures("llvm")
 
 PX = 32
-
 
 SETTINGS = RenderSettings(
     resolution=32, noise_floor_db=99.0, min_spp=8, max_spp=8, aux_spp=4, min_mean_radiance=0.0
@@ -143,14 +142,8 @@ def test_guided_passes_have_one_more_set_of_kernels_for_every_scene() -> None:
 
 
 def test_all_views_and_lights_share_one_load(monkeypatch: pytest.MonkeyPatch) -> None:
-    loads = list[Scene]()
-    load = kernel_scene.build_mitsuba_scene
-
-    def counted(scene: Scene, *rest: Any, **named: Any) -> Any:
-        loads.append(scene)
-        return load(scene, *rest, **named)
-
-    monkeypatch.setattr(kernel_scene, "build_mitsuba_scene", counted)
+    load = Mock(wraps=kernel_scene.build_mitsuba_scene)
+    monkeypatch.setattr(kernel_scene, "build_mitsuba_scene", load)
     scene = sampled_like_scene(np.random.default_rng(3), num_views=2)
     scene = scene.with_provenance({"camera_attempts": [0] * 2})
     changes = {"renders.min_spp": 8, "renders.max_spp": 8, "renders.per_light": True}
@@ -160,7 +153,7 @@ def test_all_views_and_lights_share_one_load(monkeypatch: pytest.MonkeyPatch) ->
         "000000000", RenderInput(scene=scene), settings, [], ViewProgress(None, 0)
     )
     assert len(sample.views) == 2
-    assert len(loads) == 2  # what camera rays meet, and what all other rays meet
+    assert load.call_count == 2  # what camera rays meet, and what all other rays meet
 
 
 def test_pictures_come_back_only_where_something_is_decided(reads: list[int]) -> None:
@@ -179,22 +172,16 @@ def test_little_is_read_back_by_device_arithmetic(
     reads: list[int], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """Once at a look, and little; the picture once, and once what shows anything."""
-    num_looks, look = 0, DevicePictures.look
-
-    def counted_look(self: DevicePictures, quality: Filtered) -> MeasuredLook:
-        nonlocal num_looks
-        num_looks += 1
-        return look(self, quality)
-
-    monkeypatch.setattr(DevicePictures, "look", counted_look)
+    look = create_autospec(DevicePictures.look, side_effect=DevicePictures.look)
+    monkeypatch.setattr(DevicePictures, "look", look)
     settings = dataclasses.replace(ADAPTIVE, resolution=64, max_spp=256, arithmetic="device")
     render_view(sampled_like_scene(np.random.default_rng(5), num_views=1), settings)
     picture_bytes = 4 * 3 * 64**2
     small = [size for size in reads if size < picture_bytes / 4]
-    assert num_looks > 2
+    assert look.call_count > 2
     assert reads.count(picture_bytes) == 1 and len(reads) == len(small) + 1
     # the mean of the first passes, what shows anything, and each look
-    assert len(small) == 2 + num_looks
+    assert len(small) == 2 + look.call_count
 
 
 @for_each(
@@ -394,21 +381,15 @@ def test_the_way_back_has_the_density_that_a_path_from_there_draws() -> None:
 
 
 SAMPLES = 300_000
-
-
 SIGNIFICANCE = 0.01
 """Chance that any of all cases is rejected although it is right; the seeds are fixed."""
-
 
 MIRRORS = [(0.01, 0.5), (0.03, 0.02), (0.03, 0.95), (0.1, 0.15), (0.3, 0.5), (1.0, 0.02),
            (1.0, 0.95)]  # fmt: skip
 """Roughness and cosine. Not 0.01 at 0.02: wi + wo is 0.04 long there, so that float32 rounds the
 half vector by 2 % of the lobe's width, and the histogram shows the rounding."""
 
-
 MIXTURES = [(0.5, 0.15), (0.7, 0.5), (1.0, 0.95)]
-
-
 CASES = len(MIRRORS) + len(MIXTURES)
 
 

@@ -2,6 +2,7 @@
 
 import dataclasses
 from typing import Any
+from unittest.mock import Mock
 
 import drjit as dr
 import mitsuba as mi
@@ -24,7 +25,6 @@ from pipeline.renders.guide_table import (
     bin_of,
     learn,
 )
-from pipeline.renders.kernel_scene import KernelScene
 from pipeline.renders.renderer import RenderedView, SceneRenderer
 from pipeline.renders.settings import RenderSettings
 from pipeline.renders.tracer import PixelCamera, load_tracer
@@ -64,8 +64,6 @@ from tests.pipeline.renders.test_renderer import lit_scene
 from tests.sky_maps import smooth
 
 pytestmark = pytest.mark.usefixtures("llvm")
-
-
 _ALMOST_ALL = 2.0**30
 """Light paths for each camera path, of which weights leave a millionth to the other strategies."""
 
@@ -86,11 +84,7 @@ class CameraPathsLeft(CameraPathsOnly):
 
 
 LAMP = [[0.8, 0.3, 1.6], [1.1, 0.3, 1.6], [0.9, 0.6, 1.7]]
-
-
 WIDE = [[-2, -2, 0], [2, -2, 0], [2, 2, 0], [-2, 2, 0]]
-
-
 WALL = [[-2, 1, 0], [2, 1, 0], [2, 1, 2], [-2, 1, 2]]
 
 
@@ -175,6 +169,10 @@ def test_a_caustic_has_a_fraction_of_the_noise() -> None:
 _SEEDS = ((11, 5), (12, 6), (13, 7))
 """Of the camera paths and of the light paths of three passes."""
 
+SHARED = RenderSettings(
+    resolution=32, noise_floor_db=99.0, min_spp=64, max_spp=64, light_paths="scene"
+)
+
 
 def _orbit() -> tuple[Scene, list[PixelCamera]]:
     """A scene with three cameras around it."""
@@ -222,9 +220,6 @@ def test_light_paths_of_another_seed_are_those_of_a_pass_of_that_seed() -> None:
 
 def test_views_of_a_scene_trace_their_light_paths_once(monkeypatch: pytest.MonkeyPatch) -> None:
     scene, _ = _orbit()
-    settings = RenderSettings(
-        resolution=32, noise_floor_db=99.0, min_spp=64, max_spp=64, light_paths="scene"
-    )
     joined = list[int]()
     landed = vector_tracer._land
 
@@ -237,7 +232,7 @@ def test_views_of_a_scene_trace_their_light_paths_once(monkeypatch: pytest.Monke
 
     def views(light_seed: int | None, order: tuple[int, ...]) -> list[NDArray]:
         joined.clear()
-        renderer = SceneRenderer(scene, settings, light_seed=light_seed)
+        renderer = SceneRenderer(scene, SHARED, light_seed=light_seed)
         poses = ((scene.c2w[view], float(scene.fov_deg[view]), view) for view in order)
         return [renderer.render_view(*pose).radiance_rgb for pose in poses]
 
@@ -252,12 +247,9 @@ def test_views_of_a_scene_trace_their_light_paths_once(monkeypatch: pytest.Monke
 
 def test_lamps_apart_share_the_light_paths_of_a_scene() -> None:
     scene = lit_scene()
-    settings = RenderSettings(
-        resolution=32, noise_floor_db=99.0, min_spp=64, max_spp=64, light_paths="scene"
-    )
 
     def view(*, per_light: bool) -> RenderedView:
-        told = dataclasses.replace(settings, per_light=per_light)
+        told = dataclasses.replace(SHARED, per_light=per_light)
         renderer = SceneRenderer(scene, told, light_seed=5)
         return renderer.render_view(scene.c2w[0], float(scene.fov_deg[0]), 0)
 
@@ -430,14 +422,8 @@ def test_a_matt_scene_has_nothing_to_learn() -> None:
 
 def test_only_views_that_miss_their_floor_are_guided(monkeypatch: pytest.MonkeyPatch) -> None:
     """A scene is learnt once, whatever its views and lights, and not for views that need little."""
-    learnt = list[Scene]()
-    learn = vector_tracer._learn_guide
-
-    def counted(record: Scene, scene: KernelScene) -> GuideTable | None:
-        learnt.append(record)
-        return learn(record, scene)
-
-    monkeypatch.setattr(vector_tracer, "_learn_guide", counted)
+    learn = Mock(wraps=vector_tracer._learn_guide)
+    monkeypatch.setattr(vector_tracer, "_learn_guide", learn)
     scene = mirrors()
     camera = camera_of(scene, 16)
     for floor_db, max_spp, times in ((1.0, 512, 0), (90.0, 256, 0), (90.0, 512, 1)):
@@ -449,7 +435,7 @@ def test_only_views_that_miss_their_floor_are_guided(monkeypatch: pytest.MonkeyP
         renderer = SceneRenderer(scene, settings)
         for seed in range(2):
             renderer.render_view(camera.c2w, camera.fov_deg, seed)
-        assert len(learnt) == times
+        assert learn.call_count == times
 
 
 def test_lights_apart_share_a_table_and_add_up() -> None:

@@ -7,6 +7,7 @@ import subprocess
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
+from unittest.mock import Mock
 
 import drjit as dr
 import mitsuba as mi
@@ -37,12 +38,8 @@ from storage.records.scene_file import encode_scene
 from tests.command_line import trilight
 from tests.for_each import for_each
 from tests.oracle.kernel_bsdf import exact_twin
-from tests.pipeline.renders.sampling import (
-    Estimate,
-    assert_agree,
-    printed_by,
-    render_blocks,
-)
+from tests.pipeline.programs import printed_by
+from tests.pipeline.renders.sampling import Estimate, assert_agree, render_blocks
 from tests.scenes_by_hand import tiny_scene
 
 
@@ -67,16 +64,12 @@ def test_a_library_that_is_none_is_passed_over_and_success_is_remembered(
     remembered = json.loads(memory.read_text())
     assert len(remembered) == 1  # what failed may work once its cause is mended
     with monkeypatch.context() as patch:
-        patch.setattr(variant_module, "_probe", _must_not_be_asked)
+        patch.setattr(variant_module, "_probe", None)  # nothing is probed again
         assert choose_variant() == variant
     memory.write_text("damaged")
     monkeypatch.setattr(variant_module, "_probe", lambda variant: _ProbeResult())
     assert choose_variant() == variant
     assert json.loads(memory.read_text()) == remembered
-
-
-def _must_not_be_asked(variant: Variant) -> _ProbeResult:
-    raise AssertionError(f"{variant} was probed again")
 
 
 def test_where_no_library_works_it_says_what_to_install(
@@ -190,28 +183,21 @@ def test_an_option_names_the_device_before_the_variable_and_the_default(
     assert (variant.address_space(1) == 1) == (chosen == CPU)
 
 
-def test_a_probe_of_a_gpu_is_remembered_for_its_driver(
-    own_cache: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+@pytest.mark.usefixtures("own_cache")
+def test_a_probe_of_a_gpu_is_remembered_for_its_driver(monkeypatch: pytest.MonkeyPatch) -> None:
     """A problem is remembered for `auto` alone: its cause may be fixed before `gpu` is named."""
-    probes: list[str] = []
-    results = iter(["no OptiX", "", ""])
-
-    def probe(variant: Variant) -> _ProbeResult:
-        probes.append(variant.name)
-        return _ProbeResult(problem=next(results))
-
+    probe = Mock(side_effect=[_ProbeResult(problem=each) for each in ("no OptiX", "", "")])
     monkeypatch.setenv("CUDA_VISIBLE_DEVICES", "0")
     monkeypatch.setattr(variant_module, "_probe", probe)
     monkeypatch.setattr(variant_module, "_on_processor", lambda: ON_CPU)
     assert [choose_variant("auto").device for _ in range(2)] == ["cpu", "cpu"]
-    assert len(probes) == 1
+    assert probe.call_count == 1
     assert [choose_variant(device="gpu").device for _ in range(2)] == ["gpu", "gpu"]
     assert choose_variant("auto").device == "gpu"
-    assert len(probes) == 2
+    assert probe.call_count == 2
     monkeypatch.setattr(variant_module, "gpu_identity", lambda: ("another driver",))
     assert choose_variant("auto").device == "gpu"
-    assert len(probes) == 3
+    assert probe.call_count == 3
 
 
 WARNING = "jit_eval(): more than one OptiX shader binding table. Disabling this ray tracing op"

@@ -40,8 +40,6 @@ from tests.pipeline.scenes.example_scenes import example_scene
 from tests.textured_by_hand import bumps
 
 pytestmark = pytest.mark.slow("references")
-
-
 RESOLUTION = 128
 
 
@@ -189,9 +187,8 @@ def _reference(shared: Path, file: str) -> NDArray[np.float32]:
 @pytest.mark.parametrize(
     ("name", "least_db"), [("cbox", 76), ("cbox-bunny", 74), ("crystals", 71), ("tree", 65)]
 )
-def test_direct_light_is_that_of_cycles(
-    shared: Path, llvm: None, name: str, least_db: float
-) -> None:
+@pytest.mark.usefixtures("llvm")
+def test_direct_light_is_that_of_cycles(shared: Path, name: str, least_db: float) -> None:
     """Geometry, materials, camera, light and pixels, with nothing but noise between.
 
     Measured: 79.7, 76.4, 75.4 and 68.0. With single scattering 57.6, 57.6, 59.1 and 21.9; vertices

@@ -3,6 +3,7 @@
 import dataclasses
 import hashlib
 from typing import Any
+from unittest.mock import Mock
 
 import numpy as np
 import pytest
@@ -27,7 +28,7 @@ from pipeline.renders.settings import RenderSettings
 from pipeline.renders.tracer import choose_tracing_scale, load_tracer
 from pipeline.renders.view_pictures import with_mean_of
 from storage.conventions import look_at_c2w
-from storage.denoiser import Features, Quality, denoise
+from storage.denoiser import denoise
 from storage.errors import Rejected
 from storage.metrics import psnr_log_db
 from storage.records.lights import (
@@ -39,11 +40,8 @@ from storage.records.lights import (
 from storage.records.scene import Scene, SceneObject
 from storage.settings.overrides import apply_overrides
 from tests.for_each import for_each
-from tests.pipeline.renders.sampling import (
-    camera_of,
-    printed_by,
-    render_view,
-)
+from tests.pipeline.programs import printed_by
+from tests.pipeline.renders.sampling import camera_of, render_view
 from tests.pipeline.renders.scene_kit import (
     join,
     light,
@@ -57,8 +55,6 @@ from tests.scenes_by_hand import tiny_scene
 from tests.sky_maps import constant
 
 CHEAP = RenderSettings(resolution=32, noise_floor_db=60.0, min_spp=32, max_spp=32)
-
-
 GROWING = dataclasses.replace(CHEAP, min_spp=16, max_spp=256)
 """Its first look is at 64 samples: the picture is narrow."""
 
@@ -138,21 +134,16 @@ def test_a_view_says_how_far_it_is() -> None:
 
 
 def test_halves_of_many_samples_have_the_best_filter(monkeypatch: pytest.MonkeyPatch) -> None:
-    filtered: list[str] = []
-    denoise = pictures.denoise
-
-    def noted(raw: NDArray[np.float32], features: Features, quality: Quality) -> Any:
-        filtered.append(quality)
-        return denoise(raw, features, quality)
-
-    monkeypatch.setattr(pictures, "denoise", noted)
+    denoise = Mock(wraps=pictures.denoise)
+    monkeypatch.setattr(pictures, "denoise", denoise)
     settings = dataclasses.replace(GROWING, noise_floor_db=95.0, min_spp=64, max_spp=512)
     render_view(simple_scene(), settings)
     # Two halves at 256 and at 512 samples, and the picture.
-    assert filtered == ["fast"] * 2 + ["high"] * 2 + ["high"]
-    filtered.clear()
+    qualities = [call.args[2] for call in denoise.call_args_list]
+    assert qualities == ["fast"] * 2 + ["high"] * 2 + ["high"]
+    denoise.reset_mock()
     render_view(simple_scene(), dataclasses.replace(settings, denoiser="fast"))
-    assert filtered == ["fast"] * 5
+    assert [call.args[2] for call in denoise.call_args_list] == ["fast"] * 5
 
 
 def test_a_linear_target_goes_on_where_the_log_one_is_reached() -> None:

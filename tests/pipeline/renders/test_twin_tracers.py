@@ -36,6 +36,7 @@ from storage.records.sample import decode_sample, encode_sample
 from storage.records.scene import Scene
 from storage.records.texture import Texture
 from tests.oracle.kernel_bsdf import exact_twin
+from tests.pipeline.programs import printed_by
 from tests.pipeline.renders.sampling import (
     assert_agree,
     assert_honest,
@@ -43,7 +44,6 @@ from tests.pipeline.renders.sampling import (
     camera_of,
     exact,
     lambert_irradiance,
-    printed_by,
     render_blocks,
     render_view,
     scores,
@@ -182,14 +182,8 @@ def test_the_oracle_agrees_where_nothing_is_compiled() -> None:
 
 
 DIM = 0.125
-
-
 PANEL = np.array([[-0.5, 1.0, 0.5], [0.5, 1.0, 0.5], [0.0, 1.0, 1.5]])
-
-
 BRIGHT = np.array([[-0.5, 0.0, 2.5], [0.5, 0.0, 2.5], [0.0, 0.4, 2.5]])
-
-
 RADIANCE = 20.0
 
 
@@ -236,13 +230,8 @@ SETTINGS = RenderSettings(
     resolution=32, noise_floor_db=60.0, min_spp=32, max_spp=32, aux_spp=16, split=True
 )
 
-
 KINDS = [{"split": True}, {"split_lobes": True}, {"split": True, "split_lobes": True}]
-
-
 FLOOR = quad([[-2, -2, 0], [2, -2, 0], [2, 2, 0], [-2, 2, 0]], material(diffuse=0.5))
-
-
 LAMP = np.array([[-0.5, -1.5, 2], [0.5, -1.5, 2], [0, -1, 2.4]])
 
 

@@ -10,14 +10,17 @@ import trimesh
 from numpy.typing import NDArray
 
 from pipeline.scenes.compose import compose_scene
+from pipeline.scenes.pieces import ScenePiece, shell_piece
 from pipeline.scenes.triangle_budget import PooledAsset
-from scene_templates.layout import SurfaceLook
+from scene_templates.layout import ShellPart, SurfaceLook
+from scene_templates.rooms import PATCH_FACES, SIDES, patch
 from scene_templates.settings import SceneSettings
 from storage.errors import Rejected
 from storage.records.asset import Asset, Level, LevelQuality, LevelRecord, SourceFacts
 from storage.records.objects import LockedObject
 from storage.records.scene import ARRAY_FIELDS, Scene
 from storage.seeds import SceneKey
+from tests.scene_templates.balls import STILL
 
 QUALITY = LevelQuality(
     error_mean=0.0,
@@ -44,11 +47,9 @@ SOURCE = SourceFacts(
 )
 """Of a closed object that needed no repair."""
 
-
 STEP_ERROR = 0.02
 """Error of each level beyond that of the next finer one: far above what any preset calls enough, so
 that finer levels are wanted wherever they fit."""
-
 
 BLIND = {
     "views.min_coverage": 0.0, "views.min_lit": 0.0, "views.max_shell_back": 1.0,
@@ -120,6 +121,13 @@ def small_pool() -> list[PooledAsset]:
         pooled("made/ring", [create.torus(0.5, 0.2, n, n) for n in (24, 16, 8)]),
         pooled("made/wall1", [create.cone(0.5, 1, sections=n) for n in (48, 12)]),
     ]
+
+
+def floor_piece(look: SurfaceLook, rng: np.random.Generator) -> ScenePiece:
+    """Return the floor of a room, of 128 triangles, with a look."""
+    positions = patch(SIDES["floor"], STILL)
+    part = ShellPart(name="floor", positions=positions, faces=PATCH_FACES, surface=look)
+    return shell_piece(part, rng, 30.0)
 
 
 def first_scene(

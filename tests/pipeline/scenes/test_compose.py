@@ -174,7 +174,6 @@ def test_real_objects_compose(real_pool: list[PooledAsset]) -> None:
 
 CROWD = {"families.num_objects": [3, 3], "placement.overlap_share": 0.0}
 
-
 PROVOKED: list[tuple[str, str, Mapping[str, Any], str]] = [
     ("no_room", "open_box", {**CROWD, "families.object_scale": [2.0, 2.0]}, "3 objects met"),
     (

@@ -15,22 +15,15 @@ import trimesh
 from numpy.typing import NDArray
 
 from pipeline.presets.registry import preset_settings
-from pipeline.scenes.pieces import object_piece, shell_piece
+from pipeline.scenes.pieces import object_piece
 from pipeline.scenes.triangle_budget import PooledAsset
-from scene_templates.layout import ShellPart, SurfaceLook
+from scene_templates.layout import SurfaceLook
 from scene_templates.out_of_range import median_settings
-from scene_templates.rooms import PATCH_FACES, SIDES, patch
 from scene_templates.sample_layout import scene_plan
 from storage.records.material import DIFFUSE, EMISSION, ROUGHNESS
 from storage.records.scene import Scene, SceneObject
 from storage.settings.overrides import differences
-from tests.pipeline.scenes.small_pool import (
-    LOOK,
-    first_scene,
-    rows_of,
-    triangles_of,
-)
-from tests.scene_templates.balls import STILL
+from tests.pipeline.scenes.small_pool import LOOK, first_scene, floor_piece, rows_of, triangles_of
 from tests.scene_templates.published import DEFAULT, STAGE_1
 from tests.scene_templates.statistics import (
     choices,
@@ -80,11 +73,8 @@ def _surface(colours: Any) -> SurfaceLook:
 
 def test_many_colours_are_even_below_the_diffuse_scale() -> None:
     rng = np.random.default_rng(0)
-    positions = patch(SIDES["floor"], STILL)
-    part = ShellPart(
-        name="floor", positions=positions, faces=PATCH_FACES, surface=_surface("triangles")
-    )
-    drawn = np.concatenate([shell_piece(part, rng, 30.0).materials[:, DIFFUSE] for _ in range(20)])
+    look = _surface("triangles")
+    drawn = np.concatenate([floor_piece(look, rng).materials[:, DIFFUSE] for _ in range(20)])
     assert len(drawn) == 20 * 128
     table = {name: uniform(drawn[:, k], 0, 0.8) for k, name in enumerate(("red", "green", "blue"))}
     table["brighter red than green"] = share(drawn[:, 0] > drawn[:, 1], 0.5)
@@ -115,7 +105,6 @@ SETTINGS = preset_settings("out-of-range").scenes
 
 SEED = 20261121
 
-
 AXES: dict[str, tuple[tuple[float, ...], set[str]]] = {
     "triangles": ((6144, 8192, 12288, 16384), {"max_triangles", "fill_to"}),
     "fov_deg": ((10, 20, 75, 90, 110), {"cameras.fov_deg"}),
@@ -128,7 +117,6 @@ AXES: dict[str, tuple[tuple[float, ...], set[str]]] = {
     "roughness": ((0.01, 0.02, 0.03, 0.04), {"materials.roughness_clip"}),
 }
 """The values of every axis, and the settings that make them."""
-
 
 MEDIAN = {
     "triangles": 4096,
@@ -143,10 +131,8 @@ MEDIAN = {
     "roughness": 0.2016,
 }
 
-
 ROUNDING = 1e-5
 """Float32 numbers up to 4, a few operations each; values on the axes are a hundredth apart."""
-
 
 CHOSEN = [index for index in range(74) if index == 0 or index % 37 > 3] + [38]
 """Half a turn: 37 values in two layouts each; of the slow subdivisions the two with the fewest."""

@@ -19,7 +19,6 @@ from pipeline.scenes.pieces import (
     cube_coordinates,
     emitter_piece,
     object_piece,
-    shell_piece,
     source_skins,
     with_drawn_textures,
     with_source_emission,
@@ -27,8 +26,7 @@ from pipeline.scenes.pieces import (
 from pipeline.scenes.redrawn import with_new_lights
 from pipeline.scenes.shading_normals import flat_shaded
 from pipeline.scenes.triangle_budget import PooledAsset
-from scene_templates.layout import Emitter, Layout, ObjectPlacement, Pose, ShellPart
-from scene_templates.rooms import PATCH_FACES, SIDES, patch
+from scene_templates.layout import Emitter, Layout, ObjectPlacement, Pose
 from scene_templates.rotations import rotate_points
 from scene_templates.settings import SceneSettings
 from scene_templates.surfaces.procedural_textures import SurfaceMapSettings
@@ -57,8 +55,8 @@ from tests.pipeline.assets.source_materials.textured_kit import (
     picture_bytes,
     textured_glb,
 )
-from tests.pipeline.scenes.small_pool import LOOK, first_scene, pooled, small_pool
-from tests.scene_templates.balls import DEFAULTS, STILL
+from tests.pipeline.scenes.small_pool import LOOK, first_scene, floor_piece, pooled, small_pool
+from tests.scene_templates.balls import DEFAULTS
 from tests.scene_templates.statistics import require_plausible, share
 from tests.textured_by_hand import bumps
 
@@ -232,7 +230,6 @@ CLOSED = {
     "cone": trimesh.creation.cone(0.5, 1, sections=11),
 }
 
-
 ALL = {**CLOSED, "odd": _open_and_odd()}
 
 
@@ -330,20 +327,11 @@ def test_the_longest_edges_are_halved_first() -> None:
     assert before < 4.005 / 20  # of the diagonal of the plank as it was
 
 
-def _shell() -> ScenePiece:
-    part = ShellPart(
-        name="floor",
-        positions=patch(SIDES["floor"], STILL),
-        faces=PATCH_FACES,
-        surface=LOOK,
-    )
-    return shell_piece(part, np.random.default_rng(0), 30.0)
-
-
 def test_a_scene_is_filled_by_its_objects_alone() -> None:
+    floor = floor_piece(LOOK, np.random.default_rng(0))
     lamp = _lamp(np.array([[0, 0, 2], [0.1, 0, 2], [0, 0.1, 2.0]]), (9.0, 9.0, 9.0))
     box, ball = _piece(CLOSED["box"], smooth=False), _piece(CLOSED["ball"], smooth=True)
-    pieces = [_shell(), box, ball, lamp]
+    pieces = [floor, box, ball, lamp]
     for fill_to in (1000, 2048):
         after = fill_triangles(pieces, fill_to)
         assert [after[0], after[3]] == [pieces[0], pieces[3]]
@@ -353,9 +341,9 @@ def test_a_scene_is_filled_by_its_objects_alone() -> None:
         assert fill_to - 2 * 3 < 128 + first + second + 1 <= fill_to
         # In proportion to what they had, 12 and 80, to the same few.
         assert abs(first / (first + second) - 12 / 92) < 4 / fill_to
-    bare = [_shell(), lamp]
+    bare = [floor, lamp]
     assert fill_triangles(bare, 5000) == bare
-    same = fill_triangles([_shell(), ball], 208)
+    same = fill_triangles([floor, ball], 208)
     assert [len(piece.mesh.faces) for piece in same] == [128, 80]
     assert np.array_equal(_corners(same[1]), _corners(ball)) and same[1].entry == ball.entry
 

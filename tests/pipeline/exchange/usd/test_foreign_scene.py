@@ -25,17 +25,13 @@ from tests.pipeline.exchange.exchange_kit import L_SHAPE, mesh, row_at, write_st
 from tests.scenes_by_hand import tiny_scene
 
 
-def read(path: Path, key: str | None = None) -> LoadedScene:
-    return read_usd(path, key)
-
-
 def edited(folder: Path, edit: Callable[[Any], object] = lambda stage: None) -> LoadedScene:
     """Return the stage of a stranger after an edit."""
     path = write_stage(folder)
     stage = Usd.Stage.Open(str(path))
     edit(stage)
     stage.GetRootLayer().Save()
-    return read(path)
+    return read_usd(path)
 
 
 @pytest.fixture
@@ -119,7 +115,7 @@ def test_our_own_file_whose_light_is_gone_says_nothing_else(tmp_path: Path) -> N
     stage.RemovePrim("/Scene/Objects/light")
     stage.GetRootLayer().Export(str(tmp_path / "b.usda"))
     with pytest.raises(TrilightError, match=r"carried over \(none is seen\); expected an emissive"):
-        read(tmp_path / "b.usda")
+        read_usd(tmp_path / "b.usda")
 
 
 def test_our_own_files_read_as_a_stranger_does_hold_the_same_light(tmp_path: Path) -> None:
@@ -127,7 +123,7 @@ def test_our_own_files_read_as_a_stranger_does_hold_the_same_light(tmp_path: Pat
     write_usd(tmp_path / "a.usda", tiny_scene())
     text = (tmp_path / "a.usda").read_text()
     (tmp_path / "b.usda").write_text(text.replace("trilight:", "other:"))
-    found, scene = read(tmp_path / "b.usda"), tiny_scene()
+    found, scene = read_usd(tmp_path / "b.usda"), tiny_scene()
     assert found.scene.provenance["template"] == "usd"
     back = found.scene
     assert np.array_equal(back.vertex_positions[back.faces], scene.vertex_positions[scene.faces])
@@ -150,10 +146,10 @@ def test_time_samples_are_a_sequence(tmp_path: Path) -> None:
     edited(tmp_path, edit)
     path = tmp_path / "stage.usda"
     assert usd_keys(path) == ["1", "2", "3"]
-    heights = [object_of(read(path, key).scene, "Grid")[0][..., 2].max() for key in ("1", "2", "3")]
+    heights = [object_of(read_usd(path, key).scene, "Grid")[0][..., 2].max() for key in "123"]
     assert heights == pytest.approx([0, 0.5, 1], abs=1e-6)
     with pytest.raises(TrilightError, match="no time code 4; expected one of 1 to 3"):
-        read(path, "4")
+        read_usd(path, "4")
 
 
 def test_a_stage_without_light_or_camera(tmp_path: Path) -> None:
@@ -161,7 +157,7 @@ def test_a_stage_without_light_or_camera(tmp_path: Path) -> None:
     mesh(stage, "/L", L_SHAPE, [6], [0, 1, 2, 3, 4, 5])
     stage.GetRootLayer().Export(str(tmp_path / "a.usda"))
     with pytest.raises(TrilightError, match="no light that can be carried over"):
-        read(tmp_path / "a.usda")
+        read_usd(tmp_path / "a.usda")
     lamps = [UsdLux.SphereLight.Define(stage, f"/{name}") for name in ("None", "Below")]
     lamps[0].CreateRadiusAttr(0.0)
     lamps[1].CreateIntensityAttr(-1.0)
@@ -170,15 +166,15 @@ def test_a_stage_without_light_or_camera(tmp_path: Path) -> None:
     with pytest.raises(
         TrilightError, match="/None: a light without an area; /Below: negative radiance"
     ):
-        read(tmp_path / "a.usda")
+        read_usd(tmp_path / "a.usda")
     UsdLux.DistantLight.Define(stage, "/Sun")
     stage.GetRootLayer().Export(str(tmp_path / "a.usda"))
     with pytest.raises(TrilightError, match=r"; 1 more of lights\)"):
-        read(tmp_path / "a.usda")
+        read_usd(tmp_path / "a.usda")
     lamps[0].CreateRadiusAttr(1.0)
     stage.GetRootLayer().Export(str(tmp_path / "a.usda"))
     assert any(
-        "binding of a material that is not there" in t for t in read(tmp_path / "a.usda").notes
+        "binding of a material that is not there" in t for t in read_usd(tmp_path / "a.usda").notes
     )
     found = edited(tmp_path, lambda stage: stage.RemovePrim("/W/cam"))
     assert found.scene.num_views == 1
@@ -190,8 +186,6 @@ PICTURE = np.array([[RED, GREEN], [BLUE, GREY]], np.uint8)
 """The top row first; the stage's floor has u along +X and v along -Y."""
 
 CORNERS = {(-0.5, -0.5): RED, (0.5, -0.5): GREEN, (-0.5, 0.5): BLUE, (0.5, 0.5): GREY}
-
-
 CODED = 0.005
 """Half a step of 8 sRGB-encoded bits is at most 0.0045 in linear light."""
 

@@ -4,6 +4,7 @@ import dataclasses
 import json
 from collections import Counter
 from collections.abc import Callable
+from contextlib import closing
 from pathlib import Path
 from typing import Any
 
@@ -32,6 +33,7 @@ from storage.records.texture import CONSTANT, MapSource, Texture
 from tests.columns_kit import COAT, WAVES, declared
 from tests.command_line import trilight
 from tests.for_each import case, for_each, with_folders
+from tests.pipeline.exchange.exchange_kit import edited_layer as edited
 from tests.pipeline.scenes.example_scenes import example_scene
 from tests.scenes_by_hand import FLOOR, LIGHT, tiny_scene
 from tests.sky_maps import as_sky, six_poles
@@ -40,15 +42,6 @@ from tests.textured_by_hand import number_texture, sky, textured_scene
 MATERIAL = f"/Scene/Materials/material_{FLOOR}"
 PREVIEW, OPENPBR = "/Preview.inputs:roughness", "/OpenPBR.inputs:specular_roughness"
 MOVE = np.array([1.0, 2.0, 3.0])
-
-
-def edited(tmp_path: Path, scene: Scene, edit: Callable[[Any], None]) -> LoadedScene:
-    """Return what is read after an edit of the layer that we wrote."""
-    write_usd(tmp_path / "a.usda", scene)
-    layer = Sdf.Layer.OpenAsAnonymous(str(tmp_path / "a.usda"))
-    edit(layer)
-    layer.Export(str(tmp_path / "b.usda"))
-    return read_usd(tmp_path / "b.usda")
 
 
 def as_blender_writes(layer: Any) -> None:
@@ -66,16 +59,16 @@ def as_blender_writes(layer: Any) -> None:
                     del shader.properties[name]
 
 
-def set_values(*edits: tuple[str, Any]) -> Callable[[Any], None]:
+Edit = Callable[[Any], None]
+
+
+def set_values(*edits: tuple[str, Any], besides: Edit = lambda layer: None) -> Edit:
     def edit(layer: Any) -> None:
         for path, value in edits:
             layer.GetAttributeAtPath(f"{MATERIAL}{path}").default = value
+        besides(layer)
 
     return edit
-
-
-def do_nothing(layer: Any) -> None:
-    pass
 
 
 def move_light(layer: Any) -> None:
@@ -132,21 +125,16 @@ def assert_changed(found: LoadedScene, scene: Scene, column: str, value: Any, pl
     assert f"the value of {place} is used" in said
 
 
-@for_each("besides", [do_nothing, move_light, as_blender_writes])
-def test_an_edit_changes_its_column_alone(tmp_path: Path, besides: Callable[[Any], None]) -> None:
+@for_each("besides", [set_values(), move_light, as_blender_writes])
+def test_an_edit_changes_its_column_alone(tmp_path: Path, besides: Edit) -> None:
     """Of each column in each place; Blender keeps what stands in the preview alone."""
     in_blender = besides is as_blender_writes
     kept = [e for e in EDITS if not in_blender or ("/Preview" in e[1] and e[0] != "specular")]
     assert len(kept) == 3 if in_blender else {e[0] for e in kept} == set(PUBLISHED_COLUMNS)
     for folder, (column, path, value, read, place) in with_folders(tmp_path, kept):
         with case(path):
-
-            def edit(layer: Any, path: str = path, value: Any = value) -> None:
-                set_values((path, value))(layer)
-                besides(layer)
-
-            scene = tiny_scene()
-            assert_changed(edited(folder, scene, edit), scene, column, read, place)
+            found = edited(folder, tiny_scene(), set_values((path, value), besides=besides))
+            assert_changed(found, tiny_scene(), column, read, place)
 
 
 def test_constants_beside_textures_are_read_where_they_were_changed(tmp_path: Path) -> None:
@@ -155,10 +143,8 @@ def test_constants_beside_textures_are_read_where_they_were_changed(tmp_path: Pa
     for folder, (column, path, value, _, place) in with_folders(tmp_path, constants):
         scene = textured_scene()
         found = edited(folder, scene, set_values((path, value)))
-        assert (
-            rows(found.scene)[:, COLUMNS[column][0]].tolist().count(pytest.approx(value, rel=1e-6))
-            == 2
-        )
+        values = rows(found.scene)[:, COLUMNS[column][0]].tolist()
+        assert values.count(pytest.approx(value, rel=1e-6)) == 2
         (said,) = [text for text in found.notes if " was changed since" in text]
         assert f"{column} was changed" in said and f"the value of {place} is used" in said
     found = edited(tmp_path, textured_scene(), set_values((".trilight:diffuseAlbedo", (0, 0, 0))))
@@ -256,7 +242,7 @@ def spoil(layer: Any) -> None:
     ],
 )
 def test_what_is_no_longer_so_is_said(
-    tmp_path: Path, edit: Callable[[Any], None], albedos: tuple[float, ...], said: str
+    tmp_path: Path, edit: Edit, albedos: tuple[float, ...], said: str
 ) -> None:
     found = edited(tmp_path, tiny_scene(), edit)
     assert rows(found.scene)[0, :6] == pytest.approx(albedos, rel=1e-6)
@@ -324,11 +310,8 @@ def run_blender(folder: Path, request: dict[str, Any]) -> NDArray[np.float32]:
 def ours(scene: Scene, resolution: int, spp: int) -> NDArray[np.float32]:
     """Return our picture [R, R, 3] of the first view."""
     limits = ChildLimits(memory_bytes=16 << 30, wall_s=1800, calls_per_child=1)
-    child = IsolatedChild(limits=limits, factory=activate, args=(choose_variant(),))
-    try:
+    with closing(IsolatedChild(limits=limits, factory=activate, args=(choose_variant(),))) as child:
         return child.call(render_shot, scene, fixed_samples(resolution, spp)).radiance_rgb
-    finally:
-        child.close()
 
 
 RESOLUTION, SPP = 48, 512

@@ -27,7 +27,7 @@ from storage.records.scene import Scene, SceneObject
 from storage.records.scene_file import encode_scene, scene_digest
 from storage.records.texture import MapSource, Texture
 from tests.for_each import for_each, with_folders
-from tests.pipeline.exchange.exchange_kit import assert_usd_keeps_all, errors_of
+from tests.pipeline.exchange.exchange_kit import assert_usd_keeps_all, edited_layer, errors_of
 from tests.pipeline.foreign.test_light_pictures import radiance_hdr
 from tests.scenes_by_hand import FLOOR, LIGHT, tiny_scene
 from tests.sky_maps import COLOURS, POLES, one_sun, six_poles, smooth
@@ -217,10 +217,6 @@ def set_default(path: str, value: Any) -> Callable[[Any], None]:
     return lambda layer: setattr(layer.GetObjectAtPath(path), "default", value)
 
 
-def add_light(layer: Any) -> None:
-    UsdLux.SphereLight.Define(Usd.Stage.Open(layer), "/Scene/Objects/more")
-
-
 @for_each(
     "edit",
     [
@@ -229,17 +225,13 @@ def add_light(layer: Any) -> None:
         set_default("/Scene/Cameras/camera_0.focalLength", 3.0),
         lambda layer: layer.GetObjectAtPath("/Scene/Objects/floor").SetInfo("active", False),
         lambda layer: layer.GetObjectAtPath("/Scene/Objects/floor").SetInfo("instanceable", True),
-        add_light,
+        lambda layer: UsdLux.SphereLight.Define(Usd.Stage.Open(layer), "/Scene/Objects/more"),
     ],
 )
 def test_what_was_changed_or_added_is_no_longer_ours(
     tmp_path: Path, edit: Callable[[Any], None]
 ) -> None:
-    write_usd(tmp_path / "a.usda", tiny_scene())
-    layer = Sdf.Layer.FindOrOpen(str(tmp_path / "a.usda"))
-    edit(layer)
-    layer.Export(str(tmp_path / "b.usda"))
-    assert read_usd(tmp_path / "b.usda").notes
+    assert edited_layer(tmp_path, tiny_scene(), edit).notes
 
 
 @pytest.mark.parametrize(
@@ -263,10 +255,6 @@ def test_what_is_not_written(tmp_path: Path, scene: Scene, name: str, message: s
     assert not list(tmp_path.iterdir())
 
 
-def _read(path: Path) -> LoadedScene:
-    return read_usd(path)
-
-
 def _sky(scene: Scene) -> Environment:
     assert scene.environment is not None
     return scene.environment
@@ -274,8 +262,7 @@ def _sky(scene: Scene) -> Environment:
 
 def test_a_normal_map_is_an_input_that_usd_defines(tmp_path: Path) -> None:
     scene = bumpy_scene()
-    write_usd(tmp_path / "a.usda", scene)
-    stage = Usd.Stage.Open(str(tmp_path / "a.usda"))
+    stage = written(tmp_path, scene, "a.usda")
     shader = UsdShade.Shader(stage.GetPrimAtPath(f"/Scene/Materials/material_{FLOOR}/Preview"))
     (source,) = UsdShade.Utils.GetValueProducingAttributes(shader.GetInput("normal"))
     node = UsdShade.Shader(source.GetPrim())
@@ -293,9 +280,7 @@ def test_other_programs_find_each_pole_where_we_have_it(tmp_path: Path) -> None:
     """By the convention of USD alone: the middle is +Z of the dome, a quarter +X, the top +Y."""
     turn = uniform_rotation(np.random.default_rng(2)).astype(np.float32)
     turned = six_poles(rotation=turn)
-    path = tmp_path / "a.usda"
-    write_usd(path, tiny_scene(environment=turned))
-    stage = Usd.Stage.Open(str(path))
+    stage = written(tmp_path, tiny_scene(environment=turned), "a.usda")
     dome = UsdLux.DomeLight(stage.GetPrimAtPath("/Scene/Environment"))
     matrix = dome.ComputeLocalToWorldTransform(Usd.TimeCode.Default())
     places = {
@@ -319,7 +304,7 @@ def edited(path: Path, edit: Callable[[Usd.Stage, UsdLux.DomeLight], object]) ->
     stage = Usd.Stage.Open(str(path))
     edit(stage, UsdLux.DomeLight(stage.GetPrimAtPath("/Scene/Environment")))
     stage.Save()
-    return _read(path)
+    return read_usd(path)
 
 
 @pytest.mark.parametrize("up", ["Y", "Z"])
@@ -414,7 +399,7 @@ def test_there_and_back_is_exact_and_valid(tmp_path: Path, suffix: str) -> None:
         path = folder / f"again{suffix}"
         before = path.read_bytes()
         assert usd_keys(path) == [""]
-        assert_usd_keeps_all(_read(path).scene, folder, suffix)
+        assert_usd_keeps_all(read_usd(path).scene, folder, suffix)
         assert path.read_bytes() == before
         has_files = suffix != ".usdz" and (scene.textures or scene.environment)
         assert (len(list(folder.iterdir())) > 1) == bool(has_files)
@@ -431,9 +416,7 @@ def test_other_programs_find_every_corner_where_we_have_it(tmp_path: Path) -> No
     """By the words of USD alone: `st` of a corner, v up, the top row of a picture at v = 1."""
     texels = np.array([[[200, 0, 0], [0, 200, 0]], [[0, 0, 200], [90, 90, 0]]], np.uint8)
     scene = textured_scene(0, Texture(texels=texels, is_srgb=True), number_texture())
-    path = tmp_path / "a.usda"
-    write_usd(path, scene)
-    stage = Usd.Stage.Open(str(path))
+    stage = written(tmp_path, scene, "a.usda")
     shader = UsdShade.Shader(stage.GetPrimAtPath("/Scene/Materials/material_0/DiffuseTexture"))
     assert shader.GetInput("sourceColorSpace").Get() == "sRGB"
     assert [shader.GetInput(f"wrap{axis}").Get() for axis in "ST"] == ["repeat", "repeat"]
@@ -447,8 +430,7 @@ def test_other_programs_find_every_corner_where_we_have_it(tmp_path: Path) -> No
 
 def test_renderers_of_materialx_get_the_textures_too(tmp_path: Path) -> None:
     """A textured material has no constant OpenPBR that they would prefer; others keep it."""
-    write_usd(tmp_path / "a.usda", textured_scene())
-    stage = Usd.Stage.Open(str(tmp_path / "a.usda"))
+    stage = written(tmp_path, textured_scene(), "a.usda")
     for row, expected in (
         (FLOOR, "UsdPreviewSurface"),
         (LIGHT, "ND_open_pbr_surface_surfaceshader"),
@@ -465,11 +447,11 @@ def test_files_that_were_changed_are_read_as_they_are_now(tmp_path: Path) -> Non
     shader = layer.GetPrimAtPath("/Scene/Materials/material_0/Preview")
     shader.attributes["inputs:diffuseColor"].connectionPathList.ClearEdits()
     layer.Export(str(tmp_path / "b.usda"))
-    assert _read(tmp_path / "b.usda").notes, "a connection was edited"
+    assert read_usd(tmp_path / "b.usda").notes, "a connection was edited"
     (picture,), (map_file,) = tmp_path.glob("texture-*.png"), tmp_path.glob("sky-*.exr")
     map_file.write_bytes(encode_channels({"RGB": np.full((2, 4, 3), 7, np.float32)}))
     Image.fromarray(np.full((4, 6, 3), 255, np.uint8)).save(picture)
-    found = _read(path)
+    found = read_usd(path)
     assert any("diffuse was changed since" in text for text in found.notes)
     assert (_sky(found.scene).radiance_rgb == 7).all()
 

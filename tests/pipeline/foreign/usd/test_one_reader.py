@@ -10,7 +10,6 @@ from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 from pxr import Gf, Sdf, Usd, UsdGeom, UsdLux, UsdShade, UsdSkel, Vt
 
-from pipeline.exchange.textured_triangles import LoadedScene
 from pipeline.exchange.usd.read_usd import read_usd
 from pipeline.foreign.material import source_columns
 from pipeline.foreign.source_file import read_source
@@ -19,6 +18,7 @@ from storage.errors import Rejected, TrilightError
 from storage.records.material import DIFFUSE, EMISSION, ROUGHNESS
 from tests.for_each import for_each
 from tests.pipeline.assets.source_materials.textured_kit import KEEP, F, new_stage
+from tests.pipeline.exchange.exchange_kit import mesh
 
 POINTS = ((0, 0, 0), (1, 0, 0), (0, 2, 0), (0, 0, 3))
 SIDES = ((0, 2, 1), (0, 1, 3), (0, 3, 2), (1, 2, 3))
@@ -67,12 +67,8 @@ def diffuse_of(rgb: Any) -> tuple[float, ...]:
     return tuple(rounded(np.array(rgb) * (1 - F)).tolist())
 
 
-def read(path: Path) -> LoadedScene:
-    return read_usd(path)
-
-
 def of_scene(path: Path) -> Looks:
-    scene = read(path).scene
+    scene = read_usd(path).scene
     rows = scene.materials[scene.material_index]
     own = ~rows[:, EMISSION].any(axis=1)
     corners = scene.vertex_positions[scene.faces][own]
@@ -80,12 +76,7 @@ def of_scene(path: Path) -> Looks:
 
 
 def solid(stage: Usd.Stage, path: str) -> UsdGeom.Mesh:
-    made = UsdGeom.Mesh.Define(stage, path)
-    made.CreatePointsAttr([Gf.Vec3f(*point) for point in POINTS])
-    made.CreateFaceVertexCountsAttr([3] * 4)
-    made.CreateFaceVertexIndicesAttr(np.ravel(SIDES).tolist())
-    made.CreateSubdivisionSchemeAttr("none")
-    return made
+    return mesh(stage, path, POINTS, [3] * 4, np.ravel(SIDES).tolist())
 
 
 def saved(stage: Usd.Stage, path: Path) -> Path:
@@ -177,17 +168,17 @@ def computed(stage: Usd.Stage) -> Counter[Row]:
     found, time = Counter[Row](), Usd.TimeCode.Default()
     unit = UsdGeom.GetStageMetersPerUnit(stage)
     for prim in Usd.PrimRange.Stage(stage, Usd.TraverseInstanceProxies()):
-        mesh = UsdGeom.Mesh(prim)
-        if not mesh or mesh.ComputeVisibility() == "invisible":
+        shape = UsdGeom.Mesh(prim)
+        if not shape or shape.ComputeVisibility() == "invisible":
             continue
-        if mesh.ComputePurpose() not in ("default", "render"):
+        if shape.ComputePurpose() not in ("default", "render"):
             continue
-        place = mesh.ComputeLocalToWorldTransform(time)
+        place = shape.ComputeLocalToWorldTransform(time)
         points = np.array([place.Transform(Gf.Vec3d(*point)) for point in POINTS]) * unit
         if UsdGeom.GetStageUpAxis(stage) == "Y":
             points = points[:, [0, 2, 1]] * [1, -1, 1]
         turned = place.GetDeterminant() < 0
-        step = -1 if turned != (mesh.GetOrientationAttr().Get() == "leftHanded") else 1
+        step = -1 if turned != (shape.GetOrientationAttr().Get() == "leftHanded") else 1
         found.update(as_row(points[list(side)[::step]]) for side in SIDES)
     return found
 
@@ -288,7 +279,7 @@ def test_prototypes_stand_anywhere(tmp_path: Path, specifier: Any) -> None:
     assert of_object(path) == of_scene(path)
     many.CreatePositionsAttr([(0, 0, 0)])
     with pytest.raises(TrilightError, match="not as many as its 4 protoIndices"):
-        read(saved(stage, tmp_path / "b.usda"))
+        read_usd(saved(stage, tmp_path / "b.usda"))
 
 
 def posed(folder: Path, *, on_mesh: bool = False, instanced: bool = False) -> Path:
@@ -372,7 +363,7 @@ def test_cases(shared: Path, tmp_path: Path) -> None:
         path = saved(stage, tmp_path / "a.usda")
         if case.stem == "skinned":
             with pytest.raises(TrilightError, match="its animation is bound to the mesh"):
-                read(path)
+                read_usd(path)
             continue
         scene = of_scene(path)
         assert scene == of_object(path), case.stem
@@ -388,9 +379,9 @@ def test_a_dome_turns_with_its_pole_and_what_is_not_read_is_named(tmp_path: Path
     stage = new_stage()
     solid(stage, "/W/a")
     UsdLux.DomeLight_1.Define(stage, "/old").GetPrim().SetTypeName("DomeLight")
-    plain = read(saved(stage, tmp_path / "a.usda")).scene.environment
+    plain = read_usd(saved(stage, tmp_path / "a.usda")).scene.environment
     stage.GetPrimAtPath("/old").SetTypeName("DomeLight_1")  # of a stage with +Z up
-    turned = read(saved(stage, tmp_path / "b.usda")).scene.environment
+    turned = read_usd(saved(stage, tmp_path / "b.usda")).scene.environment
     assert plain is not None and turned is not None
     up = np.array([[1, 0, 0], [0, 0, -1], [0, 1, 0]])
     assert turned.rotation == pytest.approx(np.einsum("ij,jk->ik", up, plain.rotation), abs=1e-6)
@@ -407,4 +398,4 @@ def test_a_dome_turns_with_its_pole_and_what_is_not_read_is_named(tmp_path: Path
     for word in (*words, "1 x RectLight"):
         assert any(word in note for note in unread), word
     for word in (*words, "inputs:diffuse", "cone:angle"):
-        assert any(word in note for note in read(path).notes), word
+        assert any(word in note for note in read_usd(path).notes), word

@@ -19,9 +19,9 @@ from tests.scenes_by_hand import tiny_scene
 HEAD = "#usda 1.0\n"
 
 
-def prims_of(path: Path) -> list[str]:
-    with read_quietly(path):
-        stage = OpenedStage(path).compose()
+def prims_of(opened: OpenedStage) -> list[str]:
+    with read_quietly(opened.path):
+        stage = opened.compose()
     return [str(prim.GetPath()) for prim in stage.Traverse()]
 
 
@@ -59,7 +59,7 @@ def test_refused_in_one_line(
     (folder / "link.usda").symlink_to(tmp_path / "x.usda")
     (folder / "file.usda").write_text(HEAD + text)
     with pytest.raises(TrilightError, match=message) as caught:
-        prims_of(folder / "file.usda")
+        prims_of(OpenedStage(folder / "file.usda"))
     assert "\n" not in str(caught.value) and str(tmp_path) not in str(caught.value)
     assert str(caught.value).startswith("file.usda: ")
 
@@ -82,9 +82,7 @@ def test_brackets_in_the_name_of_a_folder_are_no_archive(tmp_path: Path, packed:
             (folder / name).write_text(text)
         assert asset_bytes(f"{folder}/lib.usda", 100) == layers["lib.usda"].encode()
     opened = OpenedStage(folder / ("s.usdz" if packed else "s.usda"))
-    with read_quietly(opened.path):
-        stage = opened.compose()
-    assert [str(prim.GetPath()) for prim in stage.Traverse()] == ["/x", "/x/L"]
+    assert prims_of(opened) == ["/x", "/x/L"]
     assert opened.files == [opened.path, *([] if packed else [folder / "lib.usda"])]
 
 
@@ -110,14 +108,13 @@ def test_the_user_may_name_the_folder_and_the_stage_is_compared_with_it_at_last(
     assert len(list(stage.Traverse())) == 1
     monkeypatch.setattr(OpenedStage, "_open_all", lambda self: None)
     with pytest.raises(TrilightError, match="uses 'shared.usda' of another folder"):
-        prims_of(folder / "a.usda")
+        prims_of(OpenedStage(folder / "a.usda"))
 
 
 def test_what_is_missing_is_noted(tmp_path: Path) -> None:
     (tmp_path / "a.usda").write_text(f'{HEAD}def "A" (references = @./no.usda@</A>) {{}}')
     opened = OpenedStage(tmp_path / "a.usda")
-    with read_quietly(opened.path):
-        opened.compose()
+    prims_of(opened)
     assert opened.lost == ["file './no.usda' is missing"]
 
 
@@ -187,7 +184,7 @@ def test_what_arcs_multiply_is_left(
     (tmp_path / "lib.usda").write_text(f'{HEAD}class "_c" {{}}\ndef "A" (inherits = </_c>) {{}}')
     (tmp_path / "bomb.usda").write_text(text)
     with pytest.raises(TrilightError, match=message):
-        prims_of(tmp_path / "bomb.usda")
+        prims_of(OpenedStage(tmp_path / "bomb.usda"))
 
 
 def test_exactly_what_composition_makes_is_counted(
@@ -199,10 +196,10 @@ def test_exactly_what_composition_makes_is_counted(
         'def "R" (inherits = </Q>) {\nover "c" {\ndef "d" {}\n}\n}\n'
     )
     monkeypatch.setattr(opening, "MAX_PRIMS", 17)  # with the root of all
-    assert len(prims_of(tmp_path / "b.usda")) == 16
+    assert len(prims_of(OpenedStage(tmp_path / "b.usda"))) == 16
     monkeypatch.setattr(opening, "MAX_PRIMS", 16)
     with pytest.raises(TrilightError, match="more than 16 prims"):
-        prims_of(tmp_path / "b.usda")
+        prims_of(OpenedStage(tmp_path / "b.usda"))
 
 
 def test_instances_of_one_prototype_count_once(
@@ -214,7 +211,7 @@ def test_instances_of_one_prototype_count_once(
     )
     (tmp_path / "i.usda").write_text(f'{HEAD}def "P" {{\n{inner}}}\n{heirs}')
     monkeypatch.setattr(opening, "MAX_PRIMS", 1 + 51 + 50 + 50)
-    prims_of(tmp_path / "i.usda")
+    prims_of(OpenedStage(tmp_path / "i.usda"))
 
 
 def stage_of(prototype: str, count: int) -> Usd.Stage:
