@@ -5,7 +5,6 @@ The test of a file is where its name says: tests/a/b/test_c.py tests a/b/c.py.
 
 import ast
 import re
-import subprocess
 import sys
 from collections import defaultdict
 from collections.abc import Iterator
@@ -15,6 +14,7 @@ from pathlib import Path
 import pytest
 
 from infra.setup import wheel_tree
+from tests.command_line import run_program
 from tests.conftest import ROOT
 
 PACKAGES = ("trilight", *wheel_tree.PACKAGES)
@@ -158,9 +158,7 @@ def test_every_module_says_what_it_is() -> None:
 
 
 def test_layers_hold() -> None:
-    command = [str(Path(sys.executable).parent / "lint-imports"), "--no-cache"]
-    result = subprocess.run(command, cwd=ROOT, capture_output=True, text=True, check=False)
-    assert result.returncode == 0, result.stdout
+    run_program([Path(sys.executable).parent / "lint-imports", "--no-cache"])
 
 
 def test_packages_are_ours() -> None:
@@ -172,9 +170,7 @@ def test_packages_are_ours() -> None:
 
 
 def test_the_top_level_holds_what_the_design_names() -> None:
-    tracked = subprocess.run(
-        ["git", "ls-files"], cwd=ROOT, capture_output=True, text=True, check=False
-    ).stdout
+    tracked = run_program(["git", "ls-files"]).stdout
     allowed = {
         *PACKAGES, "tests", "docs", "examples", "requirements", "README.md", "LICENSE",
         "CONTRIBUTING.md", "DECISIONS.md", "MANIFEST.in", "Makefile", "pyproject.toml",

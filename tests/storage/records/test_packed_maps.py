@@ -12,6 +12,7 @@ from collections.abc import Callable, Iterator
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager
 from typing import Any
+from unittest import mock
 
 import numpy as np
 import pytest
@@ -276,16 +277,12 @@ def test_equal_members_give_equal_samples_with_and_without_what_is_held() -> Non
 
 
 def test_a_map_is_unpacked_once(monkeypatch: pytest.MonkeyPatch) -> None:
-    members, unpacked = encode_sample(textured_sample(KEY)), list[str]()
-    values = packed_maps._PackedMap.values
-
-    def counted(packed: packed_maps._PackedMap) -> np.ndarray:
-        unpacked.append(packed.name)
-        return values(packed)
-
-    monkeypatch.setattr(packed_maps._PackedMap, "values", counted)
+    members, values = encode_sample(textured_sample(KEY)), packed_maps._PackedMap.values
+    unpack: Any = mock.create_autospec(values, side_effect=values)
+    monkeypatch.setattr(packed_maps._PackedMap, "values", unpack)
     held = HeldMaps()
     scenes = [decode_sample(KEY, members, held).scene for _ in range(3)]
+    unpacked = [each.args[0].name for each in unpack.call_args_list]
     assert len(unpacked) == len(set(unpacked)) == 3
     one, other = scenes[0].textures[0], scenes[2].textures[0]
     assert one.texels is other.texels

@@ -9,12 +9,12 @@ import hashlib
 import json
 import os
 import shutil
-import subprocess
 import sys
 from collections.abc import Iterator
 from http import HTTPStatus
 from pathlib import Path
 from typing import Any
+from unittest import mock
 from urllib.parse import parse_qs, unquote
 
 import pytest
@@ -34,7 +34,7 @@ from storage.remote import url as remote_url
 from storage.remote.retries import with_tries
 from storage.remote.store import LocalStore, RemoteStore, Store
 from storage.remote.url import RemoteUrl
-from tests.conftest import ROOT
+from tests.command_line import run_program
 from tests.for_each import for_each
 from tests.http_server import Handler, running
 from tests.pipeline.generation.bucket_kit import empty_bucket
@@ -237,9 +237,7 @@ def test_places_that_cannot_be_written_are_refused_by_name(out: str, message: st
 
 
 def test_a_full_disk_may_pass_whichever_way_the_bytes_go() -> None:
-    def full() -> None:
-        raise OSError(errno.ENOSPC, "No space left on device")
-
+    full = mock.Mock(side_effect=OSError(errno.ENOSPC, "No space left on device"))
     with pytest.raises(EnvironmentFailure, match="^the disk is full. What was finished is safe"):
         with_tries(full)
 
@@ -315,15 +313,8 @@ def hub(local: Dataset) -> Iterator[str]:
 def run(hub: str, cache: Path, *arguments: str) -> tuple[list[list[str]], list[str], list[int]]:
     """Run READ in a process that knows this hub; returns its bad shards, samples and sizes."""
     code = f"import json, sys\n{READ}\nprint(json.dumps([verified, read, replaced]))"
-    ran = subprocess.run(
-        [sys.executable, "-c", code, DATASET, *arguments],
-        cwd=ROOT,
-        env={**os.environ, "HF_ENDPOINT": hub, "HF_HOME": str(cache.parent / "hub")},
-        capture_output=True,
-        text=True,
-        check=False,
-    )
-    assert ran.returncode == 0, ran.stderr
+    words = [sys.executable, "-c", code, DATASET, *arguments]
+    ran = run_program(words, HF_ENDPOINT=hub, HF_HOME=str(cache.parent / "hub"))
     verified, read, replaced = json.loads(ran.stdout)
     return verified, read, replaced
 
