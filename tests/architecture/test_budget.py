@@ -6,12 +6,12 @@
 import ast
 import io
 import json
-import subprocess
 import sys
 import tokenize
 from collections import Counter
 
 from infra.setup.generated_pages import every_command
+from tests.command_line import run_program
 from tests.conftest import BUDGET, ROOT
 
 PROGRAMS = (".py", ".js", ".html", ".jinja", ".css", ".sh", ".sbatch")
@@ -30,9 +30,7 @@ _NO_CODE = {
 
 
 def _tracked() -> list[str]:
-    listed = subprocess.run(
-        ["git", "ls-files", "-z"], cwd=ROOT, capture_output=True, text=True, check=True
-    )
+    listed = run_program(["git", "ls-files", "-z"])
     return [name for name in listed.stdout.split("\0") if name and (ROOT / name).is_file()]
 
 

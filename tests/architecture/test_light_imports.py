@@ -1,10 +1,9 @@
 """What must start fast must not load what is heavy; looked at step by step in a fresh process."""
 
 import json
-import subprocess
 import sys
 
-from tests.conftest import ROOT
+from tests.command_line import run_program
 
 HEAVY = {"torch", "mitsuba", "pxr", "prefect", "trimesh", "pymeshlab", "webdataset", "matplotlib"}
 CHECKERS = {"pydantic", "prefect", "mitsuba", "pxr"}
@@ -42,11 +41,8 @@ def _loaded_after(*statements: str, then: tuple[str, ...] = ()) -> list[set[str]
     told = "print(json.dumps(sorted({name.partition('.')[0] for name in sys.modules})))"
     lines = [line for statement in statements for line in (statement, told)]
     code = "\n".join(["import sys, json", *lines, *then])
-    result = subprocess.run(
-        [sys.executable, "-c", code], cwd=ROOT, capture_output=True, text=True, check=False
-    )
-    assert result.returncode == 0, result.stderr
-    return [set(json.loads(line)) for line in result.stdout.splitlines()]
+    lines = run_program([sys.executable, "-c", code]).stdout.splitlines()
+    return [set(json.loads(line)) for line in lines]
 
 
 def test_nothing_heavy_is_loaded_before_it_is_used() -> None:

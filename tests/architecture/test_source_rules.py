@@ -1,8 +1,10 @@
-"""The house rules that a machine can hold: size of files and functions, layers, stray words."""
+"""The house rules that a machine can hold: size of files and functions, layers, stray words.
+
+The test of a file is where its name says: tests/a/b/test_c.py tests a/b/c.py.
+"""
 
 import ast
 import re
-import subprocess
 import sys
 from collections import defaultdict
 from collections.abc import Iterator
@@ -12,6 +14,7 @@ from pathlib import Path
 import pytest
 
 from infra.setup import wheel_tree
+from tests.command_line import run_program
 from tests.conftest import ROOT
 
 PACKAGES = ("trilight", *wheel_tree.PACKAGES)
@@ -155,9 +158,7 @@ def test_every_module_says_what_it_is() -> None:
 
 
 def test_layers_hold() -> None:
-    command = [str(Path(sys.executable).parent / "lint-imports"), "--no-cache"]
-    result = subprocess.run(command, cwd=ROOT, capture_output=True, text=True, check=False)
-    assert result.returncode == 0, result.stdout
+    run_program([Path(sys.executable).parent / "lint-imports", "--no-cache"])
 
 
 def test_packages_are_ours() -> None:
@@ -169,9 +170,7 @@ def test_packages_are_ours() -> None:
 
 
 def test_the_top_level_holds_what_the_design_names() -> None:
-    tracked = subprocess.run(
-        ["git", "ls-files"], cwd=ROOT, capture_output=True, text=True, check=False
-    ).stdout
+    tracked = run_program(["git", "ls-files"]).stdout
     allowed = {
         *PACKAGES, "tests", "docs", "examples", "requirements", "README.md", "LICENSE",
         "CONTRIBUTING.md", "DECISIONS.md", "MANIFEST.in", "Makefile", "pyproject.toml",
@@ -204,3 +203,33 @@ def test_next_steps_are_printed_in_one_place() -> None:
         if re.search(r"Next(?: step)?:", path.read_text())
     }
     assert found == {"infra/cli/console.py", "infra/serving/local.py"}
+
+
+TESTS = ROOT / "tests"
+BESIDE = {"architecture", "end_to_end", "extremes", "hostile", "laws", "references"}
+"""Folders of tests that are about no single file."""
+
+
+def _tests() -> list[Path]:
+    found = (path.relative_to(TESTS) for path in TESTS.rglob("test_*.py"))
+    return sorted(path for path in found if path.parts[0] not in BESIDE)
+
+
+def test_every_folder_of_tests_is_a_folder_of_the_product() -> None:
+    folders = {path.parent for path in _tests()}
+    assert len(folders) > 20, "the walk finds the tests"
+    assert [str(folder) for folder in folders if not (ROOT / folder).is_dir()] == []
+
+
+def test_a_test_that_is_named_for_a_file_is_at_its_place() -> None:
+    """A name that several files of a package have says which by its place."""
+    places = defaultdict[tuple[str, str], set[Path]](set)
+    for package in PACKAGES:
+        for path in (ROOT / package).rglob("*.py"):
+            places[package, path.stem].add(path.relative_to(ROOT).parent)
+    misplaced = {}
+    for test in _tests():
+        wanted = places[test.parts[0], test.stem.removeprefix("test_")]
+        if wanted and test.parent not in wanted:
+            misplaced[str(test)] = sorted(map(str, wanted))
+    assert misplaced == {}

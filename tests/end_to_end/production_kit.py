@@ -21,6 +21,7 @@ from pathlib import Path
 
 import pytest
 
+from tests.command_line import run_program
 from tests.conftest import ROOT
 
 SERVERS = (ROOT / "docs/how-to/servers-and-clusters.md").read_text()
@@ -175,10 +176,7 @@ def served(
 
 def copy_of_the_project(folder: Path) -> None:
     """Copy what git tracks, and lend the environment: set-up is proved elsewhere (study S64)."""
-    listed = subprocess.run(
-        ["git", "ls-files", "-z"], cwd=ROOT, capture_output=True, text=True, check=True
-    ).stdout
-    for name in filter(None, listed.split("\0")):
+    for name in filter(None, run_program(["git", "ls-files", "-z"]).stdout.split("\0")):
         target = folder / name
         target.parent.mkdir(parents=True, exist_ok=True)
         shutil.copy2(ROOT / name, target)

@@ -4,9 +4,9 @@ import csv
 import dataclasses
 import json
 import shutil
-from collections.abc import Callable
 from pathlib import Path
 from typing import Any
+from unittest import mock
 
 import numpy as np
 import pytest
@@ -138,26 +138,17 @@ def test_nothing_is_judged_twice_and_what_changed_is_judged_again(
     asked = dataclasses.replace(short, pictures=(mine,))
     before = board_of(asked)
     lines = (asked.out / "rows.jsonl").read_text().splitlines()
-    judged: list[Any] = []
-    real = board_module.picture_scores
-    monkeypatch.setattr(board_module, "picture_scores", counted(real, judged))
-    assert board_of(asked).widths == before.widths and judged == []
+    judged = mock.Mock(wraps=board_module.picture_scores)
+    monkeypatch.setattr(board_module, "picture_scores", judged)
+    assert board_of(asked).widths == before.widths and not judged.called
     assert (asked.out / "rows.jsonl").read_text().splitlines() == lines
     name = sorted(path.name for path in mine.glob("*.exr"))[-1]  # the scene before is not judged
     (mine / "000000003_view_0.exr").write_bytes((mine / name).read_bytes())
     board_of(asked)
-    assert len(judged) == VIEWS, "one picture is another: its scene is judged again"
+    assert judged.call_count == VIEWS, "one picture is another: its scene is judged again"
     board_of(dataclasses.replace(asked, scenes=3))
     scenes = {json.loads(line).get("scene") for line in (asked.out / "rows.jsonl").open()}
     assert len(scenes - {None}) == 3
-
-
-def counted(real: Callable[..., Any], calls: list[Any]) -> Callable[..., Any]:
-    def score(*words: Any) -> Any:
-        calls.append(words)
-        return real(*words)
-
-    return score
 
 
 def test_a_set_without_training_split_looks_up_its_other_scenes(

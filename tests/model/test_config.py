@@ -6,6 +6,7 @@ What is rounded, recomputed or packed gives what it gave, as near as is said.
 import copy
 import dataclasses
 import math
+from unittest import mock
 
 import numpy as np
 import pytest
@@ -339,21 +340,16 @@ def test_rounding_together_changes_no_bit(
     model = awake(tiny_config(family), dtype=torch.float32)
     model.recompute_activations(recompute)
     batch = batch_of(3, 5, dtype=torch.float32)
-    rounded: list[int] = []
-    together = precision._copy_as
-
-    def counted(tensors: tuple[Tensor, ...], to: torch.dtype) -> tuple[Tensor, ...]:
-        rounded.append(len(tensors))
-        return together(tensors, to)
+    rounded = mock.Mock(wraps=precision._copy_as)
 
     @torch.autocast("cpu", torch.bfloat16)
     def results() -> dict[str, Tensor]:
         return picture_and_gradients(model, batch)
 
-    monkeypatch.setattr(precision, "_copy_as", counted)
+    monkeypatch.setattr(precision, "_copy_as", rounded)
     found = results()
     layers = len(model.encoder.layers) + len(model.decoder.layers) + (family == "dpt")
-    assert len(rounded) == 2 * layers, "once forth and once back for each layer, and the head"
+    assert rounded.call_count == 2 * layers, "once forth and once back for each layer, and the head"
     monkeypatch.setattr(precision, "_round_together", lambda *_: {})
     alone = results()
     assert found.keys() == alone.keys()
@@ -361,8 +357,9 @@ def test_rounding_together_changes_no_bit(
         assert torch.equal(value, alone[name]), name
 
 
-def test_every_triangle_carries_its_own_vertices_normals_and_material() -> None:
+def test_every_triangle_carries_its_own_and_shares_no_memory_with_the_scene() -> None:
     scene = toy_scene(0)
+    before = {name: getattr(scene, name).copy() for name in ARRAY_FIELDS}
     tensors = scene_tensors(scene)
     assert tensors.num_triangles == scene.num_triangles
     assert tensors.num_views == scene.num_views
@@ -376,14 +373,8 @@ def test_every_triangle_carries_its_own_vertices_normals_and_material() -> None:
         # emission of 20 through a float32 logarithm
         np.testing.assert_allclose(emission, material[EMISSION], atol=1e-4)
     assert tensors.material_TM.shape[1] == material_width()
-    assert all(value.dtype == torch.float32 for value in tensors_of(tensors).values())
-
-
-def test_the_scene_stays_as_it_was_and_shares_no_memory() -> None:
-    scene = toy_scene(1)
-    before = {name: getattr(scene, name).copy() for name in ARRAY_FIELDS}
-    tensors = scene_tensors(scene)
     for value in tensors_of(tensors).values():
+        assert value.dtype == torch.float32
         value.fill_(-1)
     for name, array in before.items():
         np.testing.assert_array_equal(getattr(scene, name), array, err_msg=name)

@@ -295,27 +295,19 @@ def with_albedos(scene: Scene, diffuse: float, specular: float) -> Scene:
     return dataclasses.replace(scene, materials=materials)
 
 
-def test_one_ray_a_pixel_sees_the_albedo_that_the_pixel_sees_first() -> None:
-    scene = corner()
-    one_ray = dataclasses.replace(DEMODULATED, hit_rays=1)
-    seen = with_traced(scene_tensors(scene), 32, one_ray).albedo_VRR6
-    assert seen is not None
+def test_one_ray_sees_the_albedo_that_its_pixel_sees_first_and_rays_are_averaged() -> None:
+    """Four rays of a pixel are those of four pixels of a picture twice as wide."""
+    scene, one_ray = corner(), dataclasses.replace(DEMODULATED, hit_rays=1)
+    fine = with_traced(scene_tensors(scene), 32, one_ray).albedo_VRR6
+    coarse = with_traced(scene_tensors(scene), 16, DEMODULATED).albedo_VRR6
+    assert fine is not None and coarse is not None
     found = first_hits(scene, view=0, resolution=32)
     materials = np.append(scene.materials[scene.material_index], np.zeros((1, 10)), axis=0)
     expected = materials[np.where(found.met, found.triangle, -1)]
     expected = np.concatenate([expected[..., DIFFUSE], expected[..., SPECULAR]], axis=-1)
-    differs = (np.abs(seen[0].numpy() - expected) > 1e-6).any(axis=-1)
+    differs = (np.abs(fine[0].numpy() - expected) > 1e-6).any(axis=-1)
     # rays of single precision pass some edges on the other side
     assert differs.mean() < 0.005 and found.met.any() and not found.met.all()
-
-
-def test_rays_of_a_pixel_are_averaged() -> None:
-    """Four rays of a pixel are those of four pixels of a picture twice as wide."""
-    tensors = scene_tensors(corner())
-    coarse = with_traced(tensors, 16, DEMODULATED).albedo_VRR6
-    one_ray = dataclasses.replace(DEMODULATED, hit_rays=1)
-    fine = with_traced(tensors, 32, one_ray).albedo_VRR6
-    assert coarse is not None and fine is not None
     mean = fine.unflatten(2, (16, 2)).unflatten(1, (16, 2)).mean(dim=(2, 4))
     # rays through one place, rounded otherwise, may pass an edge on the other side
     assert ((coarse - mean).abs() > 1e-5).any(dim=-1).double().mean() < 0.01

@@ -73,14 +73,6 @@ def test_round_trip_is_exact_and_reproducible(head: str) -> None:
     assert encode_weights(again) == data
 
 
-def test_a_file_without_a_whole_configuration_is_refused() -> None:
-    tensors = load(encode_weights(awake(tiny_config(), torch.float32)))
-    with pytest.raises(TrilightError, match="the file has no trilight_model entry"):
-        decode_weights(save(tensors))
-    with pytest.raises(TrilightError, match="width is missing"):
-        decode_weights(save(tensors, metadata={CONFIG_KEY: "{}"}))
-
-
 def test_equal_networks_give_equal_bytes_in_any_process() -> None:
     """Ten writings: the library shuffles two entries of metadata, half of the times."""
     model = awake(tiny_config("linear"), torch.float32)
@@ -90,8 +82,8 @@ def test_equal_networks_give_equal_bytes_in_any_process() -> None:
     assert list(header) == sorted(header) and len(header) == 2
 
 
-def test_removed_settings_are_refused_where_they_are_used() -> None:
-    """And load where they meant none."""
+def test_removed_settings_are_refused_where_they_are_used_and_no_configuration_always() -> None:
+    """Removed settings load where they meant none."""
     data = encode_weights(awake(tiny_config(), torch.float32))
 
     def stating(**fields: int) -> bytes:
@@ -104,6 +96,10 @@ def test_removed_settings_are_refused_where_they_are_used() -> None:
         message = f"^network: model.{name} is {value}: removed since, and commit {LAST_COMMIT} is"
         with pytest.raises(TrilightError, match=message):
             decode_weights(stating(**{name: value}))
+    with pytest.raises(TrilightError, match="the file has no trilight_model entry"):
+        decode_weights(save(load(data)))
+    with pytest.raises(TrilightError, match="width is missing"):
+        decode_weights(save(load(data), metadata={CONFIG_KEY: "{}"}))
 
 
 @pytest.fixture
@@ -168,7 +164,7 @@ def test_a_name_that_is_plainly_a_path_asks_no_hub(monkeypatch: pytest.MonkeyPat
             find_network(name)
 
 
-def test_a_hub_that_does_not_answer_is_one_line(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_hub_or_library_that_does_not_answer_is_one_line(monkeypatch: pytest.MonkeyPatch) -> None:
     def download(repo_id: str, filename: str, local_files_only: bool) -> str:
         assert local_files_only  # else the library tries for half a minute, line by line
         raise OSError("not in the cache")
@@ -177,9 +173,6 @@ def test_a_hub_that_does_not_answer_is_one_line(monkeypatch: pytest.MonkeyPatch)
     with pytest.raises(TrilightError, match=r"the hub did not give it \(no route to host\)") as got:
         open_network(PUBLISHED[0])
     assert "\n" not in str(got.value)
-
-
-def test_without_the_hub_library_the_way_out_is_named(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setitem(sys.modules, "huggingface_hub", None)
     with pytest.raises(TrilightError, match="huggingface_hub, which would fetch it, is not"):
         open_network(PUBLISHED[0])
@@ -224,13 +217,17 @@ NAMES = tuple(name for name in BUILTIN_NETWORKS if name != BUILTIN)
 
 
 @for_each("name", NAMES)
-def test_the_card_is_of_these_weights(name: str) -> None:
+def test_a_shipped_file_is_that_of_its_card_and_is_written_again_byte_for_byte(name: str) -> None:
+    """A field of the configuration that came later must not change what older networks are."""
     file = BUILTIN_NETWORKS[name]
     weights, card = file.read_bytes(), file.with_name("README.md").read_text()
     assert len(weights) <= MOST_BYTES
     assert f"{len(weights)} bytes, sha256 `{sha256_hex(weights)}`" in card
     (stated,) = re.findall(r"size: (\d+) parameters", card)
     assert count_parameters(open_network(name)) == int(stated)
+    tensors, metadata = read_tensors(file)
+    network = from_tensors(tensors, metadata)
+    assert encode_weights(network, trained_range(metadata)) == weights
 
 
 def test_a_name_that_does_not_come_along_is_said_and_the_better_one_needs_none() -> None:
@@ -252,15 +249,6 @@ def test_it_renders_by_its_name_and_knows_its_range(name: str) -> None:
     notes = renderer.resolution_notes(128)
     assert renderer.resolution_notes(64) == ()
     assert ["trained on 64" in note for note in notes] == [True] * (name == BUILTIN_TOKENS)
-
-
-@for_each("name", NAMES)
-def test_its_file_is_written_again_byte_for_byte(name: str) -> None:
-    """A field of the configuration that came later must not change what older networks are."""
-    tensors, metadata = read_tensors(BUILTIN_NETWORKS[name])
-    network = from_tensors(tensors, metadata)
-    again = encode_weights(network, trained_range(metadata))
-    assert again == BUILTIN_NETWORKS[name].read_bytes()
 
 
 SWIN_LARGE: dict[str, Any] = {
@@ -461,22 +449,18 @@ def test_outputs_are_the_published_ones(reference: Path, capsys: pytest.CaptureF
     assert "passes" in printed
 
 
-@for_each("place", [0, -1])
-def test_a_pixel_that_differs_is_in_both_differences(
-    base: Path, tmp_path: Path, place: int
+def test_a_pixel_that_differs_is_in_both_differences_and_nan_fails(
+    base: Path, tmp_path: Path, capsys: pytest.CaptureFixture
 ) -> None:
     """In the first or the last scene: neither comparison may stop at the other's result."""
     name = "output.log10_radiance_bvchw"
-    expected = load_file(base)[name].float()
-    expected[(place,) * 5] += 1e-6
-    path = changed(base, tmp_path, name, expected)
-    found = differences(Path(path))
-    assert found["padded"] > TOLERANCE and found["unpadded"] > TOLERANCE and main([path]) == 1
-
-
-def test_the_command_fails_on_nan(
-    base: Path, tmp_path: Path, capsys: pytest.CaptureFixture
-) -> None:
+    for place in (0, -1):
+        expected = load_file(base)[name].float()
+        expected[(place,) * 5] += 1e-6
+        path = changed(base, tmp_path, name, expected)
+        found = differences(Path(path))
+        assert found["padded"] > TOLERANCE and found["unpadded"] > TOLERANCE and main([path]) == 1
+    capsys.readouterr()
     name = "param.view_transformer.out_dpt.scratch.output_conv2.2.bias"
     assert main([changed(base, tmp_path, name, torch.full((3,), torch.nan))]) == 1
     assert "FAILS" in capsys.readouterr().out

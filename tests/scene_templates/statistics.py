@@ -6,13 +6,14 @@ plausible if none falls below LEVEL.
 """
 
 from collections.abc import Callable, Hashable, Iterable, Mapping, Sequence
-from typing import Any, TypeVar
+from typing import Any, ParamSpec, TypeVar
+from unittest import mock
 
 import numpy as np
 from numpy.typing import ArrayLike
 from scipy import stats
 
-from scene_templates.recorded_sampler import RecordedDraw
+from scene_templates.recorded_sampler import RecordedDraw, RecordedSampler
 
 FALSE_ALARM = 1e-6
 """Probability that any p-value of the whole suite falls below LEVEL although all is as stated."""
@@ -128,3 +129,23 @@ def _rows(name: str, kind: str, stated: Any, values: list[Any]) -> Table:
             f"{name} azimuth": uniform(np.arctan2(y, x), -np.pi, np.pi),
         }
     return {name: uniform(values, low, high)}
+
+
+Made = TypeVar("Made")
+Args = ParamSpec("Args")
+
+
+def with_draws(
+    draw: Callable[Args, Made], *args: Args.args, **options: Args.kwargs
+) -> tuple[Made, Mapping[str, tuple[Any, ...]]]:
+    """Return what a function makes, and the values that it drew, by name."""
+    samplers: list[RecordedSampler] = []
+    begin = RecordedSampler.__init__
+
+    def noted(self: RecordedSampler, rng: np.random.Generator) -> None:
+        begin(self, rng)
+        samplers.append(self)
+
+    with mock.patch.object(RecordedSampler, "__init__", noted):
+        made = draw(*args, **options)
+    return made, samplers[-1].parameters()

@@ -1,7 +1,6 @@
 """Files of a user's own: loaded once, recorded by their bytes, and every mistake is one line."""
 
 import os
-import subprocess
 import sys
 from collections.abc import Iterator
 from pathlib import Path
@@ -22,7 +21,7 @@ from storage.extensions import (
     short_name,
 )
 from storage.registry import Registry
-from tests.conftest import ROOT
+from tests.command_line import run_program
 from tests.extensions_kit import room_for_extensions, written
 from tests.for_each import for_each
 
@@ -57,10 +56,7 @@ def test_processes_that_start_from_here_load_the_same(tmp_path: Path) -> None:
         "import sys; from storage.extensions import load_named_extensions; "
         "load_named_extensions(); print(sys.modules['trilight_extension_own'].VALUE)"
     )
-    ran = subprocess.run(
-        [sys.executable, "-c", code], cwd=ROOT, capture_output=True, text=True, check=True
-    )
-    assert ran.stdout == "7\n"
+    assert run_program([sys.executable, "-c", code]).stdout == "7\n"
 
 
 @for_each(

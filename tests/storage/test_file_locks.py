@@ -13,6 +13,7 @@ import sys
 import threading
 import time
 from pathlib import Path
+from unittest import mock
 
 import pytest
 import torch
@@ -140,10 +141,8 @@ def test_without_locks_everything_goes_on_after_one_warning(
     monkeypatch: pytest.MonkeyPatch,
     caplog: pytest.LogCaptureFixture,
 ) -> None:
-    def refuse(descriptor: int, operation: int) -> None:
-        raise OSError(number, os.strerror(number))
-
     caplog.clear()
+    refuse = mock.Mock(side_effect=OSError(number, os.strerror(number)))
     monkeypatch.setattr(fcntl, "flock", refuse)
     monkeypatch.setattr(file_locks, "_unlocked", itertools.count())
     folder, cache = DatasetFolder(tmp_path / "set"), ShardCache(tmp_path / "cache", 1 << 20)

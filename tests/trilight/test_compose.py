@@ -8,6 +8,7 @@ from collections.abc import Callable
 from importlib import metadata
 from pathlib import Path
 from types import ModuleType
+from unittest import mock
 
 import numpy as np
 import pytest
@@ -20,7 +21,6 @@ from pipeline.renders.mitsuba_variant import Variant
 from storage.errors import TrilightError
 from storage.records.exr import decode_exr
 from storage.records.material import DIFFUSE, EMISSION, ROUGHNESS, SPECULAR
-from storage.renderer import Camera
 from tests.command_line import run_program
 from tests.conftest import ROOT
 from tests.for_each import for_each
@@ -283,15 +283,10 @@ def test_a_name_is_exported_as_its_import_calls_it(tmp_path: Path) -> None:
 
 
 def test_every_camera_is_rendered_but_where_some_are_named(monkeypatch: pytest.MonkeyPatch) -> None:
-    class Scene:
-        """Returns the field of view in place of a picture."""
-
-        def __init__(self, *_: object) -> None: ...
-
-        def render_view(self, camera: Camera) -> tuple[float, int | None]:
-            return camera.fov_deg, camera.view
-
-    monkeypatch.setattr("infra.render.path_tracer.SceneInChild", Scene)
+    """The field of view stands for a picture."""
+    scene_in_child = mock.Mock()
+    scene_in_child().render_view = lambda camera: (camera.fov_deg, camera.view)
+    monkeypatch.setattr("infra.render.path_tracer.SceneInChild", scene_in_child)
     variant = Variant(name="llvm_ad_rgb", libllvm="", note="")  # nothing is traced here
     monkeypatch.setattr("pipeline.renders.mitsuba_variant.choose_variant", lambda default: variant)
     scene = tiny_scene(fov_deg=np.array([45, 50], np.float32))

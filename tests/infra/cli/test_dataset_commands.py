@@ -6,6 +6,7 @@ import os
 import shlex
 from pathlib import Path
 from typing import Any
+from unittest import mock
 
 import numpy as np
 import pytest
@@ -22,7 +23,6 @@ from pipeline.exchange import reader
 from pipeline.exchange.open_scene import load_source, scene_source
 from pipeline.exchange.renderformer_h5 import read_renderformer_h5
 from pipeline.exchange.renderformer_json import describe_scene
-from pipeline.generation.generate_options import GenerateOptions
 from pipeline.renders.mitsuba_variant import choose_variant
 from storage.dataset.dataset import open_dataset
 from storage.dataset.layout import DatasetFolder
@@ -197,12 +197,7 @@ def test_a_bad_derived_shard_is_made_of_its_sources_again(tmp_path: Path) -> Non
 def test_a_repair_has_the_objects_of_the_generate_command(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    orders: list[GenerateOptions] = []
-
-    def refuse(options: GenerateOptions) -> None:
-        orders.append(options)
-        raise TrilightError("refused")
-
+    refuse = mock.Mock(side_effect=TrilightError("refused"))
     publication = begin_tiny(tmp_path, 4)
     make_tiny_shard(publication, 0)
     write_asked(publication.folder, ["generate", "smoke", "--objects", "mine"])
@@ -210,7 +205,7 @@ def test_a_repair_has_the_objects_of_the_generate_command(
     for objects in (None, "others"):
         with pytest.raises(TrilightError, match="refused"):
             repair(str(tmp_path), ["train-000000.tar"], objects=objects, scenes_from=None)
-    assert [options.objects for options in orders] == ["mine", "others"]
+    assert [each.args[0].objects for each in refuse.call_args_list] == ["mine", "others"]
     assert [path.name for path in tmp_path.glob("*.tar*")] == ["train-000000.tar"]
 
 

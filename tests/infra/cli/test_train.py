@@ -7,10 +7,10 @@ import signal
 import subprocess
 import sys
 import time
-from collections.abc import Mapping
 from pathlib import Path
 from types import SimpleNamespace
-from typing import Any, NoReturn
+from typing import Any
+from unittest import mock
 
 import pytest
 
@@ -178,27 +178,25 @@ def test_a_wait_policy_of_the_users_own_stays() -> None:
 
 def test_several_processes_are_launched_by_torchrun(monkeypatch: pytest.MonkeyPatch) -> None:
     """As one command line; under torchrun it would be twice as many."""
-    seen: list[list[str]] = []
-
-    def replaced(program: str, words: list[str], environment: Mapping[str, str]) -> NoReturn:
-        assert environment["PYTHONSAFEPATH"]
-        seen.append(words)
-        sys.exit(0)
-
+    replaced = mock.Mock(side_effect=SystemExit(0))
     monkeypatch.setattr(os, "execve", replaced)
     asked = ["train", "smoke", "--processes", "2", "--set", "seed=3", "--skip-unusable", "1"]
     assert trilight([*asked, "--json"]).exit_code == 0
-    (words,) = seen
+    assert replaced.call_count == 1
+    _, words, environment = replaced.call_args.args
+    assert environment["PYTHONSAFEPATH"]
     assert words[1:6] == ["-m", "torch.distributed.run", "--standalone", "--nproc-per-node=2", "-m"]
     assert " ".join(words[6:]) == "trilight train smoke --skip-unusable 1 --set seed=3 --json"
     watched = ["train", "smoke", "--processes", "2", "--hang-after", "9", "--profile", "2"]
     assert trilight([*watched, "--wandb", "light"]).exit_code == 0
-    assert " ".join(seen.pop()[6:]) == (
+    _, words, environment = replaced.call_args.args
+    assert environment["PYTHONSAFEPATH"]
+    assert " ".join(words[6:]) == (
         "trilight train smoke --hang-after 9.0 --profile 2 --wandb light"
     )
     monkeypatch.setenv("RANK", "0")
     assert trilight(asked).mistake.startswith("--processes is 2 under torchrun")
-    assert len(seen) == 1
+    assert replaced.call_count == 2
 
 
 FAR = "out-of-range"

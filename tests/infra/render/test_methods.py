@@ -7,6 +7,7 @@ import re
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
+from unittest import mock
 
 import numpy as np
 import pytest
@@ -184,15 +185,11 @@ class Enough(Exception):
 
 def test_path_tracers_share_a_child_that_can_be_stopped_and_keeps_few_scenes() -> None:
     told = list[Sampling | Image]()
-
-    def stop(step: Sampling | Image) -> None:
-        raise Enough
-
     with contextlib.closing(RenderChild(choose_variant(), threads=1)) as child:
         growing = PathTracer(child, MEASURED, 32, shows_looks=True)
         grown = growing.load(TINY, "tiny")
         with pytest.raises(Enough):
-            grown.render(TINY_CAMERA, stop)
+            grown.render(TINY_CAMERA, mock.Mock(side_effect=Enough))
         last = grown.render(TINY_CAMERA, told.append)
         looks = [step for step in told if isinstance(step, Image)]
         assert len(looks) > 3 and any(isinstance(step, Sampling) for step in told)
@@ -353,17 +350,12 @@ def test_a_plan_has_all_that_was_asked(source: Path, tmp_path: Path) -> None:
 def test_the_pictures_of_a_turn_share_the_loading_of_its_scene(
     source: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    told: list[float] = []
-
-    def price_all(*_: object, per_scene: float, **__: object) -> None:
-        told.append(per_scene)
-        raise TrilightError("no way to it")
-
+    price_all = mock.Mock(side_effect=TrilightError("no way to it"))
     monkeypatch.setattr(plan, "price_all", price_all)
     for more in ({"out": tmp_path / "x.exr"}, {"out": tmp_path / "turn", "orbit": 3}):
         with pytest.raises(TrilightError, match="no way"):
             plan_render(RenderOptions(source=str(source), seconds=1.0, **more), HereReader())
-    assert told == [1, 3]
+    assert [each.kwargs["per_scene"] for each in price_all.call_args_list] == [1, 3]
 
 
 def test_only_the_plan_reads_what_was_asked() -> None:

@@ -13,7 +13,8 @@ import time
 import tomllib
 from collections.abc import Iterator
 from pathlib import Path
-from typing import Any, cast
+from typing import Any
+from unittest import mock
 
 import pytest
 from prefect.exceptions import ParameterTypeError
@@ -109,17 +110,10 @@ def test_a_port_of_somebody_else_is_refused(monkeypatch: pytest.MonkeyPatch) -> 
 
 
 def test_an_answer_counts_only_while_our_server_lives(tmp_path: Path) -> None:
-    class Ends:
-        """A server that cannot bind, and ends while a stranger answers for it."""
-
-        answers = 0
-
-        def poll(self) -> int | None:
-            self.answers += 1
-            return None if self.answers == 1 else 1
-
+    """A server that cannot bind ends while a stranger answers for it."""
+    ends = mock.Mock(poll=mock.Mock(side_effect=[None, *[1] * 9]))
     with healthy_server() as url, pytest.raises(TrilightError, match="did not start: it ended"):
-        wait_until_healthy(url, cast(Any, Ends()), tmp_path / "log")
+        wait_until_healthy(url, ends, tmp_path / "log")
 
 
 def test_a_slow_server_is_waited_for_with_signs_of_life(
@@ -266,16 +260,7 @@ def test_the_password_is_no_argument_and_is_not_said(
     monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     """Arguments are seen by every user of the machine, and what is said gets into logs."""
-    told: list[str] = []
-    environments: list[Any] = []
-
-    def launch(name: str, command: Any, environment: Any) -> None:
-        told.extend(command)
-        environments.append(environment)
-
-    def call(command: list[str], environment: Any) -> None:
-        launch("step", command, environment)
-
+    launch, call = mock.Mock(), mock.Mock()
     monkeypatch.setattr(local, "_launch", launch)
     monkeypatch.setattr(local, "_require_free", lambda *_: None)
     monkeypatch.setattr(local, "wait_until_healthy", lambda *_: None)
@@ -284,6 +269,9 @@ def test_the_password_is_no_argument_and_is_not_said(
     monkeypatch.setenv("TRILIGHT_HOST", "my-host")
     local.main(["start"])
     password = tomllib.loads(settings_file().read_text())["api"]["auth_string"]
+    calls = [each.args[-2:] for each in (*launch.call_args_list, *call.call_args_list)]
+    told = [word for command, _ in calls for word in command]
+    environments = [environment for _, environment in calls]
     assert [environment[PASSWORDS[1]] for environment in environments] == [password] * 3
     assert environments[0]["TRILIGHT_HOST_NAMES"].split(",")[0] == "my-host"
     assert len(told) > 10 and not any(password in word for word in told)

@@ -1,9 +1,7 @@
 """What a wheel is built from: our packages below `trilight`, and nothing of a user's replaced."""
 
 import ast
-import os
 import re
-import subprocess
 import sys
 import textwrap
 import zipfile
@@ -13,6 +11,7 @@ import pytest
 
 from infra.setup.build_backend import build_editable
 from infra.setup.wheel_tree import CHECKOUT_ONLY, FACE, PACKAGES, with_prefix, write_wheel_tree
+from tests.command_line import run_program
 from tests.conftest import ROOT
 from tests.for_each import case
 
@@ -83,8 +82,7 @@ def test_lines_keep_their_numbers(tree: Path) -> None:
 
 def test_all_files_of_the_checkout_are_in_the_tree(tree: Path) -> None:
     listed = ["git", "ls-files", "--cached", "--others", "--exclude-standard", *PACKAGES, FACE]
-    tracked = subprocess.run(listed, cwd=ROOT, capture_output=True, text=True, check=True)
-    for name in tracked.stdout.splitlines():
+    for name in run_program(listed).stdout.splitlines():
         copied = tree / ("" if name.startswith(f"{FACE}/") else FACE) / name
         left_out = any(Path(name).is_relative_to(each) for each in CHECKOUT_ONLY)
         assert copied.is_file() != left_out, name
@@ -124,15 +122,7 @@ def test_a_program_keeps_its_own_model_train_and_storage(tree: Path, tmp_path: P
         (tmp_path / place).write_text('WHOSE = "the user\'s"\n')
     (tmp_path / "program.py").write_text(textwrap.dedent(PROGRAM))
     for command in (["program.py"], ["-m", "trilight", "--version"]):
-        ran = subprocess.run(
-            [sys.executable, *command],
-            cwd=tmp_path,
-            env={**os.environ, "PYTHONPATH": str(tree)},
-            capture_output=True,
-            text=True,
-            check=False,
-        )
-        assert ran.returncode == 0, ran.stderr
+        run_program([sys.executable, *command], tmp_path, PYTHONPATH=str(tree))
 
 
 @pytest.mark.filterwarnings("ignore::Warning")
@@ -156,4 +146,4 @@ def test_beside_a_clone_our_package_is_found_and_not_the_folder(
     script.write_text(
         f"import site; site.addsitedir({str(site)!r}); import trilight; trilight.NAME"
     )
-    subprocess.run([sys.executable, "-S", "-E", str(script)], check=True, cwd=tmp_path)
+    run_program([sys.executable, "-S", "-E", str(script)], tmp_path)

@@ -8,6 +8,7 @@ import time
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any, NamedTuple
+from unittest import mock
 from uuid import UUID
 
 import pytest
@@ -219,22 +220,17 @@ def seen(state: str, **more: Any) -> RunStatus:
 
 
 @pytest.fixture
-def asked(monkeypatch: pytest.MonkeyPatch) -> list[Any]:
+def asked(monkeypatch: pytest.MonkeyPatch) -> mock.Mock:
     """What the server is asked for; its run is seen in `looks`, without any by default."""
-    found: list[Any] = []
-
-    def submit(client: object, flow: str, deployment: str | None, given: object) -> SubmittedRun:
-        found.append((flow, deployment, given))
-        return RUN
-
+    submit = mock.Mock(return_value=RUN)
     monkeypatch.setattr(submission, "server", contextlib.nullcontext)
     monkeypatch.setattr(submission, "submit", submit)
     monkeypatch.setattr(submission, "workers_online", lambda client, pool: 1)
-    return found
+    return submit
 
 
 def test_a_run_is_watched_to_its_end_and_one_that_crashed_is_a_mistake_with_its_reason(
-    asked: list[Any], monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+    asked: mock.Mock, monkeypatch: pytest.MonkeyPatch, tmp_path: Path
 ) -> None:
     looks = [seen("Pending"), seen("Running"), seen("Running")]
     looks.append(seen("Completed", tables={"summary": [("scenes", "2")]}))
@@ -242,7 +238,7 @@ def test_a_run_is_watched_to_its_end_and_one_that_crashed_is_a_mistake_with_its_
     words = ["submit", "generate-scenes", "smoke", "--scenes", "2", "--out", str(tmp_path)]
     told = trilight(words).stdout
     given = {"build": "smoke", "scenes": 2, "out": str(tmp_path)}
-    assert asked == [("generate-scenes", None, given)]
+    asked.assert_called_once_with(mock.ANY, "generate-scenes", None, given)
     for line in ("Run a-run of generate-scenes/local: http://page", "Pending", "scenes  2"):
         assert told.count(line) == 1, told
     assert f"Next: trilight verify {tmp_path}" in told
@@ -253,7 +249,7 @@ def test_a_run_is_watched_to_its_end_and_one_that_crashed_is_a_mistake_with_its_
     assert "ended as Crashed: it was killed. Its log is at http://page" in failed.stderr
 
 
-def test_who_does_not_watch_gets_the_run(asked: list[Any]) -> None:
+def test_who_does_not_watch_gets_the_run(asked: mock.Mock) -> None:
     words = ["submit", "generate-scenes", "smoke", "--no-watch", "--deployment", "cluster"]
     assert json.loads(trilight([*words, "--json"]).stdout)["flow_run"] == str(RUN.id)
-    assert asked[0][:2] == ("generate-scenes", "cluster")
+    assert asked.call_args.args[1:3] == ("generate-scenes", "cluster")

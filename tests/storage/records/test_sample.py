@@ -8,7 +8,6 @@ import gzip
 import io
 import json
 import struct
-import subprocess
 import sys
 from collections.abc import Callable
 from pathlib import Path
@@ -39,7 +38,7 @@ from storage.records.profiles import (
 )
 from storage.records.sample import decode_sample, encode_sample
 from storage.records.scene_file import encode_scene
-from tests.conftest import ROOT
+from tests.command_line import run_program
 from tests.for_each import case, for_each
 from tests.pipeline.documents.dataset_by_hand import edit_manifest, five_scenes
 from tests.scenes_by_hand import tiny_sample
@@ -286,10 +285,7 @@ def test_what_is_not_expected_takes_no_memory(tmp_path: Path) -> None:
         path = tmp_path / f"{number}.exr"
         path.write_bytes(made())
         words += [str(path), read_as]
-    child = subprocess.run(
-        [sys.executable, "-c", _CHILD, *words], cwd=ROOT, capture_output=True, text=True, check=True
-    )
-    lines = child.stdout.splitlines()
+    lines = run_program([sys.executable, "-c", _CHILD, *words]).stdout.splitlines()
     assert len(lines) == 2 * len(HOSTILE_EXR)
     for (_, _, said), message, grown_mb in zip(HOSTILE_EXR, lines[::2], lines[1::2], strict=True):
         assert said in message

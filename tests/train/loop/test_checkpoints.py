@@ -4,6 +4,7 @@ Around the steps: who trains where, what a signal does, and checkpoints written 
 """
 
 import dataclasses
+import errno
 import json
 import os
 import signal
@@ -13,6 +14,7 @@ import threading
 from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
+from unittest import mock
 
 import pytest
 import torch
@@ -215,11 +217,8 @@ def test_processes_that_read_different_checkpoints_do_not_go_on(tmp_path: Path) 
 
 def test_a_full_disk_leaves_the_older_ones(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     keep(tmp_path, 0, checkpoints_kept=1)
-
-    def full(_: int) -> None:
-        raise OSError(28, "No space left on device")
-
-    monkeypatch.setattr(os, "fsync", full)
+    full = OSError(errno.ENOSPC, "No space left on device")
+    monkeypatch.setattr(os, "fsync", mock.Mock(side_effect=full))
     with pytest.raises(TrilightError, match="the disk is full"):
         keep(tmp_path, 5, checkpoints_kept=1)
     assert saved_steps(tmp_path) == [0]

@@ -18,6 +18,7 @@ from safetensors.numpy import load_file
 from model.open import saved_steps
 from storage.dataset.dataset import Dataset
 from storage.seeds import rng_for
+from tests.command_line import run_program
 from tests.conftest import ROOT
 from tests.infra.slurm.test_jobs import commands_in
 from train.folder import read_rows
@@ -73,15 +74,7 @@ def environment() -> dict[str, str]:
 
 
 def run(dataset: Dataset, out: Path, processes: int, *rest: str, **changes: object) -> Path:
-    done = subprocess.run(
-        command(dataset, out, processes, *rest, **changes),
-        cwd=ROOT,
-        env=environment(),
-        capture_output=True,
-        text=True,
-        check=False,
-    )
-    assert done.returncode == 0, done.stderr
+    run_program(command(dataset, out, processes, *rest, **changes), env=environment())
     return out
 
 
