@@ -88,10 +88,10 @@ class Machines:
     def maker(self, name: str, scenes: int = 8, **changes: Any) -> Iterator[DatasetWriter]:
         """Take part from a machine, as a run does."""
         self.use(name)
-        folder = dataset_folder(OUT)
+        shards = PublishedShards(dataset_folder(OUT))
         build = preset_settings("smoke", changes=changes) if changes else _build()
-        with PublishedShards(folder).hold_lock():
-            yield begin_or_resume_dataset(PublishedShards(folder), build, ENVIRONMENT, scenes)
+        with shards.hold_lock():
+            yield begin_or_resume_dataset(shards, build, ENVIRONMENT, scenes)
 
 
 def other_shard(writer: DatasetWriter) -> Any:
