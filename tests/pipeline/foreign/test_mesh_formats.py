@@ -15,6 +15,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from pxr import Gf, Usd, UsdGeom, UsdLux, UsdShade
 
+from pipeline.assets.settings import OwnMaterialSettings
 from pipeline.assets.source_materials.skin import _parts
 from pipeline.assets.source_materials.source_surface import FacePoints, SourceSurface
 from pipeline.exchange.open_scene import load_source, scene_source
@@ -391,7 +392,7 @@ WIDE = kit.UV_UP * [2.25, 1] + [0.75, 0]
 
 def assert_same(path: Path) -> None:
     source = read_source(path, kit.KEEP.read_limits)
-    parts = _parts(source, Decoder(1 << 20), emission=False)
+    parts = _parts(source, Decoder(1 << 20), OwnMaterialSettings())
     scene = load_source(scene_source(str(path))).scene
     count = len(parts.mesh.faces)
     corners = scene.vertex_positions[scene.faces[:count]]
@@ -502,7 +503,8 @@ SMALL_PICTURE = kit.picture_bytes(kit.CORNERS)
 def look_at_parts(path: Path) -> str:
     """Read all of a file and return what is not read; what became of its numbers is finite."""
     source = read_source(path, kit.KEEP.read_limits)
-    for material in _parts(source, Decoder(1 << 20), emission=True).materials:
+    kept = OwnMaterialSettings(emission=True)
+    for material in _parts(source, Decoder(1 << 20), kept).materials:
         colors = (*material.base_rgb, *material.specular_rgb, *material.emission_rgb)
         numbers = (material.metallic, material.roughness, material.f0, material.specular_strength)
         moves = [[*slot.uv_matrix.flat, *slot.uv_offset] for slot in material.slots]

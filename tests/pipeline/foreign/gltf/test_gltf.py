@@ -11,6 +11,7 @@ from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 from numpy.typing import NDArray
 
+from pipeline.assets.settings import OwnMaterialSettings
 from pipeline.assets.source_materials.skin import _parts
 from pipeline.exchange.gltf.read_gltf import read_gltf
 from pipeline.exchange.textured_triangles import LoadedScene
@@ -32,7 +33,7 @@ def surface(path: Path) -> NDArray[np.float64]:
     """Return corners and diffuse color [T, 12] of an object's triangles that have an area."""
     source = read_source(path, KEPT)
     try:
-        parts = _parts(source, Decoder(1 << 26), emission=False)
+        parts = _parts(source, Decoder(1 << 26), OwnMaterialSettings())
     except Rejected as why:
         assert why.reason == "no_materials"
         corners = load_mesh(source).corners
