@@ -9,11 +9,14 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+import pytest
 from numpy.typing import ArrayLike, NDArray
 from pxr import Gf, Sdf, Usd, UsdGeom, UsdShade, Vt
 
 from pipeline.assets.settings import AssetSettings
+from pipeline.foreign.usd import object_source
 from storage.conventions import linear_from_srgb8
+from storage.errors import Rejected
 from storage.records.asset import Asset
 from tests.for_each import for_each
 from tests.pipeline.assets.child_kit import Bench
@@ -158,6 +161,21 @@ def test_pictures_coordinates_and_materials_are_lost_with_a_reason(tmp_path: Pat
     stage = new_stage()
     usd_mesh(stage, BOX)
     assert kit.lost(exported(stage, path)) == "no_materials"
+
+
+def test_materials_that_are_refused_are_read_once(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    path = textured_usd(tmp_path / "a.usda", PICTURE, _set("info:id", "Other", SHADER))
+    read, calls = object_source.read_stage_materials, []
+    monkeypatch.setattr(
+        object_source, "read_stage_materials", lambda *given: calls.append(1) or read(*given)
+    )
+    source = object_source.UsdSource(path, kit.KEEP.read_limits)
+    for _ in range(2):
+        with pytest.raises(Rejected, match="materials_unreadable"):
+            source.materials  # noqa: B018
+    assert len(calls) == 1
 
 
 def test_the_stage_makes_it_in_a_child_and_again_when_a_part_changes(bench: Bench) -> None:
