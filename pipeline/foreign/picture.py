@@ -254,7 +254,7 @@ def _find_texels(
 ) -> tuple[NDArray[np.int64], NDArray[np.int64], NDArray[np.float64]]:
     """Return the two texels [N] around coordinates [N] on an axis, and the second's weight [N, 1].
 
-    Both are the nearest one where texels are not interpolated.
+    Where texels are not interpolated, the first is the nearest one, and the second weighs nothing.
     """
     if wrap in ("clamp", "black"):
         wrapped = np.clip(at, 0, 1)

@@ -211,8 +211,9 @@ class CameraRays:
         start = dr.unravel(mi.Point3f, own_floats(origins))
         ray = mi.Ray3f(start, dr.unravel(mi.Vector3f, own_floats(directions)))
         hit, is_met = hit_of(self._scene.ray_intersect_preliminary(ray, coherent=True))
-        position = read_back(dr.select(is_met, hit.triangle, len(self._rows) - 1))
-        return RayHits(triangle=self._rows[position], uv=np.array(hit.barycentric))
+        position = dr.select(is_met, hit.triangle, len(self._rows) - 1)
+        dr.eval(position, hit.barycentric)  # at once: read apart, each would trace all rays
+        return RayHits(triangle=self._rows[read_back(position)], uv=np.array(hit.barycentric))
 
 
 def off_surface(point: SurfacePoint, direction: Any) -> Any:

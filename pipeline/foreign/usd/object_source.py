@@ -205,16 +205,17 @@ class UsdSource:
         with _reject_errors(path):
             self.stage = _read_stage(path, limits)
         digest = hashlib.sha256()
-        self._bytes_left = limits.max_bytes
+        bytes_left = limits.max_bytes
         for layer in self.stage.opened.files:
             data = layer.read_bytes()
-            if len(data) > self._bytes_left:
-                why = f"the layers together; {self._bytes_left} bytes are left"
+            if len(data) > bytes_left:
+                why = f"the layers together; {bytes_left} bytes are left"
                 raise Rejected("too_large_bytes", why)
             digest.update(data)
-            self._bytes_left -= len(data)
-        with contextlib.suppress(Rejected):
-            pictures = self.materials.pictures.data
+            bytes_left -= len(data)
+        self._materials = self._read_materials(bytes_left)
+        if isinstance(self._materials, StageMaterials):
+            pictures = self._materials.pictures.data
             for place in sorted(pictures):
                 digest.update(pictures[place])
         self.sha256 = digest.hexdigest()
@@ -241,14 +242,26 @@ class UsdSource:
             ]
         )
 
-    @cached_property
+    @property
     def materials(self) -> StageMaterials:
         """Return the materials; raises Rejected as `read_stage_materials`, or no_materials."""
+        if isinstance(self._materials, Rejected):
+            raise self._materials
+        return self._materials
+
+    def _read_materials(self, bytes_left: int) -> StageMaterials | Rejected:
+        """Return the materials, or why there are none: to read those of a large stage costs a lot.
+
+        The reason is new, since the traceback of a raised one would hold the stage.
+        """
         if not self._limits.with_materials:
-            raise Rejected("no_materials", "materials were not asked for")
+            return Rejected("no_materials", "materials were not asked for")
         read = partial(_read_strictly, self.stage, normals=self._limits.with_normal_maps)
-        with _reject_errors(self._path):
-            return read_stage_materials(self.stage, self._bytes_left, read)
+        try:
+            with _reject_errors(self._path):
+                return read_stage_materials(self.stage, bytes_left, read)
+        except Rejected as why:
+            return Rejected(why.reason, why.message)
 
 
 @contextlib.contextmanager

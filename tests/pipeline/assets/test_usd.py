@@ -7,13 +7,17 @@ import dataclasses
 import zlib
 from pathlib import Path
 from typing import Any
+from unittest.mock import Mock
 
 import numpy as np
+import pytest
 from numpy.typing import ArrayLike, NDArray
 from pxr import Gf, Sdf, Usd, UsdGeom, UsdShade, Vt
 
 from pipeline.assets.settings import AssetSettings
+from pipeline.foreign.usd import object_source
 from storage.conventions import linear_from_srgb8
+from storage.errors import Rejected
 from storage.records.asset import Asset
 from tests.for_each import for_each
 from tests.pipeline.assets.child_kit import Bench
@@ -158,6 +162,19 @@ def test_pictures_coordinates_and_materials_are_lost_with_a_reason(tmp_path: Pat
     stage = new_stage()
     usd_mesh(stage, BOX)
     assert kit.lost(exported(stage, path)) == "no_materials"
+
+
+def test_materials_that_are_refused_are_read_once(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    path = textured_usd(tmp_path / "a.usda", PICTURE, _set("info:id", "Other", SHADER))
+    read = Mock(wraps=object_source.read_stage_materials)
+    monkeypatch.setattr(object_source, "read_stage_materials", read)
+    source = object_source.UsdSource(path, kit.KEEP.read_limits)
+    for _ in range(2):
+        with pytest.raises(Rejected, match="materials_unreadable"):
+            source.materials  # noqa: B018
+    read.assert_called_once()
 
 
 def test_the_stage_makes_it_in_a_child_and_again_when_a_part_changes(bench: Bench) -> None:
