@@ -192,7 +192,9 @@ def _add_swapped_scores(
     no worse with other triangles. A network of hits keeps its own hits; only the scene's tokens are
     replaced.
     """
-    seen = dataclasses.replace(other, c2w_V44=cameras.c2w_V44, fov_deg_V=cameras.fov_deg_V)
+    seen = dataclasses.replace(  # its albedo, which other cameras have seen, is traced again
+        other, c2w_V44=cameras.c2w_V44, fov_deg_V=cameras.fov_deg_V, albedo_VRR6=None
+    )
     if cameras.traced is not None:
         seen = dataclasses.replace(seen, traced=with_others_tokens(cameras.traced, other.traced))
     pictures_VRR3 = predict(config.network, seen, config.resolution)

@@ -9,10 +9,12 @@ from typing import Any
 import flip_evaluator
 import numpy as np
 import pytest
+import torch
 from PIL import Image
 
 from infra import judging
 from model.inference import light_groups
+from model.renderformer import RenderFormer
 from model.scene_tensors import scene_tensors
 from model.weights import encode_weights
 from pipeline.presets.frozen_v1 import PRESETS_FOR_JUDGING
@@ -23,6 +25,7 @@ from storage.metrics import psnr_log_db
 from storage.records.material import ROUGHNESS
 from storage.seeds import rng_for
 from tests.command_line import trilight
+from tests.model.kit import awake, tiny_config
 from tests.pipeline.renders.scene_kit import join, light, material, quad
 from tests.train.kit import eval_config, tiny_run
 from tests.train.loss.test_training_loss import small_weights
@@ -75,9 +78,9 @@ def dataset(tmp_path_factory: pytest.TempPathFactory) -> Dataset:
     return write_toy_dataset(tmp_path_factory.mktemp("toy"), train=5, validation=3, per_shard=3)
 
 
-def contest(dataset: Dataset) -> EvalConfig:
+def contest(dataset: Dataset, network: RenderFormer | None = None) -> EvalConfig:
     shards = open_training_data([str(dataset.folder.root)]).split("train")
-    return eval_config(dataset, baselines=make_baselines(shards, 16))
+    return eval_config(dataset, network, baselines=make_baselines(shards, 16))
 
 
 def test_hdr_flip_is_the_packages_and_what_cannot_be_measured_is_no_number() -> None:
@@ -185,15 +188,16 @@ def test_a_summary_shows_the_bad_ones_and_the_noise() -> None:
 
 
 def test_another_scenes_triangles_and_what_swapping_costs_are_told(dataset: Dataset) -> None:
-    judging = contest(dataset)
-    rows, samples = judge_views(judging, lambda: None), list(judging.samples())
-    assert [view.swapped_psnr_log_db is None for view in rows] == [True] * 2 + [False] * 4
-    before, judged = samples[1], validation_scene(samples[2], judging.resolution)
-    seen = before.scene.with_cameras(samples[2].scene.c2w, samples[2].scene.fov_deg)
-    mixed = training_scene(dataclasses.replace(samples[2], scene=seen), judging.resolution)
-    shown = predict(judging.network, mixed.tensors, judging.resolution)
-    for view, picture, target in zip(rows[4:], shown, judged.target_VRR3, strict=True):
-        assert view.swapped_psnr_log_db == psnr_log_db(picture, target)
+    for config in (tiny_config(), tiny_config(demodulated=True, hit_rays=1)):
+        judging = contest(dataset, awake(config, torch.float32))
+        rows, samples = judge_views(judging, lambda: None), list(judging.samples())
+        assert [view.swapped_psnr_log_db is None for view in rows] == [True] * 2 + [False] * 4
+        before, judged = samples[1], validation_scene(samples[2], judging.resolution)
+        seen = before.scene.with_cameras(samples[2].scene.c2w, samples[2].scene.fov_deg)
+        mixed = training_scene(dataclasses.replace(samples[2], scene=seen), judging.resolution)
+        shown = predict(judging.network, mixed.tensors, judging.resolution)
+        for view, picture, target in zip(rows[4:], shown, judged.target_VRR3, strict=True):
+            assert view.swapped_psnr_log_db == psnr_log_db(picture, target)
     swapped = [None, 28.0, 20.0, 34.0]
     rows = [row(0, swapped_psnr_log_db=value) for value in swapped]
     loss = record(rows, {})["swapped scenes"]
