@@ -41,6 +41,7 @@ from pipeline.exchange.open_scene import scene_source
 from pipeline.exchange.reader import SceneReader
 from pipeline.generation.derive_dataset import Selection, columns_of
 from pipeline.shards.finished_dataset import SceneFacts
+from storage.aliases import PRESET_ALIASES, name_for_people
 from storage.conventions import preview_gain
 from storage.dataset.dataset import Dataset, reading
 from storage.dataset.manifest import ShardEntry
@@ -311,7 +312,7 @@ class DatasetHandlers(SceneListHandlers):
         return json_response(
             {
                 "name": safe_url(self._source),
-                "build": manifest.build,
+                "build": name_for_people(manifest.build, PRESET_ALIASES),
                 "scenes": manifest.num_samples,
                 "indexed": len(rows),
                 "shards": len(manifest.shards),

@@ -1,8 +1,10 @@
 """Who is answered, what the pages are made of, and a page that waits for what it shows."""
 
 import contextlib
+import dataclasses
 import io
 import itertools
+import json
 import os
 import re
 import shlex
@@ -340,6 +342,15 @@ def test_what_is_shown_is_what_the_printed_command_selects(
             whole = FinishedDataset(dataset.store, dataset.manifest, {})
             assert {row.pop("views") for row in found["rows"]} <= {2}
             assert found["rows"] == list_scenes(whole, selection)
+
+
+def test_the_facts_of_a_dataset_name_its_preset_as_people_type_it(dataset: Dataset) -> None:
+    manifest = dataclasses.replace(dataset.manifest, build="smoke")
+    stored = Dataset(dataset.store, manifest)
+    room = DatasetHandlers(stored, "stored", cast(Any, ClosedChild()), None)
+    facts = room.routes()["GET api/dataset"](Request(path="api/dataset", query={}))
+    assert json.loads(facts.body)["build"] == "tiny"
+    room.close()
 
 
 def test_rows_are_sorted_and_come_page_by_page(dataset_asker: Asker) -> None:
