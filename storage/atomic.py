@@ -137,7 +137,10 @@ def _appear_first(temporary: Path, path: Path) -> None:
 
 
 def _sync_folder(folder: Path) -> None:
-    descriptor = os.open(folder, os.O_RDONLY)
+    try:
+        descriptor = os.open(folder, os.O_RDONLY)
+    except FileNotFoundError:  # another maker of the shard has packed it, and cleared its folder
+        return
     try:
         os.fsync(descriptor)
     finally:
