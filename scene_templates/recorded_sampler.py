@@ -4,7 +4,7 @@ What a surface or a sky is drawn from is written once, where it is drawn. The te
 drawn with what was stated, and the reference page of surfaces and skies is made of it.
 """
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, field
 from typing import Any, Literal
 
@@ -99,13 +99,6 @@ class RecordedSampler:
         However much is taken of it, what is drawn after it stays.
         """
         return np.random.default_rng(int(self._rng.integers(2**63)))
-
-    def parameters(self) -> Mapping[str, tuple[Any, ...]]:
-        """Return what was drawn so far by its names: numbers, words, truth values and lists."""
-        return {
-            name: tuple(v.tolist() if isinstance(v, np.ndarray) else v for v in draw.values)
-            for name, draw in self.made.items()
-        }
 
     def _between(self, low: float, high: float) -> float:
         # not rng.uniform, whose product and sum some compilers fuse and so round once less

@@ -74,5 +74,5 @@ def passes(options: PassOptions) -> None:
         )
     notes = [*scene_notes, *([f"{note}; see trilight doctor"] if note else [])]
     record = {"files": list(map(str, files)), "notes": notes, "passes": names}
-    rows = [("written", f"{len(files)} files"), ("passes", ", ".join(names))]
+    rows = [("files", str(len(files))), ("passes", ", ".join(names))]
     print_result("Passes", rows, record, notes=notes)

@@ -148,4 +148,12 @@ def with_draws(
 
     with mock.patch.object(RecordedSampler, "__init__", noted):
         made = draw(*args, **options)
-    return made, samplers[-1].parameters()
+    return made, drawn_values(samplers[-1])
+
+
+def drawn_values(sampler: RecordedSampler) -> Mapping[str, tuple[Any, ...]]:
+    """Return what was drawn so far by its names: numbers, words, truth values and lists."""
+    return {
+        name: tuple(v.tolist() if isinstance(v, np.ndarray) else v for v in draw.values)
+        for name, draw in sampler.made.items()
+    }

@@ -36,7 +36,12 @@ from storage.settings.overrides import apply_overrides
 from tests.conftest import ROOT
 from tests.for_each import for_each
 from tests.scene_templates.balls import DEFAULTS, ROOMS, template_settings
-from tests.scene_templates.statistics import implausible, require_plausible, stated_table
+from tests.scene_templates.statistics import (
+    drawn_values,
+    implausible,
+    require_plausible,
+    stated_table,
+)
 from tests.scene_templates.test_distributions import rotation_table
 
 CONTRADICTIONS: list[tuple[type, str, Any]] = [
@@ -148,14 +153,14 @@ def test_each_is_distributed_as_stated_and_another_statement_would_be_noticed() 
 
 
 def test_a_name_has_one_statement() -> None:
-    """And parameters are plain values."""
+    """And drawn values are plain."""
     draws = RecordedSampler(rng_for(0, "x"))
     draws.uniform("number", 0, 1)
     with pytest.raises(ValueError, match="number"):
         draws.uniform("number", 0, 2)
     draws.colour("colour", (0, 0, 0), (1, 1, 1))
     draws.whole("count", 1, 1)
-    found = draws.parameters()
+    found = drawn_values(draws)
     (colour,) = found["colour"]
     assert found["count"] == (1,) and isinstance(colour, list) and len(colour) == 3
 
