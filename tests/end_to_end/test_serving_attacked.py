@@ -243,12 +243,16 @@ def test_the_same_page_does_as_it_likes_with_prefect_alone(tmp_path: Path) -> No
             _, flow = alone.ask("POST", "/api/flows/", {"name": "f"})
             given = {"name": "local", "flow_id": flow["id"], "entrypoint": "f_scenes"}
             assert alone.ask("POST", "/api/deployments/", given)[0] == 201
-            with browser(RESOLVED) as page:
-                told = _attack_of(alone, page, _origins(alone)["another port of this machine"])
+            won: set[str] = set()
+            for _ in range(3):  # a server that has just started breaks off answers on a busy disk
+                with browser(RESOLVED) as page:
+                    told = _attack_of(alone, page, _origins(alone)["another port of this machine"])
+                won |= {name for name, how in told.items() if how.startswith("answered")}
+                if won >= {"read: deployments", "run: json", "socket: events in", "frame"}:
+                    return
         finally:
             process.kill()
-    won = {name for name, how in told.items() if how.startswith("answered")}
-    assert won >= {"read: deployments", "run: json", "socket: events in", "frame"}, told
+    raise AssertionError((won, told))
 
 
 def _until_it_answers(server: Server) -> None:
