@@ -19,6 +19,7 @@ from storage.errors import TrilightError
 from storage.extensions import extension_digests, require_same_extensions
 from storage.records.objects import OBJECT, SKY, TEXTURE
 from storage.remote.url import parse_url
+from storage.settings.described import settings_record
 from storage.settings.overrides import differences
 
 ASIDE = ".bad"
@@ -164,7 +165,7 @@ def _user_maps(dataset: Dataset, command: Sequence[str]) -> dict[str, str | None
 
 def _changes(manifest: Manifest) -> dict[str, object]:
     """Return the settings of a dataset that differ from its preset's."""
-    build = preset_settings(manifest.build).as_json()
+    build = settings_record(preset_settings(manifest.build))
     changed = {name: now for name, _, now in differences(build, manifest.settings)}
     if _is_of_files(manifest):
         return {name: now for name, now in changed.items() if name not in _OF_SCENE_FILES}

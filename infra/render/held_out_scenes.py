@@ -49,13 +49,11 @@ def composing_child(
         variant: Mitsuba variant; None for that of the CPU, or of TRILIGHT_VARIANT.
     """
     variant = variant or choose_variant()
-    workers = threads or available_cores()
     shards = PublishedShards(DatasetFolder(folder))
     publication = begin_or_resume_dataset(shards, settings, environment(variant), 1)
-    accepted = ObjectLock(
-        source=objects, licence=None, settings=settings, writer=publication, workers=workers
-    ).accept()
-    arguments = (settings, accepted.origin, asset_store(), variant, workers)
+    lock = ObjectLock(source=objects, licence=None, settings=settings, writer=publication)
+    origin = lock.accept().origin
+    arguments = (settings, origin, asset_store(), variant, threads or available_cores())
     limits = dataclasses.replace(_LIMITS, memory_bytes=variant.address_space(_LIMITS.memory_bytes))
     return IsolatedChild(limits=limits, factory=SceneWorker, args=arguments)
 

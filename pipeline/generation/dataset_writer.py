@@ -51,7 +51,7 @@ from storage.records.objects import (
     write_failures,
 )
 from storage.remote.store import Store
-from storage.settings.described import from_record
+from storage.settings.described import from_record, settings_record
 from storage.settings.overrides import differences
 
 _LISTING = ".staging/listing/"
@@ -447,7 +447,7 @@ def begin_or_resume_dataset(
     if num_scenes < 1:
         raise TrilightError(f"scenes is {num_scenes}; expected at least 1.")
     num_planned = planned_scenes(num_scenes, settings.splits)
-    stated = settings.as_json()
+    stated = settings_record(settings)
     folder = shards.folder
     store = shards.store
     with folder.mutex("manifest"):
@@ -485,7 +485,7 @@ def _require_same_dataset(
     accept_environment: bool,
 ) -> None:
     _require_extendable(folder, manifest)
-    stored = from_record(DatasetSettings, manifest.settings).as_json()  # fields may come later
+    stored = settings_record(from_record(DatasetSettings, manifest.settings))  # fields came later
     differing = list(differences(stored, settings))
     what = "setting"
     next_step = "choose another --out"

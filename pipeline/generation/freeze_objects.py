@@ -35,7 +35,6 @@ from pipeline.objects.maps.listing import PLURALS, FoundMap, find_maps
 from pipeline.objects.maps.prepared import decode_prepared, map_cache_key, prepare_map
 from pipeline.objects.sources import ListedObjects, list_objects
 from pipeline.presets.settings import DatasetSettings
-from scene_templates.settings import SceneSettings
 from storage.atomic import write_atomically
 from storage.cache import cache_folder
 from storage.conventions import SPLITS
@@ -43,10 +42,10 @@ from storage.dataset.progress import announce_downloads, announce_objects, count
 from storage.dataset.splits import require_objects, split_of_object, split_of_shard
 from storage.digests import canonical_json, sha256_hex
 from storage.errors import EnvironmentFailure, Rejected, TrilightError
+from storage.machine import available_cores
 from storage.records.object_index import IndexedObject, IndexFacts, ObjectIndex, write_object_index
 from storage.records.objects import (
     OBJECT,
-    SKY,
     TEXTURE,
     Failure,
     LockedObject,
@@ -86,8 +85,6 @@ class ObjectLock:
     """Settings of the preset: how objects are prepared and assigned to splits."""
     writer: DatasetWriter
     """Writer of the dataset that the objects are frozen for."""
-    workers: int
-    """Number of objects that are prepared at the same time."""
     map_folders: Mapping[str, str] = field(default_factory=dict)
     """Folders of textures and maps by kind, which are frozen with the objects."""
     map_licence: str | None = None
@@ -190,6 +187,7 @@ class ObjectLock:
             EnvironmentFailure: a frozen object could not be prepared this time.
         """
         writer = self.writer
+        splits = self.settings.splits
         display_name = self._display_name
         frozen = writer.frozen_objects()
         transient = [failure for failure in rejected if is_transient(failure.reason)]
@@ -201,7 +199,7 @@ class ObjectLock:
             LockedObject(
                 **asset.record.identity,
                 asset_sha256=asset.asset_sha256,
-                split=split_of_object(asset.geometry_sha256, self.settings.splits),
+                split=split_of_object(asset.geometry_sha256, splits),
             )
             for asset in prepared
         ]
@@ -215,7 +213,7 @@ class ObjectLock:
             shards = range(writer.num_shards)
             require_objects(
                 {split: sum(entry.split == split for entry in objects) for split in SPLITS},
-                {split_of_shard(index, self.settings.splits) for index in shards},
+                {split_of_shard(index, splits) for index in shards},
             )
             self._warn(prepared, transient)
             writer.lock_objects(locked)
@@ -283,12 +281,13 @@ class ObjectLock:
             TrilightError: a folder is missing or empty, none of its files can be used, or the cache
                 cannot be written.
         """
+        licence = self.map_licence
         allowed = self.settings.allowed_licences
         rows: list[tuple[LockedObject, Path]] = []
         failures: list[Failure] = []
         for kind, folder in self.map_folders.items():
-            listing = find_maps(kind, folder, licence=self.map_licence, allowed_licences=allowed)
-            outcomes = _prepare_maps(kind, listing.maps, self.settings, self.workers)
+            listing = find_maps(kind, folder, licence=licence, allowed_licences=allowed)
+            outcomes = _prepare_maps(kind, listing.maps, self.settings)
             usable = [outcome for outcome in outcomes if not isinstance(outcome, Failure)]
             failures += [
                 failure(locked.uid, "not_read", notes.read_text("utf-8"))
@@ -343,7 +342,7 @@ class ObjectLock:
         return prepare_in_batches(
             sorted(records, key=attrgetter("uid")),
             work,
-            workers=self.workers,
+            workers=available_cores(),
             done=lambda count: count_object(folder, count),
             should_stop=should_stop,
             retry_transient=retry_transient,
@@ -397,34 +396,11 @@ def require_tried(display_name: str, failure: Failure) -> None:
         )
 
 
-def map_folders(folders: Mapping[str, str | None], scenes: SceneSettings) -> Mapping[str, str]:
-    """Return the folders of textures and maps that are given, by kind.
-
-    Raises:
-        TrilightError: a folder is given that no scene would use, or scenes need a folder that is
-            not given.
-    """
-    for kind, drawn in ((TEXTURE, scenes.textures), (SKY, scenes.skies)):
-        name = PLURALS[kind]
-        is_used = bool(drawn.share and drawn.own_share)
-        if folders[kind] is None and is_used:
-            raise TrilightError(
-                f"scenes.{name}.own_share is {drawn.own_share:g}, but --{name} is not given; "
-                f"expected a folder. Add --{name} FOLDER, or --set scenes.{name}.own_share=0."
-            )
-        if folders[kind] is not None and not is_used:
-            raise TrilightError(
-                f"--{name} is given, but scenes.{name}.share is {drawn.share:g} and own_share "
-                f"{drawn.own_share:g}; expected both above 0. Add --set scenes.{name}.share=0.5 "
-                f"--set scenes.{name}.own_share=1, or leave --{name} out."
-            )
-    return {kind: folder for kind, folder in folders.items() if folder is not None}
-
-
 def _prepare_maps(
-    kind: str, maps: Sequence[FoundMap], settings: DatasetSettings, workers: int
+    kind: str, maps: Sequence[FoundMap], settings: DatasetSettings
 ) -> list[tuple[LockedObject, Path] | Failure]:
     scenes = settings.scenes
+    workers = available_cores()
     size = scenes.textures.surfaces.size if kind == TEXTURE else scenes.skies.maps.height
     all_files = reach(files=(path for user_map in maps for path in user_map.files.values()))
 

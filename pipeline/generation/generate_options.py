@@ -7,14 +7,18 @@ from functools import cached_property
 from typing import Annotated, Any
 
 from pipeline.exchange.from_description import AlbedoOverOne
+from pipeline.objects.generated import BENCHMARK
+from pipeline.objects.generated import PREFIX as BUILTIN
 from pipeline.presets.registry import DATASET_PRESETS, preset_settings
 from pipeline.presets.settings import DatasetSettings
 from pipeline.renders.mitsuba_variant import Device
 from pipeline.renders.settings import NoiseFloor, Resolution
+from storage.aliases import OBJECTS, stored_name
 from storage.dataset.layout import DatasetFolder, dataset_folder
 from storage.dataset.settings import MOST_SCENES
 from storage.errors import TrilightError
 from storage.extensions import function_name
+from storage.records.objects import SKY, TEXTURE
 from storage.remote.safe_url import safe_url
 from storage.settings.described import checked
 from storage.settings.fields import option_of
@@ -152,6 +156,52 @@ class GenerateOptions:
             allow_licences=self.allow_licences,
             changes=self.changes,
         )
+
+    @property
+    def source(self) -> str:
+        """Source of the objects, as `list_objects` takes it; may hold a secret.
+
+        Raises:
+            TrilightError: the preset is frozen with another source than the given one.
+        """
+        objects = self.objects and stored_name(self.objects, OBJECTS)
+        settings = self.settings
+        if settings.source is None:
+            # An evaluated network may have been trained on the built-in objects.
+            return objects or (BENCHMARK if settings.splits.one_split else BUILTIN)
+        if objects is not None and objects != settings.source:
+            raise TrilightError(
+                f"--objects is {safe_url(objects)!r}; expected {settings.source!r}, the "
+                f"fixed source of {settings.build}. Omit --objects, or choose another build."
+            )
+        return settings.source
+
+    def map_folders(self) -> Mapping[str, str]:
+        """Return the given folders of textures and maps, by kind.
+
+        Raises:
+            TrilightError: a folder is given that no scene would use, or scenes need a folder that
+                is not given.
+        """
+        folders = {}
+        for kind, name in ((TEXTURE, "textures"), (SKY, "skies")):
+            folder = getattr(self, name)
+            drawn = getattr(self.settings.scenes, name)
+            is_used = bool(drawn.share and drawn.own_share)
+            if folder is None and is_used:
+                raise TrilightError(
+                    f"scenes.{name}.own_share is {drawn.own_share:g}, but --{name} is not given; "
+                    f"expected a folder. Add --{name} FOLDER, or --set scenes.{name}.own_share=0."
+                )
+            if folder is not None and not is_used:
+                raise TrilightError(
+                    f"--{name} is given, but scenes.{name}.share is {drawn.share:g} and own_share "
+                    f"{drawn.own_share:g}; expected both above 0. Add --set scenes.{name}.share="
+                    f"0.5 --set scenes.{name}.own_share=1, or leave --{name} out."
+                )
+            if folder is not None:
+                folders[kind] = folder
+        return folders
 
     @property
     def place(self) -> str:

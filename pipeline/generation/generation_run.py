@@ -29,7 +29,7 @@ from typing import Any, Generic, TypeVar
 
 from pipeline.exchange.scene_files import SceneFiles, find_scene_files
 from pipeline.generation.dataset_writer import DatasetWriter, begin_or_resume_dataset
-from pipeline.generation.freeze_objects import ObjectLock, map_folders
+from pipeline.generation.freeze_objects import ObjectLock
 from pipeline.generation.generate_options import GenerateOptions, generate_words
 from pipeline.generation.scene_origins import (
     Accept,
@@ -39,7 +39,7 @@ from pipeline.generation.scene_origins import (
     settings_for_files,
 )
 from pipeline.objects.sources import check_source
-from pipeline.presets.registry import DATASET_PRESETS, frozen_note, object_source
+from pipeline.presets.registry import DATASET_PRESETS, frozen_note
 from pipeline.presets.settings import DatasetSettings
 from pipeline.renders.mitsuba_variant import (
     Device,
@@ -59,8 +59,7 @@ from storage.dataset.splits import keeps_scenes, lacks_validation, scenes_of_sha
 from storage.dataset.statistics import Statistics
 from storage.errors import EnvironmentFailure, TrilightError
 from storage.file_locks import WaitNotice
-from storage.machine import available_cores
-from storage.records.objects import SKY, TEXTURE, Failure
+from storage.records.objects import Failure
 
 _MOST_CHILDREN = 4
 """Children of a GPU. One that only renders fills an H200 (60,700 views an hour, four 58,500), but a
@@ -229,12 +228,12 @@ def resolve_inputs(
         return resolve_revisit(settings, options.revisits)
     licence = options.licence
     # of scene files too: they draw no maps, so that shares of maps are refused
-    maps = map_folders({TEXTURE: options.textures, SKY: options.skies}, settings.scenes)
+    maps = options.map_folders()
     if options.scenes_from is not None:
         files = find_scene_files(options.scenes_from, options.albedo_over_one)
         settings = settings_for_files(settings, files, options.views)
         return settings, partial(accept_scene_files, files, licence, settings)
-    source = object_source(settings, options.objects)
+    source = options.source
     if not folder.manifest.exists():
         check_source(source, allowed_licences=settings.allowed_licences, licence=licence)
 
@@ -244,7 +243,6 @@ def resolve_inputs(
             licence=licence,
             settings=settings,
             writer=writer,
-            workers=available_cores(),
             map_folders=maps,
             map_licence=options.map_licence,
         ).accept()

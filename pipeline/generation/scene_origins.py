@@ -37,6 +37,7 @@ from storage.records.objects import OBJECT, LockedObject
 from storage.records.sample import Sample, decode_sample
 from storage.records.scene import Scene
 from storage.seeds import SceneKey
+from storage.settings.described import settings_record
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -154,7 +155,7 @@ class RevisitedScenes:
     def _pictures_stay(self, settings: DatasetSettings) -> bool:
         """Return True if an equal scene and camera would give equal picture files."""
         was = self._source.manifest.settings
-        now = settings.as_json()
+        now = settings_record(settings)
         return (
             settings.revisit is not None
             and settings.revisit.keeps_light

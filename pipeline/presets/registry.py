@@ -4,18 +4,15 @@ import dataclasses
 from collections.abc import Mapping
 from typing import Any
 
-from pipeline.objects.generated import BENCHMARK
-from pipeline.objects.generated import PREFIX as BUILTIN
 from pipeline.presets.frozen_v1 import PRESETS_FOR_JUDGING, RENDERFORMER_PRESETS
 from pipeline.presets.settings import DatasetPreset, DatasetSettings
 from pipeline.presets.training import PRESETS_FOR_TRAINING
 from pipeline.renders.settings import Targets, target_overrides
-from storage.aliases import OBJECTS, PRESET_ALIASES, stored_name
+from storage.aliases import PRESET_ALIASES
 from storage.dataset.statistics import Statistics
 from storage.errors import TrilightError
 from storage.extensions import mistakes_of_entry
 from storage.registry import Registry
-from storage.remote.safe_url import safe_url
 from storage.settings.overrides import apply_overrides
 
 DATASET_PRESETS: Registry[DatasetPreset] = Registry(
@@ -94,24 +91,6 @@ def option_overrides(
     stated = {"seed": seed, "renders.resolution": resolution}
     changes: dict[str, Any] = {name: value for name, value in stated.items() if value is not None}
     return changes | {f"renders.{name}": db for name, db in target_overrides(noise_targets).items()}
-
-
-def object_source(settings: DatasetSettings, objects: str | None) -> str:
-    """Return the source of the objects.
-
-    Raises:
-        TrilightError: the preset is frozen with another source than the given one.
-    """
-    objects = objects and stored_name(objects, OBJECTS)
-    if settings.source is None:
-        # An evaluated network may have been trained on the built-in objects.
-        return objects or (BENCHMARK if settings.splits.one_split else BUILTIN)
-    if objects is not None and objects != settings.source:
-        raise TrilightError(
-            f"--objects is {safe_url(objects)!r}; expected {settings.source!r}, the "
-            f"fixed source of {settings.build}. Omit --objects, or choose another build."
-        )
-    return settings.source
 
 
 def frozen_note(preset: str, statistics: Statistics) -> tuple[str, ...]:

@@ -136,14 +136,10 @@ class DatasetSettings:
         )
         return dataclasses.replace(self.assets, own_materials=source_materials)
 
-    def as_json(self) -> dict[str, Any]:
-        """Return the settings as JSON values."""
-        return settings_record(self)
-
     @property
     def digest(self) -> str:
         """sha256 of the settings."""
-        return sha256_hex(canonical_json(self.as_json()))
+        return sha256_hex(canonical_json(settings_record(self)))
 
 
 @dataclass(frozen=True, kw_only=True)

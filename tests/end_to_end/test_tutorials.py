@@ -20,6 +20,7 @@ from pipeline.presets.registry import preset_settings
 from storage.digests import sha256_of_file
 from storage.records.objects import write_objects_lock
 from storage.records.scene import Scene
+from storage.settings.described import settings_record
 from tests.command_line import trilight
 from tests.end_to_end.production_kit import Step, steps_of, tutorial
 from tests.infra.viewer.served_kit import served
@@ -28,7 +29,7 @@ from tests.train.toy import toy_scene, write_toy_dataset
 
 PX = 16
 """Width of the toys' pictures, where the pages have 64."""
-SMOKE = preset_settings("smoke").as_json()
+SMOKE = settings_record(preset_settings("smoke"))
 RENDERS = SMOKE["renders"]
 SMALL = ["--set", "resolution=16", "--set", "views_per_scene=2"]
 """Of trainings."""

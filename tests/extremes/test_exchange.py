@@ -27,6 +27,7 @@ from storage.records.material import EMISSION
 from storage.records.profiles import PROFILES, keeps_law, pack_picture
 from storage.records.sample import decode_sample, encode_sample
 from storage.records.scene import MAX_POSITION_M, Scene, SceneObject
+from storage.settings.described import settings_record
 from tests.for_each import case
 from tests.pipeline.exchange.exchange_kit import (
     assert_h5_keeps_light,
@@ -342,7 +343,7 @@ def test_numbers_of_json_come_back_digit_by_digit_and_none_that_is_no_number(
     for suffix in (".usda", ".usdc"):
         assert_usd_keeps_all(scene, tmp_path, suffix)
     build = preset_settings("smoke", seed=2**256 - 1)
-    assert json.loads(json.dumps(build.as_json()))["seed"] == 2**256 - 1
+    assert json.loads(json.dumps(settings_record(build)))["seed"] == 2**256 - 1
     sample = dataclasses.replace(tiny_sample(), scene=tiny_scene(provenance={"value": math.nan}))
     with pytest.raises(ValueError, match="JSON compliant"):
         encode_sample(sample)

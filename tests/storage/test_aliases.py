@@ -2,7 +2,7 @@
 
 from model.open import find_network
 from pipeline.generation.generate_options import GenerateOptions, generate_words
-from pipeline.presets.registry import DATASET_PRESETS, object_source, preset_settings
+from pipeline.presets.registry import DATASET_PRESETS, preset_settings
 from storage.aliases import NETWORKS, OBJECTS, PRESET_ALIASES, stored_name
 from train.presets import TRAINING_PRESETS, training_preset
 
@@ -18,7 +18,7 @@ def test_a_name_for_people_is_the_stored_one() -> None:
 def test_what_is_stored_keeps_its_name() -> None:
     assert preset_settings("tiny") == preset_settings("smoke")
     assert training_preset("tiny") == training_preset("smoke")
-    assert object_source(preset_settings("tiny"), "procedural:8") == "builtin:8"
+    assert GenerateOptions(build="tiny", objects="procedural:8").source == "builtin:8"
     assert find_network("default").path == find_network("builtin:").path
     assert "tiny" not in list(DATASET_PRESETS) and "tiny" not in list(TRAINING_PRESETS)
 

@@ -227,7 +227,7 @@ def test_a_dataset_is_followed_and_options_count_more(tmp_path: Path) -> None:
         settings=_file(tmp_path, "renders: {resolution: 96, max_spp: 64}\nseed: 1\n"),
     )
     alike = with_base_settings(GenerateOptions(build=FAR), BaseSettings(like=shared.like))
-    found = preset_settings(FAR, changes=alike.changes).as_json()
+    found = settings_record(preset_settings(FAR, changes=alike.changes))
     assert found == {**record, "build": FAR}
     order = GenerateOptions(build=FAR, resolution=32, changes={"renders.max_spp": 128})
     changes = with_base_settings(order, shared).changes

@@ -62,7 +62,7 @@ def begun(root: Path) -> DatasetWriter:
 
 def asked(writer: DatasetWriter, source: str = SOURCE, licence: str | None = None) -> ObjectLock:
     """Return what is asked for of objects."""
-    return ObjectLock(source=source, licence=licence, settings=BUILD, writer=writer, workers=1)
+    return ObjectLock(source=source, licence=licence, settings=BUILD, writer=writer)
 
 
 def frozen(writer: DatasetWriter, objects: Sequence[PreparedObject]) -> AcceptedObjects:

@@ -16,7 +16,7 @@ import pytest
 from pipeline.documents.rights import encode_attribution
 from pipeline.generation import freeze_objects, pipeline, render_workers, scene_worker
 from pipeline.generation.dataset_writer import DatasetWriter
-from pipeline.generation.freeze_objects import AcceptedMaps, ObjectLock, map_folders
+from pipeline.generation.freeze_objects import AcceptedMaps, ObjectLock
 from pipeline.generation.generate_options import GenerateOptions
 from pipeline.generation.prepare_isolated import asset_store
 from pipeline.generation.scene_origins import AcceptedObjects, ComposedScenes, require_same
@@ -247,18 +247,13 @@ def accepted(settings: DatasetSettings, tmp_path_factory: pytest.TempPathFactory
     png(root / "textures" / "copy.bmp", noise(12))
     exr(root / "skies" / "copy.exr", sun_map(12))
     exr(root / "skies" / "bad.exr", np.full((2, 4, 3), np.nan, np.float32))
-    folders = {TEXTURE: str(root / "textures"), SKY: str(root / "skies")}
     with pytest.MonkeyPatch.context() as patch:
         patch.setenv("TRILIGHT_CACHE", str(root / "cache"))
         patch.setattr(freeze_objects, "IsolatedChild", ChildHere)
         writer: Any = None
+        folders = {TEXTURE: str(root / "textures"), SKY: str(root / "skies")}
         return ObjectLock(
-            source="",
-            licence=None,
-            settings=settings,
-            writer=writer,
-            workers=1,
-            map_folders=folders,
+            source="", licence=None, settings=settings, writer=writer, map_folders=folders
         ).accept_maps()
 
 
@@ -357,11 +352,10 @@ def test_share_alike_licences_never_meet() -> None:
 
 
 def test_folders_and_shares_belong_together() -> None:
-    textures_alone = {TEXTURE: "t", SKY: None}
     with pytest.raises(TrilightError, match="--skies is not given"):
-        map_folders(textures_alone, preset_settings("smoke", changes=SHARES).scenes)
+        GenerateOptions(textures="t", changes=SHARES).map_folders()
     with pytest.raises(TrilightError, match=r"--textures is given, but .*own_share 0"):
-        map_folders(textures_alone, preset_settings("smoke").scenes)
+        GenerateOptions(textures="t").map_folders()
     with pytest.raises(TrilightError, match="--scenes-from scenes was given with --textures"):
         GenerateOptions(textures="t", scenes_from="scenes")
     with pytest.raises(TrilightError, match="only with --textures or --skies"):

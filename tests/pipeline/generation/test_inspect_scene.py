@@ -39,6 +39,7 @@ from storage.records.scene import Scene, SceneObject
 from storage.records.scene_file import encode_scene
 from storage.renderer import Camera, Sampling
 from storage.seeds import seed_for
+from storage.settings.described import settings_record
 from storage.settings.overrides import json_or_word
 from tests.command_line import trilight
 from tests.infra.child_here import use_children_here
@@ -292,7 +293,7 @@ def build(**changes: object) -> DatasetSettings:
 
 
 def test_what_stores_some_says_so_in_the_order_of_the_table() -> None:
-    assert build(**ASKED).as_json()["storage"]["passes"] == list(NAMES)
+    assert settings_record(build(**ASKED))["storage"]["passes"] == list(NAMES)
     assert build(**ASKED).digest == build(**{"storage.passes": list(NAMES)}).digest
     assert build(**ASKED).digest != build().digest
     with pytest.raises(TrilightError, match=r"storage.passes.*no pass 'dept'; did you mean depth"):

@@ -7,8 +7,9 @@ from typing import Any, cast
 import numpy as np
 import pytest
 
+from pipeline.generation.generate_options import GenerateOptions
 from pipeline.presets.frozen_v1 import PRESETS_FOR_JUDGING, RENDERFORMER_PRESETS
-from pipeline.presets.registry import DATASET_PRESETS, frozen_note, object_source, preset_settings
+from pipeline.presets.registry import DATASET_PRESETS, frozen_note, preset_settings
 from pipeline.presets.settings import DatasetSettings
 from scene_templates import placement
 from scene_templates import sample_lights as emitters
@@ -20,7 +21,7 @@ from storage.dataset.statistics import Statistics
 from storage.digests import sha256_hex
 from storage.errors import TrilightError
 from storage.seeds import rng_for
-from storage.settings.described import from_record
+from storage.settings.described import from_record, settings_record
 from storage.settings.overrides import differences
 from tests.for_each import for_each
 from tests.pipeline.programs import printed_by
@@ -32,10 +33,10 @@ JUDGED = ["out-of-range", "out-of-range-2", "benchmark-v1", "benchmark-v1-mini"]
 @for_each("name", DATASET_PRESETS)
 def test_settings_survive_the_manifest(name: str) -> None:
     build = preset_settings(name)
-    stored = json.loads(json.dumps(build.as_json()))
-    assert stored == build.as_json()
+    stored = json.loads(json.dumps(settings_record(build)))
+    assert stored == settings_record(build)
     again = from_record(DatasetSettings, stored)
-    assert again.as_json() == stored and again.digest == build.digest
+    assert settings_record(again) == stored and again.digest == build.digest
     assert build.build == ("benchmark-v1" if name == "benchmark-v1-mini" else name)
 
 
@@ -49,7 +50,10 @@ def test_what_is_named_changes_and_nothing_else(name: str) -> None:
         noise_targets={"noise_floor_db": 33.0},
         changes={"scenes.num_views": 3},
     )
-    found = {path: value for path, _, value in differences(before.as_json(), after.as_json())}
+    found = {
+        path: value
+        for path, _, value in differences(settings_record(before), settings_record(after))
+    }
     expected: dict[str, Any] = {"seed": 7, "renders.resolution": 64}
     expected |= {"renders.noise_floor_db": 33.0, "scenes.num_views": 3}
     if before.renders.noise_floor_objects_db is not None:
@@ -64,7 +68,7 @@ def test_floors_licences_and_mistakes_of_a_build() -> None:
     assert linear.renders.targets_db == {"psnr_linear_db": 33.0}
     added = preset_settings("smoke", changes={"renders.noise_floor_linear_db": 33.0})
     assert added.renders.targets_db == {**plain.targets_db, "psnr_linear_db": 33.0}
-    assert from_record(DatasetSettings, linear.as_json()) == linear
+    assert from_record(DatasetSettings, settings_record(linear)) == linear
     assert len({each.digest for each in (preset_settings("smoke"), linear, added)}) == 3
     usual = preset_settings("smoke").allowed_licences
     more = preset_settings("smoke", allow_licences=("ZZ-1.0", "AA-1.0", usual[0])).allowed_licences
@@ -113,13 +117,13 @@ def test_the_simplest_objects_always_fit(name: str) -> None:
 
 
 def test_sets_to_be_judged_by_have_objects_of_their_own() -> None:
-    assert object_source(preset_settings("smoke"), None) == "builtin:"
-    assert object_source(preset_settings("smoke"), "folder") == "folder"
-    assert object_source(preset_settings("out-of-range"), "folder") == "folder"
+    assert GenerateOptions(build="smoke").source == "builtin:"
+    assert GenerateOptions(build="smoke", objects="folder").source == "folder"
+    assert GenerateOptions(build="out-of-range", objects="folder").source == "folder"
     for name in JUDGED:
-        assert object_source(preset_settings(name), None) == "builtin:benchmark-v1"
+        assert GenerateOptions(build=name).source == "builtin:benchmark-v1"
     with pytest.raises(TrilightError, match="Omit --objects"):
-        object_source(preset_settings("benchmark-v1"), "builtin:")
+        _ = GenerateOptions(build="benchmark-v1", objects="builtin:").source
 
 
 def test_a_frozen_set_says_whether_it_is_the_published_one() -> None:
@@ -141,7 +145,7 @@ def test_one_word_asks_for_own_materials_and_their_numbers_count_in_the_digest()
     plain = preset_settings("smoke", changes=OWN)
     assert plain.mesh_settings.own_materials.keep
     assert not plain.mesh_settings.own_materials.emission
-    record = plain.as_json()
+    record = settings_record(plain)
     assert record["assets"]["own_materials"]["keep"] is True
     assert "emission" not in record["assets"]["own_materials"]
     assert record["scenes"]["materials"]["source"] == "object"
@@ -162,7 +166,7 @@ def test_one_word_asks_for_own_materials_and_their_numbers_count_in_the_digest()
 
 def test_a_build_that_draws_its_materials_says_nothing_of_them() -> None:
     for name in [name for name in DATASET_PRESETS if name != "object-views"]:
-        record = DATASET_PRESETS[name].settings().as_json()
+        record = settings_record(DATASET_PRESETS[name].settings())
         assert "own_materials" not in record["assets"]
         assert not {"source", "own_share"} & set(record["scenes"]["materials"])
     smoke = preset_settings("smoke")

@@ -35,6 +35,7 @@ from storage.records.retextured import NO_TEXTURES
 from storage.records.sample import decode_sample, encode_sample
 from storage.records.scene import Scene
 from storage.records.texture import Texture
+from storage.settings.described import settings_record
 from tests.oracle.kernel_bsdf import exact_twin
 from tests.pipeline.programs import printed_by
 from tests.pipeline.renders.sampling import (
@@ -350,7 +351,7 @@ def test_a_build_with_the_setting_stores_what_verify_accepts() -> None:
         )
         manifest = Manifest(
             build="smoke",
-            settings=settings.as_json(),
+            settings=settings_record(settings),
             environment={},
             num_scenes=1,
             num_views=2,
