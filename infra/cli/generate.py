@@ -32,8 +32,13 @@ from infra.cli.overrides import BaseSettings, with_base_settings
 from infra.cli.process_exit import temporary_folder
 from pipeline.executors.registry import find_executor
 from pipeline.generation.dataset_writer import require_its_extensions
-from pipeline.generation.generate_options import CorePrice, GenerateOptions, generate_words
-from pipeline.generation.revisit_options import RevisitOptions, to_generate_options
+from pipeline.generation.generate_options import (
+    CorePrice,
+    GenerateOptions,
+    RevisitOptions,
+    generate_words,
+    to_generate_options,
+)
 from pipeline.objects.licences import USER_PROVIDED
 from storage.dataset.layout import DatasetFolder, dataset_folder
 from storage.dataset.manifest import read_head

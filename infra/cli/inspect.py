@@ -113,9 +113,8 @@ def _inspect_scene(source: str, turntable: Path | None) -> None:
     from pipeline.exchange.open_scene import scene_source
     from pipeline.generation.inspect_scene import inspect_scene
 
-    result = inspect_scene(scene_source(source), turntable)
-    record = {**result.facts, "notes": list(result.notes)}
-    print_result(source, _fact_rows(result.facts), record, notes=result.notes)
+    facts, notes = inspect_scene(scene_source(source), turntable)
+    print_result(source, _fact_rows(facts), {**facts, "notes": notes}, notes=notes)
     if turntable is not None:
         suggest_look(f"Look at {turntable}")
 

@@ -28,11 +28,12 @@ from model.open import BUILTIN_NETWORKS
 from pipeline.documents.checksums import write_sums
 from pipeline.documents.pages import Figure, render_page
 from pipeline.documents.png import encode_png
-from pipeline.documents.sheets import ChosenScene, choose_scenes, read_chosen
+from pipeline.documents.sheets import choose_scenes, read_chosen
 from pipeline.renders.mitsuba_variant import choose_variant
 from storage.atomic import write_atomically
 from storage.conventions import SPLITS, preview_srgb8
 from storage.dataset.dataset import Dataset, open_dataset
+from storage.dataset.manifest import ShardEntry
 from storage.dataset.verify import verify_dataset
 from storage.errors import TrilightError
 from storage.markdown import front_matter
@@ -190,8 +191,8 @@ def _medians(comparisons: Sequence[SceneComparison]) -> Iterator[tuple[str, floa
         yield name, float(np.median(values)), min(values), beaten
 
 
-def chosen_scenes(dataset: Dataset, count: int) -> list[ChosenScene]:
-    """Return up to `count` scenes of the test split, or of all splits if it is empty.
+def chosen_scenes(dataset: Dataset, count: int) -> list[tuple[ShardEntry, str]]:
+    """Return shard and key of up to `count` scenes of the test split, or of all if it is empty.
 
     Raises:
         TrilightError: `count` is below 1, or the dataset is empty.
@@ -207,7 +208,11 @@ def chosen_scenes(dataset: Dataset, count: int) -> list[ChosenScene]:
 
 
 def compare_scenes(
-    dataset: Dataset, chosen: Sequence[ChosenScene], *, checkpoint: str, done: Callable[[], None]
+    dataset: Dataset,
+    chosen: Sequence[tuple[ShardEntry, str]],
+    *,
+    checkpoint: str,
+    done: Callable[[], None],
 ) -> Iterator[SceneComparison]:
     """Yield the comparison of each scene's first view.
 
@@ -216,7 +221,7 @@ def compare_scenes(
     """
     with contextlib.closing(RenderChild(choose_variant(), threads=1)) as child:
         by_width: dict[int, Sequence[Renderer]] = {}
-        for entry, sample in read_chosen(dataset, chosen):
+        for shard, sample in read_chosen(dataset, chosen):
             width = int(sample.radiance_rgb.shape[1])
             if width not in by_width:
                 qualities = [FixedSamples(spp=spp, denoiser="fast") for spp in RIVALS]
@@ -236,7 +241,7 @@ def compare_scenes(
             row = judge_view(sample, validation_scene(sample, width), 0, pictures, None)
             yield SceneComparison(
                 key=row.key,
-                caption=f"{entry.split}, {row.template}, {row.num_triangles} triangles",
+                caption=f"{shard.split}, {row.template}, {row.num_triangles} triangles",
                 target_rgb=target,
                 floor_db=row.floors[METRIC],
                 pictures_rgb=pictures,

@@ -15,8 +15,7 @@ from infra.cli.options import PRESETS
 from infra.render.options import RenderOptions
 from infra.serving.train_model import TrainOptions
 from pipeline.flows.forms import DatasetInRuns
-from pipeline.generation.generate_options import CorePrice
-from pipeline.generation.revisit_options import RevisitOptions
+from pipeline.generation.generate_options import CorePrice, RevisitOptions
 from pipeline.presets.settings import DatasetSettings
 from pipeline.shards.expression import TEXTS
 from scene_templates.recorded_sampler import RecordedDraw

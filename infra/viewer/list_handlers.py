@@ -250,17 +250,13 @@ def selected_rows(
     """
     stated = {name: query.get(name) or None for name in ("split", "template", "where")}
     selection = Selection(**stated)  # type: ignore[arg-type]
-    where = selection.condition()
+    where = selection.condition
     if where is not None and (unknown := sorted(where.names - _NAMES)):
         raise TrilightError(f"{unknown[0]}: not in the page's index; use trilight shards list.")
     sort = query.get("sort", "key")
     if sort not in SORTS:
         raise TrilightError(f"sort is {sort:.40}; {expected_one_of(sort, SORTS)}.")
-    taken = [
-        row
-        for row in rows
-        if selection.takes(row.facts) and (where is None or where.holds(row.facts.values))
-    ]
+    taken = [row for row in rows if selection.takes(row.facts)]
     backwards = query.get("descending") == "1"
     taken.sort(key=lambda row: (row.columns[sort], row.facts.key), reverse=backwards)
     return taken, option_words(selection)

@@ -2,6 +2,7 @@
 
 import bisect
 import dataclasses
+import json
 from collections import Counter
 from collections.abc import Collection, Mapping, Sequence
 from typing import Any
@@ -9,19 +10,20 @@ from typing import Any
 from markupsafe import Markup
 
 from pipeline.documents.checksums import renew_sums
-from pipeline.documents.croissant import encode_croissant
 from pipeline.documents.distributions import MEASURED, Distributions, dataset_distributions
 from pipeline.documents.pages import render_markdown
 from pipeline.documents.report import write_report
 from pipeline.documents.rights import Rights, encode_attribution, hub_licence, rights_of
 from pipeline.documents.sheets import write_contact_sheet
 from storage.atomic import write_atomically
+from storage.conventions import SPLITS
 from storage.dataset.dataset import Dataset
 from storage.dataset.layout import DatasetFolder
-from storage.dataset.manifest import Manifest, read_manifest, write_manifest
+from storage.dataset.manifest import Manifest, ShardEntry, read_manifest, write_manifest
 from storage.dataset.planned import derivation_of
 from storage.dataset.statistics import Statistics, dataset_statistics
 from storage.digests import sha256_hex, sha256_of_file
+from storage.licences import licence_url
 from storage.markdown import front_matter
 from storage.records.objects import SKY, TEXTURE
 from storage.records.profiles import PLAIN
@@ -83,9 +85,15 @@ def encode_card(
 
 def _front(folder: DatasetFolder, manifest: Manifest, rights: Rights, title: str) -> dict[str, Any]:
     files = [
-        {"split": split, "path": _patterns(manifest, split)}
-        for split in ("train", "validation", "test")
-        if any(shard.split == split for shard in manifest.shards)
+        {"split": split, "path": sorted(patterns, reverse=True)}
+        for split in SPLITS
+        if (
+            patterns := {
+                f"part-*/{split}-*.tar" if "/" in shard.name else f"{split}-*.tar"
+                for shard in manifest.shards
+                if shard.split == split
+            }
+        )
     ]
     return {
         **hub_licence(rights, link=folder.licences.name),
@@ -95,12 +103,6 @@ def _front(folder: DatasetFolder, manifest: Manifest, rights: Rights, title: str
         "tags": list(_TAGS),
         "configs": [{"config_name": "default", "data_files": files}],
     }
-
-
-def _patterns(manifest: Manifest, split: str) -> list[str]:
-    names = [shard.name for shard in manifest.shards if shard.split == split]
-    patterns = {f"part-*/{split}-*.tar" if "/" in name else f"{split}-*.tar" for name in names}
-    return sorted(patterns, reverse=True)
 
 
 def _size_category(num_scenes: int) -> str:
@@ -117,13 +119,15 @@ def _by_split(manifest: Manifest, distributions: Distributions) -> list[Sequence
         num_views = int(floors["noise_floor_db"]["count"])
         shards = [shard for shard in manifest.shards if shard.split == split]
         reached = distributions.reaches_targets(split)
+        expected = summary(distributions.values[split]["expected_error_db"])
+        probably = f", probably {expected['median']:.1f}" if expected["count"] else ""
         rows.append(
             (
                 split,
                 sum(shard.num_samples for shard in shards),
                 num_views,
                 len(shards),
-                _three(floors, "median") + _probably(distributions, split) if num_views else "",
+                _three(floors, "median") + probably if num_views else "",
                 _three(floors, "p5") if num_views else "",
                 f"{reached.mean():.0%}" if reached is not None and num_views else "",
                 f"{distributions.views_at_cap[split] / max(num_views, 1):.0%}",
@@ -135,12 +139,6 @@ def _by_split(manifest: Manifest, distributions: Distributions) -> list[Sequence
 def _three(floors: Mapping[str, Mapping[str, float]], statistic: str) -> str:
     log, linear, objects = (numbers[statistic] for numbers in floors.values())
     return f"{log:.1f} ({linear:.1f}, {objects:.1f})"
-
-
-def _probably(distributions: Distributions, split: str) -> str:
-    """Return the median of the expected errors of a split behind a comma; empty without one."""
-    expected = summary(distributions.values[split]["expected_error_db"])
-    return f", probably {expected['median']:.1f}" if expected["count"] else ""
 
 
 def _user_maps(distributions: Distributions) -> list[tuple[str, int, int]]:
@@ -159,18 +157,17 @@ def _arrays(packings: Collection[str]) -> list[str]:
     return [*(f'sample.get("{packing}")' for packing in rest), f'sample["{last}"]']
 
 
-def write_documents(dataset: Dataset, out: DatasetFolder | None = None) -> Statistics:
+def write_documents(dataset: Dataset, out: DatasetFolder) -> Statistics:
     """Write card, licences, croissant, attribution, contact sheet and report of a dataset.
 
     Each file is written atomically. They depend on the dataset alone, so equal datasets have equal
     documents.
 
-    They go into `out`, by default the dataset's folder; the dataset may be on a server.
+    They go into `out`; the dataset itself may be on a server.
 
     Raises:
         TrilightError: a shard is missing, a sample unreadable, or the folder cannot be written.
     """
-    out = out or dataset.folder
     manifest = dataset.manifest
     statistics = dataset_statistics(dataset)
     distributions = dataset_distributions(dataset)
@@ -182,17 +179,163 @@ def write_documents(dataset: Dataset, out: DatasetFolder | None = None) -> Stati
     write_atomically(out.croissant, encode_croissant(manifest, rights))
     card = encode_card(out, manifest, distributions, rights)
     if out.manifest.exists():
-        _write_digests(out, card)
+        with out.mutex("manifest"):
+            documents = {
+                path.name: sha256_of_file(path)
+                for path in (out.attribution, out.licences, out.croissant)
+            }
+            listed = read_manifest(out.manifest)
+            documents[out.card.name] = sha256_hex(card)  # which is still to be written
+            write_manifest(out.manifest, dataclasses.replace(listed, documents=documents))
     write_atomically(out.card, card)  # last: with it, the dataset is finished
     renew_sums(out.root)
     return statistics
 
 
-def _write_digests(folder: DatasetFolder, card: bytes) -> None:
-    """Store the digests of the documents in the manifest; `card` is still to be written."""
-    with folder.mutex("manifest"):
-        written = (folder.attribution, folder.licences, folder.croissant)
-        documents = {path.name: sha256_of_file(path) for path in written}
-        documents[folder.card.name] = sha256_hex(card)
-        manifest = read_manifest(folder.manifest)
-        write_manifest(folder.manifest, dataclasses.replace(manifest, documents=documents))
+_TERMS = (
+    "arrayShape citeAs column containedIn equivalentProperty extract field fileObject "
+    "fileProperty fileSet format includes isArray isLiveDataset jsonPath key md5 parentField "
+    "path recordSet references regex repeated replace samplingRate separator source subField "
+    "transform"
+).split()
+_CONTEXT: Mapping[str, Any] = {
+    "@language": "en",
+    "@vocab": "https://schema.org/",
+    "conformsTo": "dct:conformsTo",
+    "cr": "http://mlcommons.org/croissant/",
+    "data": {"@id": "cr:data", "@type": "@json"},
+    "dataType": {"@id": "cr:dataType", "@type": "@vocab"},
+    "dct": "http://purl.org/dc/terms/",
+    "description": {"@container": "@language"},
+    "examples": {"@id": "cr:examples", "@type": "@json"},
+    "name": {"@container": "@language"},
+    "rai": "http://mlcommons.org/croissant/RAI/",
+    "sc": "https://schema.org/",
+    **{term: f"cr:{term}" for term in _TERMS},
+}
+"""The context that the specification prescribes."""
+
+_SPLIT_URLS: Mapping[str, str] = {
+    "train": "http://mlcommons.org/croissant/Training",
+    "validation": "http://mlcommons.org/croissant/Validation",
+    "test": "http://mlcommons.org/croissant/Test",
+}
+_RECORDS = "scene-records"
+
+
+def encode_croissant(manifest: Manifest, rights: Rights) -> bytes:
+    """Return `croissant.json`: every shard with its sha256, and a record for each scene.
+
+    The vocabulary is Croissant 1.1 of MLCommons, as JSON-LD. It is written as plain JSON:
+    mlcroissant, which validates it in the tests, would be a slower way to write the same
+    dictionary. It has no date of publication: equal datasets give equal bytes. A licence without a
+    known URL is stated by its name.
+    """
+    digest = manifest.dataset_digest
+    shards = list(manifest.shards)
+    document: dict[str, Any] = {
+        "@context": _CONTEXT,
+        "@type": "sc:Dataset",
+        "conformsTo": "http://mlcommons.org/croissant/1.1",
+        "name": f"trilight-{manifest.build}",
+        "description": (
+            f"{manifest.num_samples} path-traced scenes of triangles with {manifest.num_views} HDR "
+            "views each, every view with its own measured error, as WebDataset shards."
+        ),
+        "version": f"{manifest.schema_version}.0.0+{digest[:12]}",
+        "identifier": f"sha256:{digest}",
+        "keywords": ["neural rendering", "path tracing", "HDR", "WebDataset"],
+        "license": [licence_url(name) or name for name in rights.licences],
+        "distribution": _distribution(shards),
+        "recordSet": [_splits(shards), _scenes()] if shards else [],
+    }
+    text = json.dumps(document, indent=1, sort_keys=True, ensure_ascii=True)
+    return text.encode() + b"\n"
+
+
+MOST_LISTED = 10_000
+"""Most shards that are listed one by one; beyond that only `manifest.json` has their digests."""
+
+
+def _distribution(shards: list[ShardEntry]) -> list[dict[str, Any]]:
+    """Return the shards, and the kinds of members in all of them."""
+    if len(shards) > MOST_LISTED:
+        files = [
+            _node(
+                "cr:FileSet",
+                "shards",
+                description="manifest.json has the size and sha256 of each",
+                encodingFormat="application/x-tar",
+                includes="**/*.tar",
+            )
+        ]
+    else:
+        files = [
+            _node(
+                "cr:FileObject",
+                shard.name,
+                contentUrl=shard.name,
+                contentSize=f"{shard.num_bytes} B",
+                encodingFormat="application/x-tar",
+                sha256=shard.sha256,
+            )
+            for shard in shards
+        ]
+    kinds = (
+        (_RECORDS, "objects, provenance and the record of each view", "application/json", "*.json"),
+        (
+            "scene-arrays",
+            "geometry, materials and cameras as safetensors, gzip where the name ends so",
+            "application/octet-stream",
+            "*.scene.safetensors*",
+        ),
+        ("pictures", "linear radiance of each view, half floats", "image/x-exr", "*.exr"),
+    )
+    archives = [{"@id": file["name"]} for file in files]
+    members = [
+        _node(
+            "cr:FileSet",
+            name,
+            description=description,
+            containedIn=archives,
+            encodingFormat=encoding,
+            includes=pattern,
+        )
+        for name, description, encoding, pattern in kinds
+    ]
+    return [*files, *members] if files else []
+
+
+def _node(kind: str, name: str, **fields: Any) -> dict[str, Any]:
+    return {"@type": kind, "@id": name, "name": name, **fields}
+
+
+def _splits(shards: list[ShardEntry]) -> dict[str, Any]:
+    used = [split for split in SPLITS if any(shard.split == split for shard in shards)]
+    return _node(
+        "cr:RecordSet",
+        "splits",
+        description="a shard holds one split; its name begins with it",
+        dataType="cr:Split",
+        key={"@id": "splits/name"},
+        field=[_field("splits/name", "sc:Text"), _field("splits/url", "sc:URL")],
+        data=[{"splits/name": split, "splits/url": _SPLIT_URLS[split]} for split in used],
+    )
+
+
+def _scenes() -> dict[str, Any]:
+    """Return the records of scenes: key and JSON, which is all mlcroissant reads of many tars."""
+    key = {"extract": {"fileProperty": "filename"}, "transform": {"regex": r"^([^.]+)\."}}
+    content = {"extract": {"fileProperty": "content"}}
+    return _node(
+        "cr:RecordSet",
+        "scenes",
+        description="one record per scene; its arrays and pictures have the same key",
+        key={"@id": "scenes/key"},
+        field=[_field("scenes/key", "sc:Text", key), _field("scenes/json", "sc:Text", content)],
+    )
+
+
+def _field(name: str, data_type: str, source: Mapping[str, Any] | None = None) -> dict[str, Any]:
+    field = _node("cr:Field", name, dataType=data_type)
+    return field | ({"source": {"fileSet": {"@id": _RECORDS}, **source}} if source else {})

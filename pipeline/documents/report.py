@@ -18,20 +18,19 @@ import numpy as np
 from pipeline.documents.distributions import MEASURED, SURFACE_COUNTS, Distributions
 from pipeline.documents.figures import Panel, draw_bars, draw_panels
 from pipeline.documents.pages import data_uri, png_uri, render_page
-from pipeline.documents.scene_page import Neighbours, encode_scene_page, passes_command, preview
+from pipeline.documents.scene_page import encode_scene_page, passes_command, preview
 from pipeline.documents.sheets import choose_scenes, read_chosen
 from storage.atomic import write_atomically
 from storage.conventions import preview_gain
 from storage.dataset.dataset import Dataset
 from storage.dataset.layout import DatasetFolder
-from storage.errors import TrilightError
 from storage.records.lights import num_lights
 from storage.records.objects import Failure
 from storage.records.quantities import QUANTITIES, STATISTICS, summary
 from storage.records.sample import Sample
 
-MOST_SCENES = 1000
-"""Pages that one folder may hold."""
+MOST_SHOWN = 48
+"""Most scenes in the gallery; they are spread over splits and shards."""
 
 _CARD_PX = 176
 _MOST_CHOICES = 12
@@ -75,38 +74,31 @@ class Card:
     """Values to sort by, one for each order; the least value comes first."""
 
 
-def write_gallery(
-    dataset: Dataset, failures: Sequence[Failure], out: DatasetFolder, max_scenes: int
-) -> list[Card]:
-    """Write the pages of up to `max_scenes` scenes and return the thumbnails that link to them.
+def write_gallery(dataset: Dataset, failures: Sequence[Failure], out: DatasetFolder) -> list[Card]:
+    """Write the pages of up to MOST_SHOWN scenes and return the thumbnails that link to them.
 
     Pages of scenes that are no longer shown are deleted.
 
     Raises:
-        TrilightError: `max_scenes` is too large, a sample is unreadable, or the folder cannot be
-            written.
+        TrilightError: a sample is unreadable, or the folder cannot be written.
     """
-    if not 0 <= max_scenes <= MOST_SCENES:
-        raise TrilightError(
-            f"gallery: {max_scenes} scenes; expected 0 to {MOST_SCENES}, one page each."
-        )
-    chosen = choose_scenes(dataset, max_scenes)
-    rejected: dict[str, list[Failure]] = {entry.key: [] for entry in chosen}
+    chosen = choose_scenes(dataset, MOST_SHOWN)
+    rejected: dict[str, list[Failure]] = {key: [] for _, key in chosen}
     for failure in failures:
         key = str(failure.item).partition(".")[0]
         if failure.stage in ("scenes", "renders") and key in rejected:
             rejected[key].append(failure)
-    names = [f"{entry.key}.html" for entry in chosen]
+    names = [f"{key}.html" for _, key in chosen]
     cards = []
-    for row, (entry, sample) in enumerate(read_chosen(dataset, chosen)):
-        links = Neighbours(
-            report=f"../{out.report.name}#gallery",
-            before=names[row - 1] if row else None,
-            after=names[row + 1] if row + 1 < len(names) else None,
-        )
-        page = encode_scene_page(sample, entry.split, rejected[entry.key], links)
+    for row, (shard, sample) in enumerate(read_chosen(dataset, chosen)):
+        links = {
+            "report": f"../{out.report.name}#gallery",
+            "before": names[row - 1] if row else None,
+            "after": names[row + 1] if row + 1 < len(names) else None,
+        }
+        page = encode_scene_page(sample, shard.split, rejected[sample.key], links)
         write_atomically(out.report_pages / names[row], page)
-        cards.append(make_card(sample, entry.split, f"{out.report_pages.name}/{names[row]}"))
+        cards.append(make_card(sample, shard.split, f"{out.report_pages.name}/{names[row]}"))
     for old in sorted(out.report_pages.glob("[0-9]" * 9 + ".html")):
         if old.name not in names:
             old.unlink(missing_ok=True)
@@ -147,25 +139,14 @@ def gallery_filters(cards: Sequence[Card]) -> Mapping[str, list[tuple[str, str, 
 _MOST_USED = 20
 
 
-def write_report(
-    dataset: Dataset,
-    distributions: Distributions,
-    *,
-    max_scenes: int = 48,
-    out: DatasetFolder | None = None,
-) -> Path:
+def write_report(dataset: Dataset, distributions: Distributions, *, out: DatasetFolder) -> Path:
     """Write `report.html` and the pages of its gallery, and return the path of the former.
-
-    Args:
-        max_scenes: most scenes in the gallery, up to 1000; they are spread over splits and shards.
-        out: folder to write into; None for the dataset's folder.
 
     Raises:
         TrilightError: a shard is missing, a sample unreadable, or the folder cannot be written.
     """
-    folder = out or dataset.folder
     manifest = dataset.manifest
-    cards = write_gallery(dataset, distributions.failures, folder, max_scenes)
+    cards = write_gallery(dataset, distributions.failures, out)
     floors = {
         QUANTITIES[name].label.removesuffix(", dB"): summary(distributions.all(name))
         for name in MEASURED.values()
@@ -187,8 +168,8 @@ def write_report(
         settings=list(_lines(settings)),
         environment=list(_lines(manifest.environment)),
     )
-    write_atomically(folder.report, page)
-    return folder.report
+    write_atomically(out.report, page)
+    return out.report
 
 
 def _most_used(

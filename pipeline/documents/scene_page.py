@@ -7,8 +7,7 @@ measurement. Black marks pixels that meet no surface; every other gray and every
 """
 
 import json
-from collections.abc import Callable, Iterator, Sequence
-from dataclasses import dataclass
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from itertools import compress
 from typing import NamedTuple
 
@@ -158,22 +157,15 @@ _MOST_MAPS = 48
 """Most textures shown as pictures; the table has all."""
 
 
-@dataclass(frozen=True, kw_only=True)
-class Neighbours:
-    """Relative links of a scene's page."""
-
-    report: str
-    """Link to the report with all scenes."""
-    before: str | None
-    """Link to the previous scene, if there is one."""
-    after: str | None
-    """Link to the next scene, if there is one."""
-
-
 def encode_scene_page(
-    sample: Sample, split: str, rejected: Sequence[Failure], links: Neighbours
+    sample: Sample, split: str, rejected: Sequence[Failure], links: Mapping[str, str | None]
 ) -> bytes:
-    """Return the page of one scene, with the rejected attempts at it and its views."""
+    """Return the page of one scene, with the rejected attempts at it and its views.
+
+    Args:
+        links: links to the `report` with all scenes, and to the scenes `before` and `after` if
+            there are any.
+    """
     scene = sample.scene
     reflecting = surfaces(scene)
     shading = {surface.row: "smooth" if surface.smooth else "flat" for surface in reflecting}

@@ -2,7 +2,6 @@
 
 import functools
 from collections.abc import Iterable, Iterator, Mapping, Sequence
-from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
@@ -21,23 +20,10 @@ _LEAST_SHARE = 8
 """Divisor of the chosen scenes: a split with few scenes gets up to one in this many."""
 
 
-@dataclass(frozen=True, kw_only=True)
-class ChosenScene:
-    """One scene to show."""
-
-    key: str
-    shard: ShardEntry
-    """The shard that holds the scene."""
-
-    @property
-    def split(self) -> str:
-        return self.shard.split
-
-
 def choose_scenes(
     dataset: Dataset, max_scenes: int, splits: Sequence[str] = SPLITS
-) -> list[ChosenScene]:
-    """Choose up to `max_scenes` scenes; only shards with chosen scenes are opened.
+) -> list[tuple[ShardEntry, str]]:
+    """Choose up to `max_scenes` scenes, by shard and key; only their shards are opened.
 
     Every split gets scenes in proportion, at least an eighth if it has so many. Within a split they
     are spread evenly over its shards. The order is that of splits, then shards.
@@ -56,21 +42,21 @@ def choose_scenes(
         rows = np.linspace(0, count - 1, num_chosen).round().astype(int)
         for row, number in zip(rows, np.searchsorted(end, rows, side="right"), strict=True):
             shard = each[number]
-            chosen.append(ChosenScene(key=keys_of(shard)[row - end[number]], shard=shard))
+            chosen.append((shard, keys_of(shard)[row - end[number]]))
     return chosen
 
 
 def read_chosen(
-    dataset: Dataset, chosen: Sequence[ChosenScene]
-) -> Iterator[tuple[ChosenScene, Sample]]:
-    """Yield the chosen scenes with their pictures, one at a time.
+    dataset: Dataset, chosen: Sequence[tuple[ShardEntry, str]]
+) -> Iterator[tuple[ShardEntry, Sample]]:
+    """Yield the chosen scenes with their shards and pictures, one at a time.
 
     Raises:
         TrilightError: a shard is missing, or a sample is unreadable or breaks a law.
     """
-    for entry in chosen:
-        for sample in dataset.read_samples(entry.shard, [entry.key]):
-            yield entry, sample
+    for shard, key in chosen:
+        for sample in dataset.read_samples(shard, [key]):
+            yield shard, sample
 
 
 def _scenes_per_split(counts: Sequence[int], max_scenes: int) -> list[int]:
@@ -103,15 +89,9 @@ _FAINT = (160, 160, 165)
 
 
 def write_contact_sheet(
-    dataset: Dataset,
-    statistics: Statistics,
-    *,
-    max_scenes: int = 16,
-    out: DatasetFolder | None = None,
+    dataset: Dataset, statistics: Statistics, *, max_scenes: int = 16, out: DatasetFolder
 ) -> None:
     """Write `contact_sheet.png`: every view of up to `max_scenes` scenes, over splits and shards.
-
-    It is written into `out`, by default the folder of the dataset.
 
     Raises:
         TrilightError: a shard is missing, a sample unreadable, or the folder cannot be written.
@@ -123,9 +103,9 @@ def write_contact_sheet(
     title = f"{dataset.manifest.build}: scenes {values['scenes']}, views {values['views']}"
     floors = f"stated error {values['stated error']}; at the cap {values['views at the cap']}; "
     floors += "bright scenes are shown darker"
-    cells = ((sample, entry.split) for entry, sample in read_chosen(dataset, chosen))
+    cells = ((sample, shard.split) for shard, sample in read_chosen(dataset, chosen))
     sheet = _draw_sheet(title, floors, cells, len(chosen), dataset.manifest.num_views)
-    write_atomically((out or dataset.folder).contact_sheet, sheet)
+    write_atomically(out.contact_sheet, sheet)
 
 
 def write_first_pictures(folder: DatasetFolder, sample: Sample, *, build: str, split: str) -> None:
@@ -139,9 +119,7 @@ def write_first_pictures(folder: DatasetFolder, sample: Sample, *, build: str, s
     write_atomically(folder.contact_sheet, sheet)
 
 
-def write_template_sheet(
-    dataset: Dataset, *, per_template: int, out: DatasetFolder | None = None
-) -> None:
+def write_template_sheet(dataset: Dataset, *, per_template: int, out: DatasetFolder) -> None:
     """Write `templates.png`: the first view of the first `per_template` scenes of every layout.
 
     Each layout has a row, so that presets can be compared. Arguments and errors are those of
@@ -159,7 +137,7 @@ def write_template_sheet(
             for sample in dataset.read_samples(shard, [key]):
                 picture = sample.radiance_rgb[0] * preview_gain(sample.radiance_rgb)
                 sheet.paste(_tile(picture), (left_px, top + _LABEL_PX))
-    write_atomically((out or dataset.folder).template_sheet, encode_png(np.asarray(sheet)))
+    write_atomically(out.template_sheet, encode_png(np.asarray(sheet)))
 
 
 def _draw_sheet(

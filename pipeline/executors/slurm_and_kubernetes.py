@@ -23,9 +23,8 @@ from typing import Annotated, Any, ClassVar, Literal
 import yaml
 
 from pipeline.generation.generate_options import GenerateOptions, generate_words
-from pipeline.presets.registry import DATASET_PRESETS, preset_settings
 from storage.atomic import write_atomically
-from storage.dataset.layout import dataset_folder
+from storage.dataset.layout import DatasetFolder
 from storage.dataset.progress import missing_shards
 from storage.dataset.splits import shards_for
 from storage.digests import sha256_hex
@@ -35,7 +34,6 @@ from storage.number_ranges import number_ranges
 from storage.remote.safe_url import safe_url
 from storage.remote.store import WRITABLE
 from storage.settings.described import checked, from_record
-from storage.settings.overrides import apply_overrides
 from storage.settings.ranges import Within
 
 MAX_TASKS = 1000
@@ -103,10 +101,9 @@ def array_job(
             "user of the cluster could read in the queue; expected env:TRILIGHT_SOURCE_NAME, with "
             "the address in that variable of the tasks."
         )
-    scenes = options.scenes or DATASET_PRESETS.find(options.build).num_scenes
-    splits = apply_overrides(preset_settings(options.build), options.changes).splits
-    planned = shards_for(scenes, splits)
-    is_begun = _is_begun(options.place)
+    scenes = options.num_scenes
+    planned = shards_for(scenes, options.settings.splits)
+    is_begun = _is_begun(options.folder)
     missing = missing_shards(options.place, scenes) if is_begun else list(range(planned))
     each = per_task or -(-planned // MAX_TASKS)
     tasks = sorted({shard // each for shard in missing})
@@ -120,8 +117,7 @@ def array_job(
     return ArrayJob(options=options, tasks=tasks, per_task=each, at_once=at_once)
 
 
-def _is_begun(place: str) -> bool:
-    folder = dataset_folder(place)
+def _is_begun(folder: DatasetFolder) -> bool:
     return folder.store().get(folder.manifest.name, 1) is not None
 
 

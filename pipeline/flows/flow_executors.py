@@ -18,7 +18,7 @@ from typing import TYPE_CHECKING, Any
 from pipeline.flows.prefect_server import prefect_server, quiet_prefect
 from pipeline.generation.generate_options import GenerateOptions
 from pipeline.generation.generation_run import Outcome
-from pipeline.generation.render_workers import close_idle_children
+from pipeline.generation.render_workers import close_children
 from storage.atomic import write_atomically
 from storage.errors import TrilightError
 
@@ -84,7 +84,7 @@ def _runner(
     finally:
         # the workers outlive the run; where the cluster is gone, so are its children
         with contextlib.suppress(TrilightError, OSError), _client(address) as client:
-            client.run(close_idle_children, on_error="ignore")
+            client.run(close_children, of_idle_jobs=True, on_error="ignore")
 
 
 def _client(address: str) -> "Client":

@@ -39,7 +39,7 @@ from prefect.tasks import Task, exponential_backoff
 
 from pipeline.documents.pages import data_uri
 from pipeline.flows.prefect_server import DISK_LIMIT, GPU_LIMIT
-from pipeline.generation.generate_options import PRICES, USD_PER_CORE_HOUR, GenerateOptions
+from pipeline.generation.generate_options import PRICES, CorePrice, GenerateOptions
 from pipeline.generation.generation_run import Outcome, Piece, Run, Runner, ShardJob, TaskResult
 from pipeline.generation.pipeline import make_dataset, make_task
 from storage.dataset.layout import dataset_folder
@@ -270,16 +270,13 @@ def usd_per_core_hour() -> float:
     Raises:
         TrilightError: TRILIGHT_USD_PER_CORE_HOUR is not a valid price.
     """
-    text = os.environ.get("TRILIGHT_USD_PER_CORE_HOUR", str(USD_PER_CORE_HOUR))
+    text = os.environ.get("TRILIGHT_USD_PER_CORE_HOUR", str(CorePrice().price))
     try:
-        price = float(text)
-    except ValueError:
-        price = float("nan")
-    if not PRICES.holds(price):
+        return CorePrice(price=float(text)).price
+    except ValueError as error:
         raise TrilightError(
             f"TRILIGHT_USD_PER_CORE_HOUR is {text!r}; expected a number {PRICES}, such as 0.04."
-        )
-    return price
+        ) from error
 
 
 def report_url(out: str) -> str | None:

@@ -14,6 +14,8 @@ import os
 import shutil
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
+from functools import cached_property
+from operator import attrgetter
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
@@ -70,10 +72,11 @@ class Selection:
     reference page Quantities has the names."""
 
     def __post_init__(self) -> None:
-        self.condition()
+        _ = self.condition
 
+    @cached_property
     def condition(self) -> Condition | None:
-        """Return the parsed `where`, or None; raises TrilightError if it is malformed."""
+        """The parsed `where`, or None; raises TrilightError if it is malformed."""
         return None if self.where is None else condition(self.where)
 
     def takes(self, facts: SceneFacts) -> bool:
@@ -81,16 +84,20 @@ class Selection:
             self.split in (None, facts.shard.split)
             and self.template in (None, facts.template)
             and (self.min_noise_floor_db is None or facts.noise_floor_db >= self.min_noise_floor_db)
+            and (self.condition is None or self.condition.holds(facts.values))
         )
 
 
 @dataclass(frozen=True, kw_only=True)
-class SelectedScene:
-    """One scene of the new dataset."""
+class SelectedScene(SceneFacts):
+    """One scene of the new dataset, with its facts in the source."""
 
     source: FinishedDataset
-    facts: SceneFacts  # its facts in the source
-    key: str  # its new key
+    new_key: str
+
+
+_HELD_BY = attrgetter("source", "shard")
+"""Returns the source and the shard that hold a selected scene."""
 
 
 def select_scenes(
@@ -110,19 +117,19 @@ def select_scenes(
     Raises:
         TrilightError: two sources hold the same scene, or a source is damaged.
     """
-    where = selection.condition()
-    names = {*value_names, *(where.names if where else ())}
+    names = {*value_names, *(selection.condition.names if selection.condition else ())}
     selected: list[SelectedScene] = []
     seen: dict[str, SelectedScene] = {}
     for source, offset in zip(sources, offsets, strict=True):
         for facts in read_facts(source, names=names, shard_done=shard_done):
-            if not selection.takes(facts) or not (where is None or where.holds(facts.values)):
+            if not selection.takes(facts):
                 continue
-            entry = SelectedScene(source=source, facts=facts, key=offset_key(facts.key, offset))
+            new_key = offset_key(facts.key, offset)
+            entry = SelectedScene(**vars(facts), source=source, new_key=new_key)
             first = seen.setdefault(facts.arrays_sha256, entry)
             if first.source is not source:
                 raise TrilightError(
-                    f"scene {facts.key} of {source.folder.root} is scene {first.facts.key} of "
+                    f"scene {facts.key} of {source.folder.root} is scene {first.key} of "
                     f"{first.source.folder.root}; expected each scene once. Leave one of "
                     "the datasets out, or generate it with another --seed."
                 )
@@ -167,20 +174,19 @@ def used_objects(selected: Sequence[SelectedScene]) -> list[LockedObject]:
     used: dict[LockedObject, None] = {}
     for entry in selected:
         source = entry.source
-        for uid in entry.facts.uids:
+        for uid in entry.uids:
             if uid not in source.objects:
                 raise TrilightError(
-                    f"{source.folder.root}: object {uid!r} of scene {entry.facts.key} is not in "
+                    f"{source.folder.root}: object {uid!r} of scene {entry.key} is not in "
                     "objects.lock.jsonl; run `trilight verify`."
                 )
             for locked in source.objects[uid]:
                 used[locked] = None
                 for name in (f"uid {uid}", f"asset {locked.asset_sha256}"):
-                    split, first = splits.setdefault(name, (entry.facts.shard.split, entry))
-                    if split != entry.facts.shard.split:
+                    split, first = splits.setdefault(name, (entry.shard.split, entry))
+                    if split != entry.shard.split:
                         places = " and in ".join(
-                            f"{each.facts.shard.split} of {each.source.folder.root} (scene "
-                            f"{each.facts.key})"
+                            f"{each.shard.split} of {each.source.folder.root} (scene {each.key})"
                             for each in (first, entry)
                         )
                         raise TrilightError(
@@ -189,29 +195,6 @@ def used_objects(selected: Sequence[SelectedScene]) -> list[LockedObject]:
                             "one split of each with `trilight shards select` first."
                         )
     return list(used)
-
-
-def even_shards(
-    selected: Sequence[SelectedScene], scenes_per_shard: int
-) -> list[list[SelectedScene]]:
-    """Return the scenes of each split in shards of one size; the last of a split may be smaller.
-
-    Shards are ordered by their first scene, so that numbers follow keys.
-
-    Raises:
-        TrilightError: the size is below 1.
-    """
-    if scenes_per_shard < 1:
-        raise TrilightError(f"--scenes-per-shard is {scenes_per_shard}; expected at least 1.")
-    of_split: Mapping[str, list[SelectedScene]] = {
-        split: [entry for entry in selected if entry.facts.shard.split == split] for split in SPLITS
-    }
-    shards = [
-        entries[start : start + scenes_per_shard]
-        for entries in of_split.values()
-        for start in range(0, len(entries), scenes_per_shard)
-    ]
-    return sorted(shards, key=lambda entries: entries[0].key)
 
 
 _TEXTS = ("split", "template")
@@ -249,7 +232,7 @@ def list_scenes(
         value_names=(*_TEXTS, *_COLUMNS),
         shard_done=lambda: progress(next(done), total),
     )
-    return [{"key": entry.key, **columns_of(entry.facts.values)} for entry in selected]
+    return [{"key": entry.new_key, **columns_of(entry.values)} for entry in selected]
 
 
 def columns_of(values: Mapping[str, Any]) -> dict[str, Any]:
@@ -281,15 +264,6 @@ class DeriveOptions:
     selection: Selection = dataclasses.field(default_factory=Selection)  # which scenes are taken
     scenes_per_shard: int | None = None
     """Scenes of each new shard; `merge` keeps shards, `select` fills them as its source does."""
-
-    @property
-    def arguments(self) -> dict[str, Any]:
-        """The user's arguments, as the manifest states them."""
-        arguments = {
-            **dataclasses.asdict(self.selection),
-            "scenes_per_shard": self.scenes_per_shard,
-        }
-        return {name: value for name, value in arguments.items() if value is not None}
 
 
 def derive_shards(
@@ -328,13 +302,14 @@ def derive_shards(
     write_failures(out.failures, _failures(sources, offsets, selected))
     shards = []
     for number, group in enumerate(groups):
-        name = named_shard(number, group[0].facts.shard.split)
+        name = named_shard(number, group[0].shard.split)
         write_shard(out.shard(name), _samples(group))
         shards.append(index_shard(out.shard(name)))
         progress(next(done), total + len(groups))
+    arguments = dataclasses.asdict(derive.selection) | {"scenes_per_shard": derive.scenes_per_shard}
     derivation = Derivation(
         operation=derive.operation,
-        arguments=derive.arguments,
+        arguments={name: value for name, value in arguments.items() if value is not None},
         sources=[
             source_record(source.manifest, key_offset=offset)
             for source, offset in zip(sources, offsets, strict=True)
@@ -347,25 +322,30 @@ def derive_shards(
 def _group_scenes(
     sources: Sequence[FinishedDataset], derive: DeriveOptions, selected: Sequence[SelectedScene]
 ) -> tuple[list[list[SelectedScene]], int | None]:
-    """Return the scenes of each new shard, and the shard size if it is not the sources'."""
+    """Return the scenes of each new shard, and the shard size if it is not the sources'.
+
+    Even shards hold one split each, of which the last may be smaller. They are ordered by their
+    first scene, so that numbers follow keys.
+    """
     if derive.operation == "merge":
-        groups: dict[tuple[FinishedDataset, str], list[SelectedScene]] = {}
-        for entry in selected:
-            groups.setdefault((entry.source, entry.facts.shard.name), []).append(entry)
-        return list(groups.values()), None
+        return [list(group) for _, group in itertools.groupby(selected, _HELD_BY)], None
     size = derive.scenes_per_shard
     if size is None:
         size = max(shard.num_samples for shard in sources[0].manifest.shards)
-    return even_shards(selected, size), size
+    of_splits = ([entry for entry in selected if entry.shard.split == split] for split in SPLITS)
+    groups = [
+        entries[start : start + size]
+        for entries in of_splits
+        for start in range(0, len(entries), size)
+    ]
+    return sorted(groups, key=lambda entries: entries[0].new_key), size
 
 
 def _samples(group: Sequence[SelectedScene]) -> Iterator[tuple[str, Mapping[str, bytes]]]:
-    for (source, shard), entries in itertools.groupby(
-        group, key=lambda entry: (entry.source, entry.facts.shard)
-    ):
+    for (source, shard), entries in itertools.groupby(group, _HELD_BY):
         with source.open_shard(shard, checked=True) as opened:
             for entry in entries:
-                yield entry.key, opened.members(entry.facts.key)
+                yield entry.new_key, opened.members(entry.key)
 
 
 def _manifest(
@@ -410,7 +390,7 @@ def _failures(
     A given-up scene is never selected. `merge` and `reshard`, which select all scenes, keep its
     rejections too.
     """
-    keys = {(entry.source, entry.facts.key) for entry in selected}
+    keys = {(entry.source, entry.key) for entry in selected}
     held = sum(source.manifest.num_samples for source in sources)
     rows = []
     for source, offset in zip(sources, offsets, strict=True):
@@ -473,7 +453,7 @@ def derive_dataset(
         try:
             derive_shards(sources, derive, work, progress=progress)
             dataset = open_dataset(str(work.root))
-            statistics = write_documents(dataset)
+            statistics = write_documents(dataset, work)
             os.replace(work.root, out)
         except OSError as error:
             raise write_error(out, error) from error

@@ -4,8 +4,7 @@ import contextlib
 import dataclasses
 import math
 from collections import Counter
-from collections.abc import Mapping
-from dataclasses import dataclass
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -37,18 +36,14 @@ _ROOM_AROUND = 1.03
 """Factor on the least camera distance from which the whole scene is within the picture."""
 
 
-@dataclass(frozen=True, kw_only=True)
-class InspectedScene:
-    """Facts about one scene, and notes of its reader."""
+def inspect_scene(
+    source: SceneSource, turntable: Path | None
+) -> tuple[Mapping[str, Any], Sequence[str]]:
+    """Inspect a scene, and write its turntable if a path is given.
 
-    facts: Mapping[str, Any]
-    """Facts for the user as JSON values, by name, such as triangles and extent_m."""
-    notes: tuple[str, ...]
-    """Parts of the file that the reader could not convert, and why no GPU rendered."""
-
-
-def inspect_scene(source: SceneSource, turntable: Path | None) -> InspectedScene:
-    """Return facts about a scene, and write its turntable if a path is given.
+    Returns:
+        Facts for the user as JSON values, by name, such as triangles and extent_m; and notes on
+        what the reader could not convert, and why no GPU rendered.
 
     Raises:
         TrilightError: the source is unusable, or the sheet cannot be rendered or written.
@@ -72,7 +67,7 @@ def inspect_scene(source: SceneSource, turntable: Path | None) -> InspectedScene
         raise TrilightError(f"{source.name}: cannot be inspected ({failure}).") from failure
     except Rejected as rejection:
         raise TrilightError(f"{source.name}: cannot be rendered ({rejection}).") from rejection
-    return InspectedScene(facts=_facts(loaded.scene), notes=tuple(notes))
+    return _facts(loaded.scene), notes
 
 
 def _facts(scene: Scene) -> dict[str, Any]:

@@ -5,19 +5,22 @@ import dataclasses
 import hashlib
 import json
 import re
-from collections.abc import Callable, Sequence
+from collections import Counter
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from pipeline.assets.cleaning.clean import clean, geometry_sha256, normalize
 from pipeline.assets.preview import preview_source_and_level
 from pipeline.assets.recipe import RECIPE, library_versions
 from pipeline.assets.settings import AssetSettings
 from pipeline.assets.stage import PreparedObject
-from pipeline.documents.quality_page import Pair, encode_quality_page
+from pipeline.documents.figures import Panel, draw_panels
+from pipeline.documents.pages import data_uri, render_page
 from pipeline.documents.rights import encode_attribution
 from pipeline.exchange.gltf.write_gltf import encode_mesh_glb
 from pipeline.foreign.mesh import TriangleMesh
@@ -59,6 +62,10 @@ class AssetFolder:
     page = Below("quality.html")
     logs = Below("logs")
     meshes = Below("meshes")
+
+
+Pair = tuple[AssetRow, NDArray[np.uint8], NDArray[np.uint8]]
+"""An object's row, its cleaned source [W, W] in grey, and the level, also as [W, W, 3] in color."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -210,16 +217,7 @@ def _write(
         "settings": settings_record(settings),
     }
     write_atomically(folder.summary, json.dumps(summary, indent=1, sort_keys=True).encode())
-    within = "" if settings.epsilon is None else f"fewest within {settings.epsilon:.2%}, "
-    page = encode_quality_page(
-        report.rows,
-        report.failures,
-        pairs,
-        report.unread,
-        budget=settings.budgets[0],
-        target=f"{settings.profile}, {within}at most {settings.budgets[0]} triangles",
-    )
-    write_atomically(folder.page, page)
+    write_atomically(folder.page, encode_quality_page(report, settings, pairs))
 
 
 def _pairs(
@@ -249,5 +247,60 @@ def _pairs(
                     source, result = call_with_retries(
                         child, preview_source_and_level, path, settings, levels[i], _WIDTH_PX
                     )
-                    pairs[name].append(Pair(row=rows[i], source=source, result=result))
+                    pairs[name].append((rows[i], source, result))
     return pairs
+
+
+def encode_quality_page(
+    report: AssetReport, settings: AssetSettings, pairs: Mapping[str, Sequence[Pair]]
+) -> bytes:
+    """Return `quality.html`: one file without scripts or external links; text is escaped.
+
+    Args:
+        pairs: pictures by the name of their group.
+    """
+    rows = report.rows
+    budget = settings.budgets[0]
+    within = "" if settings.epsilon is None else f"fewest within {settings.epsilon:.2%}, "
+    requests = [row.materials for row in rows if row.materials is not None]
+    return render_page(
+        "quality.html",
+        "Assets",
+        target=f"{settings.profile}, {within}at most {budget} triangles",
+        rows=sorted(rows, key=lambda row: (-row.quality.error_p99, row.uid)),
+        failures=report.failures,
+        groups=pairs,
+        unread=report.unread,
+        licences=Counter(row.licence for row in rows),
+        asked=requests,
+        reasons=Counter(materials.reason for materials in requests if materials.reason),
+        lost=Counter(word for materials in requests for word in materials.lost),
+        figure=data_uri(_draw_histograms(rows, budget)) if rows else "",
+    )
+
+
+def _draw_histograms(rows: Sequence[AssetRow], budget: int) -> bytes:
+    """Draw error, triangle quality and budget as one picture."""
+    changed = [100 * row.quality.error_p99 for row in rows if row.method != "source"]
+    panels = [
+        Panel(
+            values=changed,
+            label=f"p99 distance, % of the diagonal\n({len(changed)} decimated objects)",
+            unit="objects",
+        ),
+        Panel(
+            values=[row.quality.min_angle_p5_deg for row in rows],
+            label="smallest angles, 5th percentile, degrees\n(60: equilateral)",
+            bounds=(0, 60),
+        ),
+        Panel(
+            values=[row.quality.area_variation for row in rows],
+            label="variation of triangle areas\n(0: all equal)",
+        ),
+        Panel(
+            values=[row.num_faces for row in rows],
+            label=f"triangles\n(budget {budget})",
+            bounds=(0, budget),
+        ),
+    ]
+    return draw_panels(panels, columns=4)

@@ -27,7 +27,6 @@ import time
 from collections.abc import Callable
 from dataclasses import replace
 from functools import partial
-from typing import Any
 
 from pipeline.documents.dataset_documents import write_documents
 from pipeline.documents.sheets import write_first_pictures
@@ -52,7 +51,7 @@ from pipeline.generation.render_workers import (
     job_children,
     restore_object,
 )
-from pipeline.generation.scene_worker import MAX_ATTEMPTS, SceneAttempt, SceneWorker
+from pipeline.generation.scene_worker import MAX_ATTEMPTS, SceneWorker
 from pipeline.isolation import ChildFailed, IsolatedChild, with_retries
 from pipeline.shards.pack_shards import UnfinishedShard
 from storage.dataset.manifest import ShardEntry
@@ -201,16 +200,12 @@ def make_scene(
     """
     failures: list[Failure] = []
     key = sample_key(scene_index)
-
-    def attempt_in_child(*words: Any) -> SceneAttempt:
-        return with_retries(
-            lambda: child.call_method(SceneWorker.attempt, split, scene_index, *words)
-        )
-
     for attempt in range(attempts):
+        words = (split, scene_index, attempt)
         try:
             from_file = (read(scene_index),) if read else ()
-            while (tried := attempt_in_child(attempt, *from_file)).missing_asset:
+            call = partial(child.call_method, SceneWorker.attempt, *words, *from_file)
+            while (tried := with_retries(call)).missing_asset:
                 restore(*tried.missing_asset)
         except Rejected as rejection:
             failures.append(failure_of("scenes", key, rejection, attempt))

@@ -59,19 +59,12 @@ _jobs: dict[tuple[str, ...], _JobChildren] = {}
 _jobs_lock = threading.RLock()
 
 
-def close_children() -> None:
-    """End the children of this process at once."""
+def close_children(*, of_idle_jobs: bool = False) -> None:
+    """End the children of this process at once, or only those of jobs without a task at work."""
     with _jobs_lock:
-        for children in _jobs.values():
-            children.close()
-        _jobs.clear()
-
-
-def close_idle_children() -> None:
-    """End the children of jobs of which no task is at work."""
-    with _jobs_lock:
-        for key in [key for key, children in _jobs.items() if not children.num_users]:
-            _jobs.pop(key).close()
+        for key, children in [*_jobs.items()]:
+            if not (of_idle_jobs and children.num_users):
+                _jobs.pop(key).close()
 
 
 @contextlib.contextmanager
@@ -86,7 +79,7 @@ def job_children(
     key = (str(job.folder.root), job.settings.digest, job.lock_sha256, job.device)
     with _jobs_lock:
         if key not in _jobs:
-            close_idle_children()
+            close_children(of_idle_jobs=True)
             _jobs[key] = _JobChildren(job)
         children = _jobs[key]
         children.num_users += 1

@@ -137,9 +137,7 @@ class RevisitedScenes:
 
     @cached_property
     def _source(self) -> FinishedDataset:
-        dataset = open_finished(str(self.root))
-        require_digest(dataset, self.digest)
-        return dataset
+        return open_source(str(self.root), self.digest)
 
     def _origin(
         self, scene: Scene, key: str, revisit: RevisitSettings, seed: int, attempt: int
@@ -169,14 +167,16 @@ def shards_with_scenes(source: FinishedDataset) -> list[ShardEntry]:
     return [shard for shard in source.manifest.shards if shard.num_samples]
 
 
-def require_digest(dataset: FinishedDataset, digest: str) -> None:
-    """Raise TrilightError if a dataset has another digest."""
+def open_source(path: str, digest: str) -> FinishedDataset:
+    """Open a finished dataset; raises TrilightError if it has another digest, or as that does."""
+    dataset = open_finished(path)
     if dataset.manifest.dataset_digest != digest:
         raise TrilightError(
             f"{dataset.folder.root}: its dataset digest is {dataset.manifest.dataset_digest}; "
             f"expected {digest}, whose scenes the new dataset was begun with. Name that one, or "
             "choose another --out."
         )
+    return dataset
 
 
 SceneOrigin = ComposedScenes | SceneFiles | RevisitedScenes
@@ -211,8 +211,7 @@ def resolve_revisit(settings: DatasetSettings, path: str | None) -> tuple[Datase
             f"revisits is {path!r} and the settings of a revisit are "
             f"{'missing' if revisit is None else 'there'}; expected both. Use `trilight revisit`."
         )
-    source = open_finished(path)
-    require_digest(source, revisit.source_digest)
+    source = open_source(path, revisit.source_digest)
     if revisit.kept_cameras > source.manifest.num_views:
         raise TrilightError(
             f"kept_cameras is {revisit.kept_cameras}; expected at most "

@@ -242,13 +242,13 @@ def user_maps(rows: Iterable[tuple[LockedObject, Path]], split: str) -> OwnMaps:
     """Return the maps that scenes of a split may use, sorted by uid; no file is read yet.
 
     Args:
-        rows: rows of a lock with the prepared files; objects among them are left out.
+        rows: rows of a lock with the prepared files.
         split: train, validation or test.
     """
     loads: Mapping[str, Callable[[Path], Any]] = {TEXTURE: _texture, SKY: _radiance}
     of_kind: dict[str, list[UserMap[Any]]] = {TEXTURE: [], SKY: []}
     for locked, path in sorted(rows, key=lambda row: row[0].uid):
-        if locked.split == split and locked.kind in of_kind:
+        if locked.split == split:
             source = MapSource(
                 name=locked.title,
                 licence=locked.licence,

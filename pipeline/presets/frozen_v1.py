@@ -227,7 +227,7 @@ _PUBLISHED_SCENES = {
 }
 
 
-def renderformer_v1_256(policy: Policy = "de-biased") -> DatasetSettings:
+def renderformer_v1_256(policy: Policy) -> DatasetSettings:
     """The published first stage: 21 families, 256 pixels, at most 1572 triangles."""
     changes = {
         "assets.budgets": [1188, 840, 594, 396, 297, 198],
@@ -236,7 +236,7 @@ def renderformer_v1_256(policy: Policy = "de-biased") -> DatasetSettings:
     return _settings_of_stage("renderformer-v1-256", policy, stage_1_families(policy), changes)
 
 
-def renderformer_v1_512(policy: Policy = "de-biased") -> DatasetSettings:
+def renderformer_v1_512(policy: Policy) -> DatasetSettings:
     """The published second stage: 14 families, 512 pixels, at most 4192 triangles."""
     changes = {
         "assets.budgets": [3968, 2380, 1188, 840, 594, 396],
@@ -256,17 +256,14 @@ def _settings_of_stage(
     return dataclasses.replace(settings, scenes=scenes)
 
 
+_POLICIES: Mapping[str, Policy] = {"": "de-biased", "-original": "original"}
 RENDERFORMER_PRESETS = {
-    "renderformer-v1-256": DatasetPreset(
-        settings=renderformer_v1_256, num_scenes=65_536, device="cpu"
-    ),
-    "renderformer-v1-512": DatasetPreset(
-        settings=renderformer_v1_512, num_scenes=16_384, device="cpu"
-    ),
-    "renderformer-v1-256-original": DatasetPreset(
-        settings=functools.partial(renderformer_v1_256, "original"), num_scenes=65_536, device="cpu"
-    ),
-    "renderformer-v1-512-original": DatasetPreset(
-        settings=functools.partial(renderformer_v1_512, "original"), num_scenes=16_384, device="cpu"
-    ),
+    f"renderformer-v1-{width}{suffix}": DatasetPreset(
+        settings=functools.partial(stage, policy), num_scenes=num_scenes, device="cpu"
+    )
+    for suffix, policy in _POLICIES.items()
+    for width, stage, num_scenes in (
+        (256, renderformer_v1_256, 65_536),
+        (512, renderformer_v1_512, 16_384),
+    )
 }

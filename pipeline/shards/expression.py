@@ -127,7 +127,10 @@ class _Reader:
                 kinds: Mapping[type, Kind] = {bool: "truth", str: "text"}
                 return _Term(kind=kinds.get(type(value), "number"), of=lambda _: value)
             case ast.Name(id=name):
-                return self._read_name(node, name)
+                if (known := kind_of(name)) is None:
+                    names = ", ".join(sorted({*TEXTS, *QUANTITIES}))
+                    self.refuse(node, "unknown", f"one of {names}")
+                return _Term(kind=known, of=lambda values: values[name])
             case ast.Compare(left=left, ops=ops, comparators=others):
                 terms = [self.read(side) for side in (left, *others)]
                 pairs = zip(others, terms, terms[1:], ops, strict=False)
@@ -156,12 +159,6 @@ class _Reader:
         takes, gives, function = _OPERATIONS[operation]
         each = [self._read_kind(part, takes).of for part in parts]
         return _Term(kind=gives, of=lambda values: function(*(of(values) for of in each)))
-
-    def _read_name(self, node: ast.expr, name: str) -> _Term:
-        kind = kind_of(name)
-        if kind is None:
-            self.refuse(node, "unknown", f"one of {', '.join(sorted({*TEXTS, *QUANTITIES}))}")
-        return _Term(kind=kind, of=lambda values: values[name])
 
     def _read_kind(self, node: ast.expr, kind: Kind) -> _Term:
         part = self.read(node)

@@ -3,10 +3,11 @@
 import json
 from collections.abc import Callable, Collection, Iterator, Mapping
 from dataclasses import dataclass
+from functools import cached_property
 from typing import Any
 
-from storage.dataset.dataset import Dataset, open_listed
-from storage.dataset.manifest import Manifest, ShardEntry
+from storage.dataset.dataset import Dataset, open_listed, reading
+from storage.dataset.manifest import ShardEntry
 from storage.dataset.planned import is_whole, num_planned
 from storage.digests import sha256_hex
 from storage.errors import TrilightError
@@ -16,19 +17,18 @@ from storage.records.quantities import QUANTITIES
 from storage.records.sample import SceneRecord, decode_scene
 from storage.records.scene_facts import scene_values
 from storage.remote.safe_url import safe_url
-from storage.remote.store import Store
-from storage.typed_json import read_json_lines
 
 
 class FinishedDataset(Dataset):
     """A dataset on this machine whose shards are all finished."""
 
-    def __init__(
-        self, store: Store, manifest: Manifest, objects: Mapping[str, list[LockedObject]]
-    ) -> None:
-        super().__init__(store, manifest)
-        self.objects = objects
+    @cached_property
+    def objects(self) -> Mapping[str, list[LockedObject]]:
         """Locked objects by uid; a merged dataset may have several under one uid."""
+        objects: dict[str, list[LockedObject]] = {}
+        for entry in self.objects_lock():
+            objects.setdefault(entry.uid, []).append(entry)
+        return objects
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -67,10 +67,7 @@ def open_finished(path: str) -> FinishedDataset:
             f"{path}: objects.lock.jsonl is missing or not the one of the manifest (sha256 "
             "differs); run `trilight verify`."
         )
-    objects: dict[str, list[LockedObject]] = {}
-    for entry in read_json_lines(lock, LockedObject, "objects.lock.jsonl"):
-        objects.setdefault(entry.uid, []).append(entry)
-    return FinishedDataset(listed.store, manifest, objects)
+    return FinishedDataset(listed.store, manifest)
 
 
 def read_facts(
@@ -88,15 +85,15 @@ def read_facts(
     for shard in dataset.manifest.shards:
         with dataset.open_shard(shard, checked=True) as opened:
             for key in opened.samples:
-                members = opened.members(key, lambda suffix: suffix in ("json", PLAIN, PACKED))
-                values: Mapping[str, Any] = {}
-                if names:
-                    values = condition_values(decode_scene(key, members), shard.split, names)
-                try:
+                with reading(dataset.display_name, f"{shard.name}: sample {key}"):
+                    members = opened.members(key, lambda suffix: suffix in ("json", PLAIN, PACKED))
+                    values: Mapping[str, Any] = {}
+                    if names:
+                        values = condition_values(decode_scene(key, members), shard.split, names)
                     record = json.loads(members["json"])
+                    provenance = record["provenance"]
                     rows = ((str(row["kind"]), str(row["uid"])) for row in record["objects"])
                     floors_db = [float(view["noise_floor_db"]) for view in record["views"]]
-                    provenance = record["provenance"]
                     facts = SceneFacts(
                         shard=shard,
                         key=key,
@@ -106,11 +103,6 @@ def read_facts(
                         arrays_sha256=sha256_hex(unpack_arrays(members)),
                         values=values,
                     )
-                except (KeyError, TypeError, ValueError, RecursionError) as error:
-                    raise TrilightError(
-                        f"{shard.name}: sample {key} is not as expected ({error!r}); run "
-                        "`trilight verify`."
-                    ) from error
                 yield facts
         shard_done()
 

@@ -13,7 +13,7 @@ from typing import Any
 import numpy as np
 from safetensors.numpy import load, save
 
-from pipeline.documents.scene_page import Neighbours, encode_scene_page
+from pipeline.documents.scene_page import encode_scene_page
 from storage.digests import sha256_hex
 from storage.errors import TrilightError
 from storage.records.exr import decode_exr, encode_channels, encode_exr
@@ -77,7 +77,8 @@ def _consumed(members: Members) -> str:
         }
     except TrilightError as error:
         return str(error)
-    page = encode_scene_page(sample, "train", [], Neighbours(report="", before=None, after=None))
+    links = {"report": "", "before": None, "after": None}
+    page = encode_scene_page(sample, "train", [], links)
     names = ["object", "uv", "material_diffuse"]
     seen = [sample.view_passes(names, view=view) for view in range(2)]
     passes = [each[name].tobytes() for each in seen for name in names]

@@ -14,7 +14,6 @@ from PIL import Image
 
 from infra.release.__main__ import write_page
 from pipeline.documents.distributions import dataset_distributions
-from pipeline.documents.quality_page import Pair, encode_quality_page
 from pipeline.documents.report import write_report
 from pipeline.exchange.convert import write_scene
 from storage.records.scene_file import read_scene_file
@@ -30,7 +29,7 @@ from tests.pipeline.documents.dataset_by_hand import (
     write_dataset,
 )
 from tests.pipeline.documents.dataset_by_hand import row as mesh_row
-from tests.pipeline.documents.test_pages import failure
+from tests.pipeline.documents.test_pages import failure, quality_bytes
 from tests.scenes_by_hand import tiny_scene
 
 pytestmark = [pytest.mark.slow("browser"), pytest.mark.timeout(900)]
@@ -311,7 +310,7 @@ BROKEN_NAMES = """[...document.querySelectorAll('table.narrow td:first-child, th
 
 def report(folder: Path) -> Path:
     dataset = five_scenes(folder)
-    return write_report(dataset, dataset_distributions(dataset))
+    return write_report(dataset, dataset_distributions(dataset), out=dataset.folder)
 
 
 def scene(folder: Path) -> Path:
@@ -328,12 +327,10 @@ def gallery(folder: Path) -> Path:
 def quality(folder: Path) -> Path:
     entry = mesh_row("builtin/superquadric-00000")
     picture = np.full((256, 256), 128, np.uint8)
-    pairs = [Pair(row=entry, source=picture, result=picture)] * 3
+    pairs = [(entry, picture, picture)] * 3
     folder.mkdir()
     page = folder / "quality.html"
-    page.write_bytes(
-        encode_quality_page([entry], [failure()], {"Worst": pairs}, budget=1400, target="faithful")
-    )
+    page.write_bytes(quality_bytes([entry], [failure()], {"Worst": pairs}))
     return page
 
 
@@ -368,7 +365,7 @@ PICK = """document.querySelector('[name="{}"][value="{}"]').click()"""
 
 def test_a_person_looks_around(tmp_path: Path) -> None:
     dataset = five_scenes(tmp_path)
-    report = write_report(dataset, dataset_distributions(dataset))
+    report = write_report(dataset, dataset_distributions(dataset), out=dataset.folder)
     with browser() as page:
         for width in (1280, 1000, 390):
             page.show(width, 844)

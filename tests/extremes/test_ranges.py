@@ -22,8 +22,7 @@ from infra.setup.generated_pages import ROOTS, reachable
 from model.config import SIZES, BaseWidths, ModelConfig
 from pipeline.assets.settings import AssetSettings, GateSettings, OwnMaterialSettings
 from pipeline.flows.forms import DatasetInRuns
-from pipeline.generation.generate_options import CorePrice
-from pipeline.generation.revisit_options import RevisitOptions
+from pipeline.generation.generate_options import CorePrice, RevisitOptions
 from pipeline.presets.registry import preset_settings
 from pipeline.presets.settings import DatasetSettings, GivenCamera, RevisitSettings
 from pipeline.renders.settings import MAX_SPP, RenderSettings

@@ -81,10 +81,10 @@ def test_the_page_shows_everybody_and_opens_from_disk(tmp_path: Path) -> None:
 
 def test_scenes_are_those_that_nobody_learned_from(tmp_path: Path) -> None:
     dataset = five_scenes(tmp_path / "five")
-    assert {entry.split for entry in chosen_scenes(dataset, 24)} == {"test"}
+    assert {shard.split for shard, _ in chosen_scenes(dataset, 24)} == {"test"}
     shards = {"train-000000.tar": [sample(key, furnished(["a"])) for key in range(4)]}
     only_train = write_dataset(tmp_path / "train", shards)
-    assert [entry.split for entry in chosen_scenes(only_train, 3)] == ["train"] * 3
+    assert [shard.split for shard, _ in chosen_scenes(only_train, 3)] == ["train"] * 3
     for none, count in ((write_dataset(tmp_path / "none", {}), 24), (dataset, 0), (dataset, -1)):
         with pytest.raises(TrilightError, match=f"pictures is {count}, .* at least one scene"):
             chosen_scenes(none, count)

@@ -339,7 +339,7 @@ def test_what_is_shown_is_what_the_printed_command_selects(
                 name: options.get(f"--{name}") for name in ("split", "template", "where")
             }
             selection = Selection(**stated)
-            whole = FinishedDataset(dataset.store, dataset.manifest, {})
+            whole = FinishedDataset(dataset.store, dataset.manifest)
             assert {row.pop("views") for row in found["rows"]} <= {2}
             assert found["rows"] == list_scenes(whole, selection)
 

@@ -17,9 +17,13 @@ import numpy as np
 import pytest
 import yaml
 
-from pipeline.documents import croissant
-from pipeline.documents.croissant import encode_croissant
-from pipeline.documents.dataset_documents import _size_category, encode_card, write_documents
+from pipeline.documents import dataset_documents
+from pipeline.documents.dataset_documents import (
+    _size_category,
+    encode_card,
+    encode_croissant,
+    write_documents,
+)
 from pipeline.documents.distributions import Distributions, dataset_distributions
 from pipeline.documents.pages import render_markdown
 from pipeline.documents.rights import rights_of
@@ -208,7 +212,7 @@ def card_of(dataset: Dataset) -> tuple[dict[str, Any], str]:
 @pytest.mark.usefixtures("bare_reports")
 def test_the_front_matter_says_what_hubs_ask(tmp_path: Path) -> None:
     dataset = five_scenes(tmp_path)
-    write_documents(dataset)
+    write_documents(dataset, dataset.folder)
     front, body = card_of(dataset)
     assert dataset.folder.card.read_text().endswith(f"---\n{body}")
     assert front["license"] == "other"
@@ -308,10 +312,10 @@ def test_equal_datasets_have_equal_documents(
 ) -> None:
     """Neither place, clock nor language is in them; of the report's figures see test_report."""
     first, second = five_scenes(tmp_path / "a"), five_scenes(tmp_path / "other" / "b")
-    write_documents(first)
+    write_documents(first, first.folder)
     os.utime(second.folder.manifest, (0, 0))
     monkeypatch.setenv("LC_ALL", "de_DE.UTF-8")
-    write_documents(second)
+    write_documents(second, second.folder)
     for name in DOCUMENTS:
         assert (first.folder.root / name).read_bytes() == (second.folder.root / name).read_bytes()
 
@@ -427,7 +431,7 @@ def test_documents_of_a_sample_say_so(
     whole = dataset_statistics(eleven)
     assert whole.scene_digest and "what follows is" not in dict(whole.lines())
     monkeypatch.setattr("storage.dataset.statistics.MOST_SCENES", 4)
-    monkeypatch.setattr(croissant, "MOST_LISTED", 3)
+    monkeypatch.setattr(dataset_documents, "MOST_LISTED", 3)
     out = DatasetFolder(tmp_path / "documents")
     out.root.mkdir()
     statistics = write_documents(eleven, out)

@@ -11,6 +11,7 @@ import json
 import re
 import shlex
 import subprocess
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import cast
 
@@ -19,21 +20,21 @@ import pytest
 from numpy.typing import NDArray
 from PIL import Image
 
+from pipeline.assets.settings import AssetSettings
 from pipeline.documents.checksums import SUMS, published_files, renew_sums, stale_sums, write_sums
 from pipeline.documents.dataset_documents import write_documents
 from pipeline.documents.distributions import dataset_distributions
 from pipeline.documents.pages import is_address, render_page
-from pipeline.documents.quality_page import Pair, encode_quality_page
 from pipeline.documents.report import Card, gallery_filters, make_card, write_report
 from pipeline.documents.rights import encode_attribution
 from pipeline.documents.scene_page import (
-    Neighbours,
     depth_grays,
     encode_scene_page,
     finite_range,
     id_colors,
 )
-from pipeline.documents.sheets import ChosenScene, choose_scenes
+from pipeline.documents.sheets import choose_scenes
+from pipeline.generation.make_assets import AssetReport, Pair, encode_quality_page
 from storage.conventions import look_at_c2w, preview_gain, preview_srgb8
 from storage.dataset.dataset import Dataset, open_dataset
 from storage.dataset.manifest import ShardEntry, read_manifest, write_manifest
@@ -63,8 +64,15 @@ def failure(item: str = "bad", message: str = "a sentence") -> Failure:
     return Failure(stage="assets", item=item, reason="no_faces", message=message)
 
 
+def quality_bytes(
+    rows: list[AssetRow], failures: list[Failure], pairs: Mapping[str, Sequence[Pair]]
+) -> bytes:
+    report = AssetReport(rows=tuple(rows), failures=tuple(failures), geometry_sha256=(), unread={})
+    return encode_quality_page(report, AssetSettings(budgets=(1400,)), pairs)
+
+
 def quality_page(rows: list[AssetRow], failures: list[Failure]) -> Tags:
-    return read(encode_quality_page(rows, failures, {}, budget=1400, target="faithful"))
+    return read(quality_bytes(rows, failures, {}))
 
 
 RIGHTS = {"licence": HARM, "attribution": HARM, "source_url": "javascript:alert(3)"}
@@ -73,9 +81,9 @@ HARMFUL = row(HARM, title=HARM, method="pymeshlab_collapse", **RIGHTS)
 
 def test_text_from_outside_stays_text_and_nothing_is_loaded_from_elsewhere() -> None:
     picture = np.full((8, 8), 128, np.uint8)
-    shown = {"Worst": [Pair(row=HARMFUL, source=picture, result=picture)], "Best": []}
+    shown = {"Worst": [(HARMFUL, picture, picture)], "Best": []}
     failures = [failure(HARM, HARM)]
-    data = encode_quality_page([HARMFUL, row()], failures, shown, budget=1400, target="x")
+    data = quality_bytes([HARMFUL, row()], failures, shown)
     plain = data.replace(html.escape(HARM).encode(), b"")
     assert not re.search(rb"https?:|javascript:|<script|@import|url\(", plain)
     tags = read(data)
@@ -112,7 +120,7 @@ def test_counts_are_those_of_the_rows_and_equal_rows_give_equal_pages() -> None:
     assert "2 watertight; 1 rejected" in text
     assert "CC0-1.0 (2)" in text
     assert tags.tags.count("tr") == 2 + 3
-    twice = [encode_quality_page([row()], [], {}, budget=9, target="x") for _ in range(2)]
+    twice = [quality_bytes([row()], [], {}) for _ in range(2)]
     assert twice[0] == twice[1]
 
 
@@ -192,7 +200,7 @@ SIZE = 96
 
 
 def page_of(shown: Sample) -> str:
-    links = Neighbours(report="../report.html", before=None, after=None)
+    links = {"report": "../report.html", "before": None, "after": None}
     return encode_scene_page(shown, "train", (), links).decode()
 
 
@@ -263,7 +271,7 @@ def test_a_view_of_nothing_is_black() -> None:
 def test_the_commands_run_as_printed(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     shards = {"train-000000.tar": [sample(index, furnished(["a"])) for index in (3, 4)]}
     dataset = write_dataset(tmp_path / "data", shards)
-    report = write_report(dataset, dataset_distributions(dataset))
+    report = write_report(dataset, dataset_distributions(dataset), out=dataset.folder)
     monkeypatch.chdir(report.parent)
     before = {path: path.read_bytes() for path in report.parent.rglob("*") if path.is_file()}
 
@@ -292,7 +300,7 @@ def test_the_report_names_the_stored_passes(tmp_path: Path) -> None:
 
     def report() -> str:
         found = open_dataset(str(tmp_path))
-        return write_report(found, dataset_distributions(found)).read_text()
+        return write_report(found, dataset_distributions(found), out=found.folder).read_text()
 
     assert "<td>passes</td><td>none stored;" in report()
     settings = {**SETTINGS, "storage": {"passes": ["object", "depth_axis_m"]}}
@@ -334,7 +342,7 @@ def test_documents_that_are_written_again_have_their_sums(tmp_path: Path) -> Non
     root = dataset.folder.root
     dataset.folder.report.write_text("an older report")
     write_sums(root)
-    write_documents(dataset)
+    write_documents(dataset, dataset.folder)
     assert checked(root) == [] == stale_sums(root)
     vouched = ("LICENSE.md", "README.md", "attribution.csv", "croissant.json")
     documents = read_manifest(dataset.folder.manifest).documents
@@ -423,25 +431,25 @@ class Listed:
         return self._keys[shard]
 
 
-def chosen_of(max_scenes: int, **counts: int) -> list[ChosenScene]:
+def chosen_of(max_scenes: int, **counts: int) -> list[tuple[ShardEntry, str]]:
     return choose_scenes(cast(Dataset, Listed(**counts)), max_scenes)
 
 
 def test_all_are_chosen_where_there_are_few_and_exactly_as_many_as_asked_for() -> None:
     chosen = chosen_of(48, test=3, train=5)
-    assert [entry.split for entry in chosen] == ["train"] * 5 + ["test"] * 3
-    assert [int(entry.key) for entry in chosen] == [3, 4, 5, 6, 7, 0, 1, 2]
+    assert [shard.split for shard, _ in chosen] == ["train"] * 5 + ["test"] * 3
+    assert [int(key) for _, key in chosen] == [3, 4, 5, 6, 7, 0, 1, 2]
     for count in range(12):
-        keys = [entry.key for entry in chosen_of(count, train=4, validation=4, test=4)]
+        keys = [key for _, key in chosen_of(count, train=4, validation=4, test=4)]
         assert len(keys) == len(set(keys)) == count
 
 
 def test_small_splits_are_seen() -> None:
     chosen = chosen_of(48, train=4000, validation=20, test=3)
-    splits = [entry.split for entry in chosen]
+    splits = [shard.split for shard, _ in chosen]
     assert (splits.count("validation"), splits.count("test")) == (6, 3)
-    assert len(set(entry.key for entry in chosen)) == len(chosen) == 48
-    train = [int(entry.key) for entry in chosen if entry.split == "train"]
+    assert len(set(key for _, key in chosen)) == len(chosen) == 48
+    train = [int(key) for shard, key in chosen if shard.split == "train"]
     gaps = [after - before for before, after in itertools.pairwise(train)]
     assert (train[0], train[-1]) == (0, 3999)
     assert max(gaps) - min(gaps) <= 1
@@ -450,4 +458,4 @@ def test_small_splits_are_seen() -> None:
 def test_only_shards_of_chosen_scenes_are_opened() -> None:
     listed = Listed(train=4000, test=40)
     chosen = choose_scenes(cast(Dataset, listed), 10)
-    assert sorted(listed.opened) == sorted({entry.shard.name for entry in chosen})
+    assert sorted(listed.opened) == sorted({shard.name for shard, _ in chosen})

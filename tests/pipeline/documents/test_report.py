@@ -22,10 +22,9 @@ from pipeline.documents.figures import (
     short_label,
 )
 from pipeline.documents.report import _rejections, write_gallery, write_report
-from pipeline.documents.scene_page import Neighbours, encode_scene_page, shown_maps
+from pipeline.documents.scene_page import encode_scene_page, shown_maps
 from storage.dataset.dataset import Dataset, open_dataset
 from storage.dataset.layout import DatasetFolder
-from storage.errors import TrilightError
 from storage.records.objects import Failure
 from storage.records.scene import SceneObject
 from storage.records.texture import MapSource, Texture
@@ -48,8 +47,8 @@ from tests.textured_by_hand import sky, textured_scene
 ACTIVE = {"script", "iframe", "link", "object", "embed", "form", "base"}
 
 
-def report_of(dataset: Dataset, max_scenes: int = 48) -> Path:
-    return write_report(dataset, dataset_distributions(dataset), max_scenes=max_scenes)
+def report_of(dataset: Dataset) -> Path:
+    return write_report(dataset, dataset_distributions(dataset), out=dataset.folder)
 
 
 def pages(report: Path) -> dict[Path, Tags]:
@@ -192,18 +191,19 @@ def test_one_scene_or_none_at_all(tmp_path: Path) -> None:
 
 
 @pytest.mark.usefixtures("bare_reports")
-def test_the_gallery_is_bounded_and_old_pages_go(tmp_path: Path) -> None:
+def test_the_gallery_is_bounded_and_old_pages_go(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     dataset = five_scenes(tmp_path)
-    write_gallery(dataset, (), dataset.folder, 48)
+    write_gallery(dataset, (), dataset.folder)
     mine = tmp_path / "report" / "notes.html"
     mine.write_text("kept")
-    report = report_of(dataset, max_scenes=2)
+    monkeypatch.setattr("pipeline.documents.report.MOST_SHOWN", 2)
+    report = report_of(dataset)
     # one scene of each split
     names = sorted(path.name for path in (tmp_path / "report").iterdir())
     assert names == ["000000000.html", "000000020.html", "notes.html"]
     assert "2 of 5 scenes" in text_of(read(report.read_bytes()))
-    with pytest.raises(TrilightError, match="1001 scenes; expected 0 to 1000"):
-        report_of(dataset, max_scenes=1001)
 
 
 def test_writing_elsewhere_gives_the_same_bytes_and_leaves_the_dataset_alone(
@@ -267,7 +267,7 @@ def test_a_texture_is_shown_as_it_lies() -> None:
     pictures = [_pixels(shown.picture or "") for shown in shown_maps(scene)]
     assert pictures[0].tolist() == [[[0] * 3] * 2, [[0] * 3, [200, 100, 50]]]
     assert pictures[2].shape == (112, 224, 3) and pictures[2].max() == 255
-    links = Neighbours(report="", before=None, after=None)
+    links = {"report": "", "before": None, "after": None}
     page = read(encode_scene_page(sample(0, scene.with_provenance({})), "train", (), links))
     assert "".join(page.text).count(HARM) == 2
 

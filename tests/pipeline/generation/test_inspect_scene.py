@@ -173,7 +173,7 @@ def test_inspecting(source: SceneSource, tmp_path: Path, monkeypatch: pytest.Mon
 
     monkeypatch.setattr(inspecting, "choose_variant", kill_and_choose)
     monkeypatch.setattr(inspecting, "_turntable", _grey)
-    assert inspect_scene(source, tmp_path / "sheet.png").facts["views"] > 0
+    assert inspect_scene(source, tmp_path / "sheet.png")[0]["views"] > 0
     assert (tmp_path / "sheet.png").exists()
 
 

@@ -17,9 +17,12 @@ from infra.cli.overrides import BaseSettings, with_base_settings
 from infra.repair import repair
 from pipeline.executors.threads import ThreadRunner
 from pipeline.generation import render_workers
-from pipeline.generation.generate_options import GenerateOptions
+from pipeline.generation.generate_options import (
+    GenerateOptions,
+    RevisitOptions,
+    to_generate_options,
+)
 from pipeline.generation.pipeline import make_dataset
-from pipeline.generation.revisit_options import RevisitOptions, to_generate_options
 from pipeline.isolation import IsolatedChild
 from pipeline.renders.renderer import SceneRenderer
 from storage.dataset.dataset import Dataset, open_dataset

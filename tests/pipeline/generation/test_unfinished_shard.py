@@ -339,7 +339,7 @@ def test_only_children_that_nobody_uses_are_closed(monkeypatch: pytest.MonkeyPat
     with render_workers.job_children(job) as lent:
         assert lent == ("child", None)
         assert closed == ["other"]
-        render_workers.close_idle_children()
+        render_workers.close_children(of_idle_jobs=True)
         assert closed == ["other"]
-    render_workers.close_idle_children()
+    render_workers.close_children(of_idle_jobs=True)
     assert closed == ["other", "ours"]
