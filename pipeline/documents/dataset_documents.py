@@ -4,7 +4,7 @@ import bisect
 import dataclasses
 import json
 from collections import Counter
-from collections.abc import Collection, Mapping, Sequence
+from collections.abc import Collection, Iterable, Mapping, Sequence
 from typing import Any
 
 from markupsafe import Markup
@@ -13,7 +13,7 @@ from pipeline.documents.checksums import renew_sums
 from pipeline.documents.distributions import MEASURED, Distributions, dataset_distributions
 from pipeline.documents.pages import render_markdown
 from pipeline.documents.report import write_report
-from pipeline.documents.rights import Rights, encode_attribution, hub_licence, rights_of
+from pipeline.documents.rights import encode_attribution, hub_licence
 from pipeline.documents.sheets import write_contact_sheet
 from storage.atomic import write_atomically
 from storage.conventions import SPLITS
@@ -51,11 +51,10 @@ _SETTINGS = (
 _ENVIRONMENT = (("Mitsuba variant", "mitsuba_variant"), ("processor", "processor"))
 
 
-def encode_card(
-    folder: DatasetFolder, manifest: Manifest, distributions: Distributions, rights: Rights
-) -> bytes:
+def encode_card(folder: DatasetFolder, manifest: Manifest, distributions: Distributions) -> bytes:
     """Return the card; of `folder` only the names of the dataset's documents are used."""
     title = f"Trilight dataset {manifest.build}"
+    licences = distributions.licences
     layouts = Counter[str]()
     for (template, _), count in sorted(distributions.scenes.items()):
         layouts[template] += count
@@ -63,7 +62,7 @@ def encode_card(
     settings += [(label, manifest.environment.get(name)) for label, name in _ENVIRONMENT]
     return render_markdown(
         "card.jinja",
-        front=Markup(front_matter(_front(folder, manifest, rights, title))),
+        front=Markup(front_matter(_front(folder, manifest, licences, title))),
         title=title,
         folder=folder,
         manifest=manifest,
@@ -79,11 +78,13 @@ def encode_card(
         derivation=derivation_of(manifest.settings),
         settings=[(label, value) for label, value in settings if value is not None],
         arrays=" or ".join(_arrays(distributions.packings)),
-        rights=rights,
+        licences=licences,
     )
 
 
-def _front(folder: DatasetFolder, manifest: Manifest, rights: Rights, title: str) -> dict[str, Any]:
+def _front(
+    folder: DatasetFolder, manifest: Manifest, licences: Collection[str], title: str
+) -> dict[str, Any]:
     files = [
         {"split": split, "path": sorted(patterns, reverse=True)}
         for split in SPLITS
@@ -96,7 +97,7 @@ def _front(folder: DatasetFolder, manifest: Manifest, rights: Rights, title: str
         )
     ]
     return {
-        **hub_licence(rights, link=folder.licences.name),
+        **hub_licence(licences, link=folder.licences.name),
         "pretty_name": title,
         "size_categories": [_size_category(manifest.num_samples)],
         "task_categories": ["other"],
@@ -145,7 +146,7 @@ def _user_maps(distributions: Distributions) -> list[tuple[str, int, int]]:
     """Return how many of the user's textures and of the maps there are and are used, if any."""
     rows = []
     for kind, name in ((TEXTURE, "textures"), (SKY, "skies")):
-        uids = {entry.uid for entry in distributions.user_maps if entry.kind == kind}
+        uids = {entry.uid for entry in distributions.locked if entry.kind == kind}
         if uids:
             rows.append((name, len(uids), len(uids & set(distributions.map_uses))))
     return rows
@@ -171,13 +172,13 @@ def write_documents(dataset: Dataset, out: DatasetFolder) -> Statistics:
     manifest = dataset.manifest
     statistics = dataset_statistics(dataset)
     distributions = dataset_distributions(dataset)
-    rights = rights_of(distributions.locked)
+    licences = distributions.licences
     write_atomically(out.attribution, encode_attribution(distributions.locked, manifest.settings))
-    write_atomically(out.licences, render_markdown("license.jinja", rights=rights))
+    write_atomically(out.licences, render_markdown("license.jinja", licences=licences))
     write_contact_sheet(dataset, statistics, out=out)
     write_report(dataset, distributions, out=out)
-    write_atomically(out.croissant, encode_croissant(manifest, rights))
-    card = encode_card(out, manifest, distributions, rights)
+    write_atomically(out.croissant, encode_croissant(manifest, licences))
+    card = encode_card(out, manifest, distributions)
     if out.manifest.exists():
         with out.mutex("manifest"):
             documents = {
@@ -223,7 +224,7 @@ _SPLIT_URLS: Mapping[str, str] = {
 _RECORDS = "scene-records"
 
 
-def encode_croissant(manifest: Manifest, rights: Rights) -> bytes:
+def encode_croissant(manifest: Manifest, licences: Iterable[str]) -> bytes:
     """Return `croissant.json`: every shard with its sha256, and a record for each scene.
 
     The vocabulary is Croissant 1.1 of MLCommons, as JSON-LD. It is written as plain JSON:
@@ -245,7 +246,7 @@ def encode_croissant(manifest: Manifest, rights: Rights) -> bytes:
         "version": f"{manifest.schema_version}.0.0+{digest[:12]}",
         "identifier": f"sha256:{digest}",
         "keywords": ["neural rendering", "path tracing", "HDR", "WebDataset"],
-        "license": [licence_url(name) or name for name in rights.licences],
+        "license": [licence_url(name) or name for name in licences],
         "distribution": _distribution(shards),
         "recordSet": [_splits(shards), _scenes()] if shards else [],
     }

@@ -41,10 +41,8 @@ class Distributions:
     """Views whose sampling ended at the cap, by split."""
     packings: set[str] = field(default_factory=set)
     """Suffixes under which samples have their arrays (storage.records.profiles)."""
-    objects: Sequence[LockedObject]
-    """The objects that scenes may draw from."""
-    user_maps: Sequence[LockedObject]
-    """The user's textures and maps that scenes may draw from."""
+    locked: Sequence[LockedObject]
+    """The objects, textures and maps that scenes may draw from, whose rights documents list."""
     failures: Sequence[Failure]
     """Rejections of objects, scenes and views."""
     targets: Mapping[str, float | None]
@@ -103,9 +101,8 @@ class Distributions:
         return dict(sorted(counts.items(), key=lambda entry: (-entry[1].total(), entry[0])))
 
     @property
-    def locked(self) -> list[LockedObject]:
-        """All rows of the lock, whose rights documents list."""
-        return [*self.objects, *self.user_maps]
+    def objects(self) -> list[LockedObject]:
+        return [entry for entry in self.locked if entry.kind == OBJECT]
 
     @property
     def licences(self) -> Mapping[str, tuple[int, int, int]]:
@@ -187,11 +184,9 @@ def dataset_distributions(
     Raises:
         TrilightError: a shard is missing, or a sample is unreadable or breaks a law.
     """
-    locked = dataset.objects_lock()
     distributions = Distributions(
         num_scenes=dataset.manifest.num_samples,
-        objects=[entry for entry in locked if entry.kind == OBJECT],
-        user_maps=[entry for entry in locked if entry.kind != OBJECT],
+        locked=dataset.objects_lock(),
         failures=dataset.failures(),
         targets={
             name: dataset.manifest.setting(f"{group}.{name}", int | float)

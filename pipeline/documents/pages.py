@@ -16,7 +16,7 @@ from markupsafe import Markup  # of jinja2
 from numpy.typing import NDArray
 
 from pipeline.documents.png import encode_png
-from storage.licences import DUTIES, duties_of, licence_url
+from storage.licences import DUTIES, duties_of, licence_url, union_of_duties
 from storage.markdown import code, text
 
 
@@ -92,6 +92,8 @@ _MARKDOWN = _make_environment(
 _MARKDOWN.globals |= {
     "licence_url": licence_url,
     "duties_of": duties_of,
+    "union_of_duties": union_of_duties,
     "duty_texts": DUTIES,
 }
+_MARKDOWN.tests["known_licence"] = lambda name: duties_of(name) is not None
 _MARKDOWN.filters["code"] = lambda value: Markup(code(value))

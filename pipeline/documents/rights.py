@@ -1,4 +1,4 @@
-"""Licences of a dataset's objects with the union of their duties, and `attribution.csv`.
+"""Licences of a dataset's objects as Hugging Face names them, and `attribution.csv`.
 
 That file has the authors, licences and changes of all objects, textures and maps.
 """
@@ -6,14 +6,11 @@ That file has the authors, licences and changes of all objects, textures and map
 import csv
 import io
 import re
-from collections import Counter
-from collections.abc import Iterable, Mapping
-from dataclasses import dataclass
+from collections.abc import Collection, Iterable, Mapping
 from types import MappingProxyType
 from typing import Any
 
 from storage.dataset.planned import derivation_of
-from storage.licences import duties_of, union_of_duties
 from storage.markdown import inert
 from storage.records.asset import AssetRow
 from storage.records.objects import OBJECT, SKY, TEXTURE, LockedObject
@@ -46,46 +43,18 @@ _AS_IN_FILE = "rendered as its scene file says"
 """Changes to the meshes of scene files."""
 
 
-@dataclass(frozen=True, kw_only=True)
-class Rights:
-    """The licences of a dataset's objects."""
-
-    objects_by_licence: Mapping[str, int]
-    """Number of objects, textures and maps by licence, sorted by its name."""
-
-    @property
-    def licences(self) -> list[str]:
-        return list(self.objects_by_licence)
-
-    @property
-    def duties(self) -> tuple[str, ...]:
-        """Union of the licences' duties, as keys of storage.licences.DUTIES."""
-        return union_of_duties(self.licences)
-
-    @property
-    def unknown(self) -> list[str]:
-        """Licences whose duties are unknown."""
-        return [name for name in self.licences if duties_of(name) is None]
-
-
-def rights_of(objects: Iterable[LockedObject]) -> Rights:
-    """Count the licences of objects."""
-    counts = Counter(entry.licence for entry in objects)
-    return Rights(objects_by_licence=dict(sorted(counts.items())))
-
-
-def hub_licence(rights: Rights, *, link: str) -> dict[str, str]:
+def hub_licence(licences: Collection[str], *, link: str) -> dict[str, str]:
     """Return the licence fields of the front matter of a Hugging Face card.
 
     Args:
-        rights: rights to the objects; without objects the result is empty.
+        licences: licences of the objects; without objects the result is empty.
         link: file with details, unless there is only one licence and Hugging Face knows it.
     """
-    if not rights.licences:
+    if not licences:
         return {}
-    if len(rights.licences) > 1:
+    if len(licences) > 1:
         return {"license": "other", "license_name": "mixed-object-licences", "license_link": link}
-    name = rights.licences[0].casefold()
+    name = next(iter(licences)).casefold()
     if name in _HUB_LICENCES or name in _HUB_SPELLING:
         return {"license": _HUB_SPELLING.get(name, name)}
     slug = re.sub(r"[^a-z0-9.-]+", "-", name).strip("-")

@@ -26,7 +26,6 @@ from pipeline.documents.dataset_documents import (
 )
 from pipeline.documents.distributions import Distributions, dataset_distributions
 from pipeline.documents.pages import render_markdown
-from pipeline.documents.rights import rights_of
 from storage.dataset.dataset import Dataset, open_dataset
 from storage.dataset.layout import DatasetFolder
 from storage.dataset.statistics import dataset_statistics, described_shards
@@ -204,7 +203,7 @@ DOCUMENTS = (
 def card_of(dataset: Dataset) -> tuple[dict[str, Any], str]:
     """Return the card's front matter and its body."""
     found = dataset_distributions(dataset)
-    card = encode_card(dataset.folder, dataset.manifest, found, rights_of(found.objects))
+    card = encode_card(dataset.folder, dataset.manifest, found)
     _, front, body = card.decode().split("---\n", 2)
     return yaml.safe_load(front), body
 
@@ -264,8 +263,8 @@ def test_the_body_counts_by_split_and_licence(tmp_path: Path) -> None:
     assert "- **attribution**:" in body and "share-alike" not in body
     assert "4, of which 3 stand in scenes" in body
     assert dataset.digest in body
-    rights = rights_of(read_objects_lock(dataset.folder.objects_lock))
-    assert "attribution, changes" in render_markdown("license.jinja", rights=rights).decode()
+    licences = dataset_distributions(dataset).licences
+    assert "attribution, changes" in render_markdown("license.jinja", licences=licences).decode()
 
 
 def test_expected_errors_stand_beside_the_promised_ones(tmp_path: Path) -> None:
@@ -371,8 +370,7 @@ def test_the_validator_has_no_error_and_every_shard_and_scene_is_found(
 ) -> None:
     dataset = five_scenes(tmp_path)
     manifest, path = dataset.manifest, dataset.folder.croissant
-    rights = rights_of(read_objects_lock(dataset.folder.objects_lock))
-    path.write_bytes(encode_croissant(manifest, rights))
+    path.write_bytes(encode_croissant(manifest, dataset_distributions(dataset).licences))
     read = mlcroissant.Dataset(jsonld=str(path))
     issues = read.metadata.ctx.issues
     assert not issues.errors
@@ -394,14 +392,14 @@ def test_the_validator_has_no_error_and_every_shard_and_scene_is_found(
 @pytest.mark.parametrize("licence", ['"}, {', "x\n\ud800", "LicenseRef-a"])
 def test_it_is_json_whatever_the_licences_are_called(tmp_path: Path, licence: str) -> None:
     dataset = five_scenes(tmp_path)
-    document = json.loads(encode_croissant(dataset.manifest, rights_of([locked("a", licence)])))
+    document = json.loads(encode_croissant(dataset.manifest, [licence]))
     assert document["license"] == [licence]
 
 
 def test_a_dataset_without_shards_is_valid_too(mlcroissant: Any, tmp_path: Path) -> None:
     manifest = dataclasses.replace(five_scenes(tmp_path / "a").manifest, shards=())
     path = tmp_path / "croissant.json"
-    path.write_bytes(encode_croissant(manifest, rights_of([])))
+    path.write_bytes(encode_croissant(manifest, []))
     assert not mlcroissant.Dataset(jsonld=str(path)).metadata.ctx.issues.errors
 
 
