@@ -20,7 +20,6 @@ from PIL import Image, ImageDraw, ImageFont
 
 from infra.cli.console import console
 from infra.render.path_tracer import PathTracer, RenderChild
-from infra.render.plan import own_camera
 from infra.render.quality import ToStatedError
 from model.inference import NeuralRenderer
 from pipeline.assets.cleaning.clean import clean, normalize
@@ -39,6 +38,7 @@ from storage.dataset.dataset import open_dataset
 from storage.metrics import psnr_log_db
 from storage.records.sample import Sample
 from storage.records.scene import Scene
+from storage.renderer import Camera
 from train.evaluation.sheet import ERROR_WHITE, heat_colors, mean_error
 
 GROUND = (22, 25, 29)
@@ -287,9 +287,10 @@ def _trace(scene: Scene, view: int, resolution: int, target_db: float) -> Render
     quality = ToStatedError(targets={"noise_floor_db": target_db})
     tracer = PathTracer(RenderChild(choose_variant("auto")), quality, resolution)
     with contextlib.closing(tracer):
-        camera = own_camera(scene, view, named="view")
         # no preview, whose error is not measured
-        return cast(RenderedView, tracer.load(scene, "scene").render_view(camera))
+        return cast(
+            RenderedView, tracer.load(scene, "scene").render_view(Camera.of_scene(scene, view))
+        )
 
 
 def _triangles(mesh: TriangleMesh) -> str:

@@ -9,7 +9,6 @@ from typing import TYPE_CHECKING, cast
 import numpy as np
 from numpy.typing import NDArray
 
-from infra.render.plan import own_camera
 from infra.render.quality import MOST_TRACED_SPP, ToStatedError
 from infra.torch_library import require_torch
 from pipeline.renders.renderer import RenderedView
@@ -18,6 +17,7 @@ from storage.atomic import write_atomically
 from storage.conventions import HALF_FLOAT_MAX, preview_srgb8
 from storage.errors import TrilightError
 from storage.records.scene import Scene
+from storage.renderer import Camera
 
 if TYPE_CHECKING:
     from model.inference import NeuralRenderer
@@ -112,7 +112,7 @@ def render_views(
     from pipeline.renders.mitsuba_variant import choose_variant
 
     rows = range(scene.num_views) if views is None else views
-    cameras = [own_camera(scene, row, named="view") for row in rows]
+    cameras = [Camera.of_scene(scene, row) for row in rows]
     scene.check()
     quality = ToStatedError(
         targets={
