@@ -28,14 +28,13 @@ from infra.render.methods import (
 )
 from infra.render.networks import NetworkRenderer
 from infra.render.path_tracer import PathTracer, RenderChild
-from infra.render.quality import FixedSamples
 from model.inference import NeuralRenderer
 from model.open import find_network
 from model.weights import network_digest
 from pipeline.exchange.exports.export import picture_name
 from pipeline.exchange.pictures import MAX_BYTES, decode_pixels
 from pipeline.renders.mitsuba_variant import choose_variant
-from pipeline.renders.preview import MOST_SPP
+from pipeline.renders.preview import MOST_SPP, PreviewSettings
 from storage.atomic import write_atomically
 from storage.dataset.training_data import TrainingData, open_training_data
 from storage.digests import sha256_hex
@@ -199,8 +198,10 @@ def _time_tracer(
 def _previews(levels: Sequence[Level], resolution: int) -> Iterator[list[Renderer]]:
     """Yield path tracers of one thread by samples and filter."""
     with contextlib.closing(RenderChild(choose_variant(), threads=1)) as child:
-        qualities = (FixedSamples(spp=spp, denoiser=denoiser) for spp, denoiser in levels)
-        yield [PathTracer(child, quality, resolution) for quality in qualities]
+        yield [
+            PathTracer(child, PreviewSettings(resolution=resolution, spp=spp, denoiser=denoiser))
+            for spp, denoiser in levels
+        ]
 
 
 def write_judgement(judgement: Judgement, out: str | Path) -> Path:

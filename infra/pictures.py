@@ -20,7 +20,7 @@ from PIL import Image, ImageDraw, ImageFont
 
 from infra.cli.console import console
 from infra.render.path_tracer import PathTracer, RenderChild
-from infra.render.quality import ToStatedError
+from infra.render.quality import measured_settings
 from model.inference import NeuralRenderer
 from pipeline.assets.cleaning.clean import clean, normalize
 from pipeline.assets.cleaning.orient import orient_outward
@@ -284,8 +284,8 @@ _CARD = "[...document.querySelectorAll('.card')].find(c => c.innerText.startsWit
 
 
 def _trace(scene: Scene, view: int, resolution: int, target_db: float) -> RenderedView:
-    quality = ToStatedError(targets={"noise_floor_db": target_db})
-    tracer = PathTracer(RenderChild(choose_variant("auto")), quality, resolution)
+    settings = measured_settings(resolution, {"noise_floor_db": target_db})
+    tracer = PathTracer(RenderChild(choose_variant("auto")), settings)
     with contextlib.closing(tracer):
         # no preview, whose error is not measured
         return cast(

@@ -15,12 +15,13 @@ from infra.render.networks import NetworkRenderer
 from infra.render.options import EngineChoice, RenderOptions
 from infra.render.path_tracer import PathTracer, RenderChild
 from infra.render.preview_table import Choice, choose, known_costs, price_all, shipped_table
-from infra.render.quality import Budget, FixedSamples, Quality
+from infra.render.quality import Budget
 from infra.render.tone_mapping import Look
 from infra.torch_library import require_torch
 from pipeline.exchange.open_scene import SceneSource, scene_source
 from pipeline.exchange.reader import SceneReader
 from pipeline.renders.mitsuba_variant import choose_variant
+from pipeline.renders.preview import PreviewSettings
 from storage.errors import TrilightError
 from storage.machine import available_cores
 from storage.records.scene import Scene
@@ -158,7 +159,7 @@ def plan_render(options: RenderOptions, reader: SceneReader) -> RenderPlan:
         raise TrilightError(f"--out is {options.out}; expected a folder, X.mp4 or X.webp for many.")
     look = Look(tone_map=options.tone_map, exposure_ev=options.exposure_ev)
     checkpoint, resolution = _network_and_width(options)
-    FixedSamples(spp=1, denoiser="off").settings(resolution)  # reports a wrong width first
+    PreviewSettings(resolution=resolution, spp=1)  # reports a wrong width first
     sources = reader.list_scenes(options.source, options.albedo_over_one, many=output.is_sequence)
     cameras: Sequence[Camera | int] = [options.view]
     if options.cameras is not None:
@@ -205,9 +206,9 @@ def _renderers(
     options: RenderOptions, checkpoint: str | None, resolution: int, pairs: Pairs
 ) -> tuple[list[Renderer], Choice | None]:
     """Return the renderers of `--engine`, or of what is chosen for a budget; and that choice."""
-    quality: Quality | None = options.quality
+    traced = None if options.engine == "neural" else options.quality(resolution)
     choice = None
-    if isinstance(quality, Budget):
+    if isinstance(traced, Budget):
         table = shipped_table()
         costs, origin = known_costs(choose_variant("auto"))
         cores = available_cores()
@@ -219,16 +220,16 @@ def _renderers(
             per_scene=len(pairs) / len({source for source, _ in pairs}),
             network=importlib.util.find_spec("torch") is not None,
         )
-        choice = choose(quality, candidates, scenes=table.scenes, costs=origin, width=resolution)
-        quality = choice.priced.samples
-        if quality is None:
+        choice = choose(traced, candidates, scenes=table.scenes, costs=origin, width=resolution)
+        traced = choice.priced.samples
+        if traced is None:
             from model.open import BUILTIN_TOKENS
 
             checkpoint = BUILTIN_TOKENS
     renderers = list[Renderer]()
-    if quality is not None and options.engine != "neural":
+    if traced is not None:
         child = RenderChild(choose_variant("auto"), options.threads)
-        renderers.append(PathTracer(child, quality, resolution, seed=options.seed))
+        renderers.append(PathTracer(child, traced, seed=options.seed))
     if checkpoint is not None:
         network = NetworkRenderer(
             checkpoint=checkpoint,

@@ -22,7 +22,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from infra.render.path_tracer import PathTracer, RenderChild
-from infra.render.quality import FixedSamples
 from infra.viewer.open_source import scene_list
 from infra.viewer.scene_handlers import SceneHandlers, handlers_of_scene
 from infra.viewer.server import (
@@ -40,6 +39,7 @@ from pipeline.exchange.formats import LoadedScene
 from pipeline.exchange.open_scene import scene_source
 from pipeline.exchange.reader import SceneReader
 from pipeline.generation.derive_dataset import Selection, columns_of
+from pipeline.renders.preview import PreviewSettings
 from pipeline.shards.finished_dataset import SceneFacts
 from storage.aliases import PRESET_ALIASES, name_for_people
 from storage.conventions import preview_gain
@@ -378,7 +378,7 @@ class DatasetHandlers(SceneListHandlers):
 THUMBNAIL_PX = 128
 """Width in pixels of thumbnails."""
 
-_THUMBNAIL = FixedSamples(spp=4, denoiser="fast")
+_THUMBNAIL = PreviewSettings(resolution=THUMBNAIL_PX, spp=4)
 
 
 class FolderHandlers(SceneListHandlers):
@@ -441,7 +441,7 @@ class FolderHandlers(SceneListHandlers):
         loaded = self._load(number)
         if loaded.radiance_rgb is not None and len(loaded.radiance_rgb):
             return thumbnail_png(loaded.radiance_rgb[0], THUMBNAIL_PX)
-        tracer = PathTracer(self._child, _THUMBNAIL, THUMBNAIL_PX)
+        tracer = PathTracer(self._child, _THUMBNAIL)
         traced = tracer.load(loaded.scene, self._names[number])
         image = traced.render(Camera.of_scene(loaded.scene, 0))
         return thumbnail_png(image.radiance_rgb, THUMBNAIL_PX)

@@ -21,10 +21,11 @@ from numpy.typing import NDArray
 
 from infra.render.networks import NetworkRenderer, RendererHere, SceneHere
 from infra.render.path_tracer import PathTracer, RenderChild
-from infra.render.quality import FixedSamples, ToStatedError
+from infra.render.quality import measured_settings, samples_text
 from infra.viewer.picture_options import PictureOptions, apply_edits
 from pipeline.documents.scene_page import PASS_VIEWS, PassView
-from pipeline.renders.preview import usual_filter
+from pipeline.renders.preview import PreviewSettings, usual_filter
+from pipeline.renders.settings import RenderSettings
 from storage.errors import TrilightError, Unrenderable
 from storage.metrics import psnr_log_db
 from storage.records.passes.declared import pass_names
@@ -175,21 +176,22 @@ def page_renderers(
 
 
 def _path_tracer(
-    child: RenderChild, options: PictureOptions, max_depth: int = ToStatedError.max_depth
+    child: RenderChild, options: PictureOptions, max_depth: int = RenderSettings.max_depth
 ) -> PathTracer:
     targets = {"noise_floor_db": options.error_db}
-    quality = ToStatedError(targets=targets, max_depth=max_depth)
-    return PathTracer(child, quality, options.resolution, shows_looks=True)
+    settings = measured_settings(options.resolution, targets, max_depth=max_depth)
+    return PathTracer(child, settings, shows_looks=True)
 
 
 def samples_on_page(child: RenderChild, spp: int) -> PageRenderer:
     """Return a preview of a number of samples per pixel with one denoise."""
-    quality = FixedSamples(spp=spp, denoiser=usual_filter(spp))
+    denoiser = usual_filter(spp)
     return PageRenderer(
-        title=f"{quality.count}, filtered",
-        means=f"{spp} path{'s' if spp > 1 else ''} a pixel, then Open Image Denoise "
-        f"({quality.denoiser}).",
-        make=lambda options: PathTracer(child, quality, options.resolution),
+        title=f"{samples_text(spp)}, filtered",
+        means=f"{spp} path{'s' if spp > 1 else ''} a pixel, then Open Image Denoise ({denoiser}).",
+        make=lambda options: PathTracer(
+            child, PreviewSettings(resolution=options.resolution, spp=spp, denoiser=denoiser)
+        ),
         words=("--spp", str(spp)),
     )
 

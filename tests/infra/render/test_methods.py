@@ -26,7 +26,7 @@ from infra.render.plan import (
     pair_cameras,
     plan_render,
 )
-from infra.render.quality import FixedSamples, ToStatedError
+from infra.render.quality import measured_settings
 from infra.render.raw_references import RawReference, true_error, true_error_db
 from infra.render.run_render import Frame, flicker
 from model.config import SIZES
@@ -35,6 +35,7 @@ from pipeline.exchange.open_scene import SceneSource, scene_source
 from pipeline.exchange.reader import SceneReader
 from pipeline.renders.mitsuba_variant import choose_variant
 from pipeline.renders.noise_floor import clamped_radiance
+from pipeline.renders.preview import PreviewSettings
 from storage.conventions import log10_radiance, look_at_c2w
 from storage.dataset.shard import write_shard
 from storage.errors import TrilightError, Unrenderable
@@ -169,8 +170,8 @@ def test_two_renderers_without_noise() -> None:
 
 TINY = tiny_scene()
 TINY_CAMERA = Camera.of_scene(TINY, 0)
-FEW = FixedSamples(spp=4, denoiser="fast")
-MEASURED = ToStatedError(targets={"noise_floor_db": 95.0}, max_spp=1024)
+FEW = PreviewSettings(resolution=32, spp=4)
+MEASURED = measured_settings(32, {"noise_floor_db": 95.0}, max_spp=1024)
 
 
 class Enough(Exception):
@@ -180,7 +181,7 @@ class Enough(Exception):
 def test_path_tracers_share_a_child_that_can_be_stopped_and_keeps_few_scenes() -> None:
     told = list[Sampling | Image]()
     with contextlib.closing(RenderChild(choose_variant(), threads=1)) as child:
-        growing = PathTracer(child, MEASURED, 32, shows_looks=True)
+        growing = PathTracer(child, MEASURED, shows_looks=True)
         grown = growing.load(TINY, "tiny")
         with pytest.raises(Enough):
             grown.render(TINY_CAMERA, mock.Mock(side_effect=Enough))
@@ -190,9 +191,9 @@ def test_path_tracers_share_a_child_that_can_be_stopped_and_keeps_few_scenes() -
         assert looks[0].stated_error_db is None and "not measured" in looks[0].remark
         assert last.stated_error_db is not None and (last.samples or 0) > 256
         assert (last.cpu_seconds or 0) > (looks[0].cpu_seconds or 0) > 0
-        plain = PathTracer(child, MEASURED, 32).load(TINY, "tiny").render(TINY_CAMERA)
+        plain = PathTracer(child, MEASURED).load(TINY, "tiny").render(TINY_CAMERA)
         np.testing.assert_array_equal(last.radiance_rgb, plain.radiance_rgb)
-        preview = PathTracer(child, FEW, 32).load(TINY, "tiny")
+        preview = PathTracer(child, FEW).load(TINY, "tiny")
         assert child._child.call_method(count_loaded) == MOST_SCENES
         picture = preview.render(TINY_CAMERA)
         assert (picture.samples, picture.facts) == (4, {"spp": 4})
@@ -215,13 +216,13 @@ def count_loaded(worker: RenderWorker) -> int:
 def test_a_fingerprint_tells_quality_width_and_seed_apart() -> None:
     child = RenderChild(choose_variant(), threads=1)
     tracers = [
-        PathTracer(child, FEW, 32),
-        PathTracer(child, FEW, 32, seed=1),
-        PathTracer(child, FEW, 64),
-        PathTracer(child, MEASURED, 32),
+        PathTracer(child, FEW),
+        PathTracer(child, FEW, seed=1),
+        PathTracer(child, PreviewSettings(resolution=64, spp=4)),
+        PathTracer(child, MEASURED),
     ]
     assert len({fingerprint(tracer.identity) for tracer in tracers}) == len(tracers)
-    assert fingerprint(PathTracer(child, FEW, 32, name="other").identity) == fingerprint(
+    assert fingerprint(PathTracer(child, FEW, name="other").identity) == fingerprint(
         tracers[0].identity
     )
 
