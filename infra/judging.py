@@ -316,7 +316,7 @@ def make_leaderboard(options: LeaderboardOptions, on_progress: OnProgress) -> Le
     """
     with open_board(options) as (board, opened):
         judge_all(board, on_progress)
-    rival = _names(options.checkpoint or BUILTIN_NETWORKS[:1])[0]
+    rival = network_name(network_labels(options.checkpoint or BUILTIN_NETWORKS)[0])
     standings = [standings_of(board, width, rival) for width in board.widths]
     tables = tuple(one for one in standings if one is not None)
     if not tables:
@@ -430,7 +430,7 @@ def _add_nearest(board: Board, options: LeaderboardOptions, opened: TrainingData
 def _add_renderers(board: Board, checkpoints: Sequence[str], child: RenderChild) -> None:
     """Add the built-in networks, those of the options, traced light and the path tracer."""
     places = [*BUILTIN_NETWORKS, *(each for each in checkpoints if each not in BUILTIN_NETWORKS)]
-    names = _names(places)
+    names = [network_name(label) for label in network_labels(places)]
     if twice := [name for name in names if names.count(name) > 1]:
         raise TrilightError(
             f"{twice[0]} is there twice; expected each network once, in folders of different names."
@@ -454,11 +454,6 @@ def _add_renderers(board: Board, checkpoints: Sequence[str], child: RenderChild)
                 board.notes.append(f"{name} is not judged at {px} pixels: {why}")
         for one in compared_renderers(px, fitting, child, [(spp, "fast") for spp in SAMPLES]):
             board.add(one, kind_of(one.name))
-
-
-def _names(places: Sequence[str]) -> list[str]:
-    """Return the row names of networks, by the folder of a run and without paths."""
-    return [network_name(label) for label in network_labels(places)]
 
 
 def _notes(board: Board, tables: Sequence[WidthStandings]) -> Iterator[str]:

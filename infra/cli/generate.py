@@ -15,9 +15,8 @@ from importlib.util import find_spec
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
-from rich.progress import Progress as Bars
-
 from infra.cli.console import (
+    Bars,
     duration,
     first_words,
     next_step,
@@ -25,7 +24,6 @@ from infra.cli.console import (
     print_json,
     print_result,
     print_rows,
-    progress_bars,
 )
 from infra.cli.options import command
 from infra.cli.overrides import BaseSettings, with_base_settings
@@ -88,26 +86,20 @@ def make(options: GenerateOptions, runner: ExecutorOptions) -> None:
         first_words(text)
     if text := choose_dataset_variant(options, folder).note:
         note(f"{text}; see trilight doctor")
-    with show_progress(folder):
-        outcome = executor.make(options, runner.address)
-    report(folder, outcome, time.monotonic() - started)
-
-
-@contextlib.contextmanager
-def show_progress(folder: DatasetFolder) -> Iterator[None]:
-    """Draw progress bars while the block runs."""
     ended = threading.Event()
-    with progress_bars() as bars:
+    with Bars() as bars:
         watcher = threading.Thread(target=_watch, args=(folder, bars, ended), daemon=True)
         watcher.start()
         try:
-            yield
+            outcome = executor.make(options, runner.address)
         finally:
             ended.set()
             watcher.join()
+    report(folder, outcome, time.monotonic() - started)
 
 
 def _watch(folder: DatasetFolder, bars: Bars, ended: threading.Event) -> None:
+    """Draw the progress of a dataset until its maker has ended."""
     drawn = _Bars(bars)
     waits = not folder.contact_sheet.exists()
     last = False
@@ -271,7 +263,7 @@ def plan(
     first_words(f"Measuring {samples} scenes of {options.build}")
     from infra.planning import measure_scenes, predict_cost  # slow: every stage
 
-    with progress_bars() as bars, temporary_folder("trilight-plan-") as place:
+    with Bars() as bars, temporary_folder("trilight-plan-") as place:
         task = bars.add_task("scenes", total=samples, note="")
         measured = measure_scenes(options, samples, place, lambda: bars.advance(task))
     cores = plan_options.cores

@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 from rich.text import Text
 
-from infra.cli.console import print_result, progress_bars, suggest_look
+from infra.cli.console import Bars, print_result, suggest_look
 from infra.cli.options import command
 from infra.render.networks import NetworkRenderer
 from infra.render.options import RenderOptions
@@ -25,7 +25,7 @@ from storage.renderer import Facts, Image, Renderer, Sampling
 @command("source")
 def render(options: RenderOptions) -> None:
     started = time.monotonic()
-    with progress_bars() as bars, SceneReader() as reader:
+    with Bars() as bars, SceneReader() as reader:
         plan = plan_render(options, reader)
         if plan.choice is not None:
             bars.console.print(Text(plan.choice.sentence), soft_wrap=True)

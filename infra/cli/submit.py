@@ -9,13 +9,13 @@ from cyclopts import App, Group
 
 from infra.cli.commands import HELP_FLAGS
 from infra.cli.console import (
+    Bars,
     console,
     first_words,
     next_step,
     note,
     print_json,
     print_rows,
-    progress_bars,
 )
 from infra.cli.options import command
 from infra.cli.overrides import BaseSettings, with_base_settings
@@ -215,7 +215,7 @@ def submit_to_array(
 def _watch_run(looks: "Iterable[RunStatus]") -> "RunStatus":
     """Draw the progress of a run, and return its last state."""
     last = None
-    with progress_bars() as bars:
+    with Bars() as bars:
         bar = bars.add_task("percent", total=100, note="")
         for look in looks:
             if last is None or last.state != look.state:

@@ -8,10 +8,9 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, NoReturn
 
-from rich.progress import Progress as Bars
 from rich.progress import TaskID
 
-from infra.cli.console import console, next_step, note, print_rows, progress_bars, suggest_look
+from infra.cli.console import Bars, console, next_step, note, print_rows, suggest_look
 from infra.cli.options import command
 from infra.cli.overrides import BaseSettings, merge_overrides, run_record
 from infra.run_record import tensorboard_command
@@ -130,7 +129,7 @@ def _run_training(
     from train.loop.interrupts import Stopped
     from train.run_training import run_training
 
-    with join_processes(options.device) as crew, progress_bars() as bars:
+    with join_processes(options.device) as crew, Bars() as bars:
         try:
             return run_training(
                 settings,

@@ -19,7 +19,7 @@ import numpy as np
 from cyclopts import Parameter
 from numpy.typing import NDArray
 
-from infra.cli.console import first_words, next_step, print_rows, progress_bars
+from infra.cli.console import Bars, first_words, next_step, print_rows
 from infra.release.push_to_hub import NETWORK_FILE, kind_of, require_within_limits
 from infra.render.networks import NetworkRenderer
 from infra.render.path_tracer import PathTracer, RenderChild
@@ -67,7 +67,7 @@ def main(
         raise TrilightError(f"{place}: objects under {named}; a release has CC0 only.")
     _write_network(folder / "network")
     chosen = chosen_scenes(dataset, pictures)
-    with progress_bars() as bars:
+    with Bars() as bars:
         task = bars.add_task("scenes", total=len(chosen), note="")
         comparisons = list(
             compare_scenes(dataset, chosen, checkpoint=_CHECKPOINT, done=lambda: bars.advance(task))

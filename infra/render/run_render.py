@@ -233,19 +233,19 @@ def run_plan(
     return finished, list(notes)
 
 
+@dataclass(eq=False)
 class _SceneAtHand:
     """Scene of consecutive pictures; a renderer loads it for the first one that is not kept."""
 
-    def __init__(
-        self, plan: RenderPlan, source: SceneSource, scene: Scene, on_progress: OnProgress
-    ) -> None:
+    plan: RenderPlan
+    source: SceneSource
+    scene: Scene
+    on_progress: OnProgress
+
+    def __post_init__(self) -> None:
+        self.sha256 = scene_digest(self.scene)
         self.notes: list[str] = []
-        self._plan = plan
-        self._source = source
-        self._scene = scene
-        self._sha256 = scene_digest(scene)
-        self._on_progress = on_progress
-        self._loaded: dict[str, ReadyScene] = {}
+        self.loaded: dict[str, ReadyScene] = {}
 
     def finish(
         self, stem: Path, camera: Camera, before: Frame | None
@@ -253,9 +253,9 @@ class _SceneAtHand:
         """Write the files of a picture; return it, and the frame if there are both renderers."""
         if camera.view is None:  # of an orbit or a file
             camera = dataclasses.replace(camera, name=f"picture {stem.name}")
-        made = {each.name: self._picture(stem, camera, each) for each in self._plan.renderers}
+        made = {each.name: self._picture(stem, camera, each) for each in self.plan.renderers}
         files = {name: file for name, (file, _) in made.items()}
-        look = self._plan.look
+        look = self.plan.look
         tiles = {name: display_pixels(rgb, look) for name, (_, rgb) in made.items()}
         now = None
         agreement = None
@@ -275,7 +275,7 @@ class _SceneAtHand:
                 }
             )
             now = Frame(
-                source=self._source,
+                source=self.source,
                 error_RR3=log10_radiance(neural) - log10_radiance(traced),
                 noise_floor_db=float(files["mitsuba"].facts["noise_floor_db"]),
             )
@@ -283,9 +283,9 @@ class _SceneAtHand:
         write_atomically(png, encode_png(pixels))
         finished = FinishedShot(
             png=png,
-            scene_sha256=self._sha256,
-            num_triangles=self._scene.num_triangles,
-            num_lights=num_lights(self._scene),
+            scene_sha256=self.sha256,
+            num_triangles=self.scene.num_triangles,
+            num_lights=num_lights(self.scene),
             pictures=files,
             psnr_log_db=agreement,
             flicker=flicker(before, now) if now else None,
@@ -299,20 +299,20 @@ class _SceneAtHand:
 
         Equal headers and pictures give equal bytes.
         """
-        plan = self._plan
+        plan = self.plan
         path = Path(f"{stem}.{renderer.name}.exr" if len(plan.renderers) > 1 else f"{stem}.exr")
-        header = header_of(renderer, self._source.name, self._sha256, camera)
+        header = header_of(renderer, self.source.name, self.sha256, camera)
         existing = load_matching_picture(path, header) if plan.output.is_sequence else None
         if existing is not None:
             return existing
         seconds = 0.0
-        loaded = self._loaded.get(renderer.name)
+        loaded = self.loaded.get(renderer.name)
         if loaded is None:
-            loaded = self._loaded[renderer.name] = renderer.load(self._scene, self._source.name)
-            self.notes += [f"{self._source.name}: {note}" for note in loaded.notes]
+            loaded = self.loaded[renderer.name] = renderer.load(self.scene, self.source.name)
+            self.notes += [f"{self.source.name}: {note}" for note in loaded.notes]
             seconds = loaded.seconds
         began = time.perf_counter()
-        image = loaded.render(camera, self._on_progress)
+        image = loaded.render(camera, self.on_progress)
         seconds += time.perf_counter() - began
         facts = {**image.facts, **(plan.choice.facts if plan.choice else {})}
         named = {_PREFIX + name: value for name, value in {**header, **facts}.items()}

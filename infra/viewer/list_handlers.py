@@ -185,21 +185,17 @@ class DatasetIndex:
             if self._closed or len(self._rows) >= MOST_SCENES:
                 break
             try:
-                self._read_shard(shard)
+                with self._dataset.open_shard(shard) as opened:
+                    for key in opened.samples:
+                        if self._closed:
+                            return
+                        with reading(self._dataset.display_name, shard.name):
+                            row = _row(opened, key, shard)
+                        self._rows.append(row)
+                        self._by_key[key] = row
             except (TrilightError, OSError) as error:
                 self.problems.append(str(error))
             self.shards_read += 1
-
-    def _read_shard(self, shard: ShardEntry) -> None:
-        dataset = self._dataset
-        with dataset.open_shard(shard) as opened:
-            for key in opened.samples:
-                if self._closed:
-                    return
-                with reading(dataset.display_name, shard.name):
-                    row = _row(opened, key, shard)
-                self._rows.append(row)
-                self._by_key[key] = row
 
 
 def _row(opened: ShardReader, key: str, shard: ShardEntry) -> SceneRow:
