@@ -97,8 +97,15 @@ def train(options: TrainOptions, watched: WatchSettings, base: BaseSettings) -> 
         )
         options = dataclasses.replace(options, changes=changes)
     settings = options.settings()  # without torch, so that mistakes are named at once
-    if options.processes > 1:
-        _launch(options, watched)
+    if options.processes > 1:  # torchrun starts this command once for each process
+        if "RANK" in os.environ:
+            raise TrilightError(
+                f"--processes is {options.processes} under torchrun, which sets their number; "
+                "omit it."
+            )
+        words = [*options.command(), *option_words(watched)]
+        words += ["--json"] if console.quiet else []
+        os.execve(words[0], words, child_environment())
     if os.environ.get("RANK", "0") == "0":
         _announce(options, settings)
     result = _run_training(options, settings, watched)
@@ -107,17 +114,6 @@ def train(options: TrainOptions, watched: WatchSettings, base: BaseSettings) -> 
     if console.quiet:
         sys.stdout.write(result.folder.summary.read_text())
     _report(result, options.data)
-
-
-def _launch(options: TrainOptions, watched: WatchSettings) -> NoReturn:
-    """Become torchrun, which starts this command once for each process."""
-    if "RANK" in os.environ:
-        raise TrilightError(
-            f"--processes is {options.processes} under torchrun, which sets their number; omit it."
-        )
-    words = [*options.command(), *option_words(watched)]
-    words += ["--json"] if console.quiet else []
-    os.execve(words[0], words, child_environment())
 
 
 def _run_training(
