@@ -510,8 +510,8 @@ def picture_folder(folder: Path, views: Views, widths: Sequence[int]) -> Picture
     by_width: dict[int, Path] = {}
     for key, view in views:
         path = folder / picture_name(key, view)
-        data = _bytes_of(path)
-        by_width.setdefault(_picture(data, path, widths).shape[0], path)
+        data, radiance_rgb = _read_picture(path, widths)
+        by_width.setdefault(len(radiance_rgb), path)
         sha256[key, view] = sha256_hex(data)
     if len(by_width) > 1:
         listed = ", ".join(f"{path.name} has {width}" for width, path in by_width.items())
@@ -524,7 +524,7 @@ def picture_folder(folder: Path, views: Views, widths: Sequence[int]) -> Picture
     def pictures(sample: Sample) -> NDArray[np.float32]:
         names = [picture_name(sample.key, view) for view in range(sample.scene.num_views)]
         paths = [folder / name for name in names]
-        read = [_picture(_bytes_of(path), path, [resolution]) for path in paths]
+        read = [_read_picture(path, [resolution])[1] for path in paths]
         return np.maximum(np.stack(read), 0)
 
     return PictureSource(
@@ -535,17 +535,14 @@ def picture_folder(folder: Path, views: Views, widths: Sequence[int]) -> Picture
     )
 
 
-def _bytes_of(path: Path) -> bytes:
+def _read_picture(path: Path, widths: Sequence[int]) -> tuple[bytes, NDArray[np.float32]]:
+    """Return a file, and the radiance [R, R, 3] in it, whose width is one of `widths`."""
     try:
         if path.stat().st_size > MAX_BYTES:
             raise TrilightError(f"{path.name}: expected a picture of at most {MAX_BYTES} bytes.")
-        return read_plain(path)
+        data = read_plain(path)
     except OSError as error:
         raise TrilightError(f"{path.name}: cannot be read ({error.strerror}).") from error
-
-
-def _picture(data: bytes, path: Path, widths: Sequence[int]) -> NDArray[np.float32]:
-    """Return the radiance [R, R, 3] of a file whose width is one of `widths`."""
     pixels = decode_pixels(data, path.name, [])
     if pixels is None or pixels.dtype != np.float32 or pixels.shape[2] < 3:
         raise TrilightError(
@@ -568,4 +565,4 @@ def _picture(data: bytes, path: Path, widths: Sequence[int]) -> NDArray[np.float
             f"{int(illegal.any(axis=-1).sum())} pixels are like it; expected finite radiance of at "
             f"least 0 (channel {'RGB'[channel]}). Make the picture again."
         )
-    return radiance_rgb
+    return data, radiance_rgb

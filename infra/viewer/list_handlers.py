@@ -244,7 +244,8 @@ def selected_rows(
         TrilightError: a condition is malformed, or on values that the index does not hold; or the
             sort column is unknown.
     """
-    stated = {name: query.get(name) or None for name in ("split", "template", "where")}
+    names = ("split", "template", "where")
+    stated = {name: query[name] for name in names if query.get(name, "") not in ("", "none")}
     selection = Selection(**stated)  # type: ignore[arg-type]
     where = selection.condition()
     if where is not None and (unknown := sorted(where.names - _NAMES)):
