@@ -126,7 +126,7 @@ class Pictures:
     room: int
     """Number of the room that the first pictures show."""
     view: int
-    """View of that room."""
+    """Row of its camera in these pictures."""
 
     def hero(self) -> None:
         """One scene in five steps: given mesh, clean mesh, traced, by the network, its error."""
