@@ -27,9 +27,6 @@ from storage.machine import available_cores
 from storage.records.scene import Scene
 from storage.renderer import Camera, Renderer
 
-SUFFIXES = (".mp4", ".webp")
-"""Suffixes of videos."""
-
 
 @dataclass(frozen=True, kw_only=True)
 class OutputPaths:
@@ -61,7 +58,7 @@ def output_paths(out: Path) -> OutputPaths:
         return OutputPaths(out=out, folder=out)
     if suffix == ".exr":
         return OutputPaths(out=out, folder=out.parent)
-    if suffix not in SUFFIXES:
+    if suffix not in (".mp4", ".webp"):
         raise TrilightError(
             f"--out is {out}; expected picture.exr, or for many pictures a folder, or X.mp4 or "
             "X.webp, beside which they are kept in a folder X."
@@ -196,10 +193,8 @@ def _network_and_width(options: RenderOptions) -> tuple[str | None, int]:
     if options.resolution is not None:
         return checkpoint, options.resolution
     network = find_network(checkpoint)
-    return (
-        checkpoint,
-        _RESOLUTION if network.any_width else network.trained.resolution or _RESOLUTION,
-    )
+    trained_px = None if network.any_width else network.trained.resolution
+    return checkpoint, trained_px or _RESOLUTION
 
 
 def _renderers(
