@@ -167,18 +167,12 @@ class Pictures:
         )
         panels = []
         for target, image in zip(STATED_DB, images, strict=True):
-            display = Image.fromarray(preview_srgb8(gain * image.radiance_rgb))
-            detail = display.crop((left_px, top_px, left_px + 48, top_px + 48))
-            both = [part.resize((384, 384), Image.Resampling.NEAREST) for part in (display, detail)]
+            display = preview_srgb8(gain * image.radiance_rgb)
+            detail = display[top_px : top_px + 48, left_px : left_px + 48]
+            parts = [part.repeat(384 // len(part), axis=0) for part in (display, detail)]
+            both = np.concatenate([part.repeat(384 // part.shape[1], axis=1) for part in parts])
             said = f"{image.noise_floor_db:.0f} dB, {image.spp:,} samples"
-            panels.append(
-                _panel(
-                    np.concatenate([np.asarray(part) for part in both]),
-                    f"Asked: {target} dB",
-                    said,
-                    TRACED,
-                )
-            )
+            panels.append(_panel(both, f"Asked: {target} dB", said, TRACED))
         self._write("stated_errors", _beside(panels))
 
     def own_objects(self) -> None:

@@ -24,6 +24,7 @@ from infra.render.path_tracer import PathTracer, RenderChild
 from infra.render.quality import measured_settings, samples_text
 from infra.viewer.picture_options import PictureOptions, apply_edits
 from pipeline.documents.scene_page import PASS_VIEWS, PassView
+from pipeline.exchange.formats import LoadedScene
 from pipeline.renders.preview import PreviewSettings, usual_filter
 from pipeline.renders.settings import RenderSettings
 from storage.errors import TrilightError, Unrenderable
@@ -132,12 +133,12 @@ class StoredPictures(RendererHere):
 
 
 def page_renderers(
-    child: RenderChild, target: StoredPictures | None, checkpoint: str | None
+    loaded: LoadedScene, child: RenderChild, checkpoint: str | None, errors_db: Sequence[float]
 ) -> Mapping[str, PageRenderer]:
-    """Return the renderers by name, in the order of the page.
+    """Return the renderers of a scene by name, in the order of the page.
 
     Args:
-        target: pictures of the file; None where it holds none.
+        errors_db: stated errors of the pictures in the file as psnr_log_db; may be empty.
     """
     offered = {
         "traced": PageRenderer(
@@ -164,7 +165,9 @@ def page_renderers(
         means="Light, surface, camera: traced without any further bounce.",
         make=lambda options: _path_tracer(child, options, max_depth=_DIRECT_DEPTH),
     )
-    if target is not None:
+    targets_rgb = loaded.radiance_rgb
+    if targets_rgb is not None and len(targets_rgb):
+        target = StoredPictures(scene=loaded.scene, radiance_rgb=targets_rgb, errors_db=errors_db)
         offered["target"] = PageRenderer(
             title="Target",
             means="The image that the file holds of this camera.",

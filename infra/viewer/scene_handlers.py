@@ -25,7 +25,6 @@ from infra.viewer.page_renderers import (
     PassImage,
     RenderJob,
     RenderQueue,
-    StoredPictures,
     agreement_db,
     page_renderers,
 )
@@ -226,12 +225,7 @@ def handlers_of_scene(
         child, checkpoint: render child and network of the page.
         errors_db: stated errors of the pictures as psnr_log_db.
     """
-    target = None
-    if loaded.radiance_rgb is not None and len(loaded.radiance_rgb):
-        target = StoredPictures(
-            scene=loaded.scene, radiance_rgb=loaded.radiance_rgb, errors_db=errors_db
-        )
-    renderers = page_renderers(child, target, checkpoint)
+    renderers = page_renderers(loaded, child, checkpoint, errors_db)
     return SceneHandlers(name=name, loaded=loaded, renderers=renderers, source=source)
 
 
