@@ -28,14 +28,13 @@ from infra.render.methods import (
 )
 from infra.render.networks import NetworkRenderer
 from infra.render.path_tracer import PathTracer, RenderChild
-from infra.render.quality import FixedSamples
 from model.inference import NeuralRenderer
 from model.open import find_network
 from model.weights import network_digest
 from pipeline.exchange.exports.export import picture_name
 from pipeline.exchange.pictures import MAX_BYTES, decode_pixels
 from pipeline.renders.mitsuba_variant import choose_variant
-from pipeline.renders.preview import MOST_SPP
+from pipeline.renders.preview import MOST_SPP, PreviewSettings
 from storage.atomic import write_atomically
 from storage.dataset.training_data import TrainingData, open_training_data
 from storage.digests import sha256_hex
@@ -199,8 +198,10 @@ def _time_tracer(
 def _previews(levels: Sequence[Level], resolution: int) -> Iterator[list[Renderer]]:
     """Yield path tracers of one thread by samples and filter."""
     with contextlib.closing(RenderChild(choose_variant(), threads=1)) as child:
-        qualities = (FixedSamples(spp=spp, denoiser=denoiser) for spp, denoiser in levels)
-        yield [PathTracer(child, quality, resolution) for quality in qualities]
+        yield [
+            PathTracer(child, PreviewSettings(resolution=resolution, spp=spp, denoiser=denoiser))
+            for spp, denoiser in levels
+        ]
 
 
 def write_judgement(judgement: Judgement, out: str | Path) -> Path:
@@ -315,7 +316,7 @@ def make_leaderboard(options: LeaderboardOptions, on_progress: OnProgress) -> Le
     """
     with open_board(options) as (board, opened):
         judge_all(board, on_progress)
-    rival = _names(options.checkpoint or BUILTIN_NETWORKS[:1])[0]
+    rival = network_name(network_labels(options.checkpoint or BUILTIN_NETWORKS)[0])
     standings = [standings_of(board, width, rival) for width in board.widths]
     tables = tuple(one for one in standings if one is not None)
     if not tables:
@@ -429,7 +430,7 @@ def _add_nearest(board: Board, options: LeaderboardOptions, opened: TrainingData
 def _add_renderers(board: Board, checkpoints: Sequence[str], child: RenderChild) -> None:
     """Add the built-in networks, those of the options, traced light and the path tracer."""
     places = [*BUILTIN_NETWORKS, *(each for each in checkpoints if each not in BUILTIN_NETWORKS)]
-    names = _names(places)
+    names = [network_name(label) for label in network_labels(places)]
     if twice := [name for name in names if names.count(name) > 1]:
         raise TrilightError(
             f"{twice[0]} is there twice; expected each network once, in folders of different names."
@@ -453,11 +454,6 @@ def _add_renderers(board: Board, checkpoints: Sequence[str], child: RenderChild)
                 board.notes.append(f"{name} is not judged at {px} pixels: {why}")
         for one in compared_renderers(px, fitting, child, [(spp, "fast") for spp in SAMPLES]):
             board.add(one, kind_of(one.name))
-
-
-def _names(places: Sequence[str]) -> list[str]:
-    """Return the row names of networks, by the folder of a run and without paths."""
-    return [network_name(label) for label in network_labels(places)]
 
 
 def _notes(board: Board, tables: Sequence[WidthStandings]) -> Iterator[str]:
@@ -514,8 +510,8 @@ def picture_folder(folder: Path, views: Views, widths: Sequence[int]) -> Picture
     by_width: dict[int, Path] = {}
     for key, view in views:
         path = folder / picture_name(key, view)
-        data = _bytes_of(path)
-        by_width.setdefault(_picture(data, path, widths).shape[0], path)
+        data, radiance_rgb = _read_picture(path, widths)
+        by_width.setdefault(len(radiance_rgb), path)
         sha256[key, view] = sha256_hex(data)
     if len(by_width) > 1:
         listed = ", ".join(f"{path.name} has {width}" for width, path in by_width.items())
@@ -528,7 +524,7 @@ def picture_folder(folder: Path, views: Views, widths: Sequence[int]) -> Picture
     def pictures(sample: Sample) -> NDArray[np.float32]:
         names = [picture_name(sample.key, view) for view in range(sample.scene.num_views)]
         paths = [folder / name for name in names]
-        read = [_picture(_bytes_of(path), path, [resolution]) for path in paths]
+        read = [_read_picture(path, [resolution])[1] for path in paths]
         return np.maximum(np.stack(read), 0)
 
     return PictureSource(
@@ -539,17 +535,14 @@ def picture_folder(folder: Path, views: Views, widths: Sequence[int]) -> Picture
     )
 
 
-def _bytes_of(path: Path) -> bytes:
+def _read_picture(path: Path, widths: Sequence[int]) -> tuple[bytes, NDArray[np.float32]]:
+    """Return a file, and the radiance [R, R, 3] in it, whose width is one of `widths`."""
     try:
         if path.stat().st_size > MAX_BYTES:
             raise TrilightError(f"{path.name}: expected a picture of at most {MAX_BYTES} bytes.")
-        return read_plain(path)
+        data = read_plain(path)
     except OSError as error:
         raise TrilightError(f"{path.name}: cannot be read ({error.strerror}).") from error
-
-
-def _picture(data: bytes, path: Path, widths: Sequence[int]) -> NDArray[np.float32]:
-    """Return the radiance [R, R, 3] of a file whose width is one of `widths`."""
     pixels = decode_pixels(data, path.name, [])
     if pixels is None or pixels.dtype != np.float32 or pixels.shape[2] < 3:
         raise TrilightError(
@@ -572,4 +565,4 @@ def _picture(data: bytes, path: Path, widths: Sequence[int]) -> NDArray[np.float
             f"{int(illegal.any(axis=-1).sum())} pixels are like it; expected finite radiance of at "
             f"least 0 (channel {'RGB'[channel]}). Make the picture again."
         )
-    return radiance_rgb
+    return data, radiance_rgb

@@ -11,6 +11,7 @@ import shutil
 import subprocess
 import sys
 from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, cast
 
@@ -20,8 +21,7 @@ from PIL import Image, ImageDraw, ImageFont
 
 from infra.cli.console import console
 from infra.render.path_tracer import PathTracer, RenderChild
-from infra.render.plan import own_camera
-from infra.render.quality import ToStatedError
+from infra.render.quality import measured_settings
 from model.inference import NeuralRenderer
 from pipeline.assets.cleaning.clean import clean, normalize
 from pipeline.assets.cleaning.orient import orient_outward
@@ -39,6 +39,7 @@ from storage.dataset.dataset import open_dataset
 from storage.metrics import psnr_log_db
 from storage.records.sample import Sample
 from storage.records.scene import Scene
+from storage.renderer import Camera
 from train.evaluation.sheet import ERROR_WHITE, heat_colors, mean_error
 
 GROUND = (22, 25, 29)
@@ -115,21 +116,23 @@ GLOSSY = {"renders.noise_floor_db": 20.0, "renders.resolution": 128}
 """Drawn materials, stopped at the first measurement."""
 
 
+@dataclass(frozen=True)
 class Pictures:
     """Makes the pictures of one folder of objects."""
 
-    def __init__(self, objects: Path, data: Path, out: Path, place: tuple[int, int]) -> None:
-        """`place`: number of the room and its view that the first pictures show."""
-        self._objects = objects
-        self._data = data
-        self._out = out
-        self._number, self._view = place
+    objects: Path
+    data: Path
+    out: Path
+    room: int
+    """Number of the room that the first pictures show."""
+    view: int
+    """Row of its camera in these pictures."""
 
     def hero(self) -> None:
         """One scene in five steps: given mesh, clean mesh, traced, by the network, its error."""
         scene = self._room()
-        traced = _trace(scene, self._view, 320, STATED_DB[-1])
-        rows = [self._view]
+        traced = _trace(scene, self.view, 320, STATED_DB[-1])
+        rows = [self.view]
         seen = scene.with_cameras(scene.c2w[rows], scene.fov_deg[rows])
         learned = NeuralRenderer.load("builtin:").render(seen, resolution=320)[0]
         source, level = self._meshes(scene)
@@ -164,18 +167,12 @@ class Pictures:
         )
         panels = []
         for target, image in zip(STATED_DB, images, strict=True):
-            display = Image.fromarray(preview_srgb8(gain * image.radiance_rgb))
-            detail = display.crop((left_px, top_px, left_px + 48, top_px + 48))
-            both = [part.resize((384, 384), Image.Resampling.NEAREST) for part in (display, detail)]
+            display = preview_srgb8(gain * image.radiance_rgb)
+            detail = display[top_px : top_px + 48, left_px : left_px + 48]
+            parts = [part.repeat(384 // len(part), axis=0) for part in (display, detail)]
+            both = np.concatenate([part.repeat(384 // part.shape[1], axis=1) for part in parts])
             said = f"{image.noise_floor_db:.0f} dB, {image.spp:,} samples"
-            panels.append(
-                _panel(
-                    np.concatenate([np.asarray(part) for part in both]),
-                    f"Asked: {target} dB",
-                    said,
-                    TRACED,
-                )
-            )
+            panels.append(_panel(both, f"Asked: {target} dB", said, TRACED))
         self._write("stated_errors", _beside(panels))
 
     def own_objects(self) -> None:
@@ -212,8 +209,8 @@ class Pictures:
         from tests.end_to_end.browser_kit import browser  # a checkout has it, and a wheel has not
 
         self._room()
-        shard = self._data / "rooms" / f"train-{self._number // 4:06d}.tar"
-        command = [sys.executable, "-m", "trilight", "view", f"{shard}::{self._number:09d}"]
+        shard = self.data / "rooms" / f"train-{self.room // 4:06d}.tar"
+        command = [sys.executable, "-m", "trilight", "view", f"{shard}::{self.room:09d}"]
         with subprocess.Popen(
             [*command, "--no-browser"], stdout=subprocess.PIPE, text=True
         ) as viewing:
@@ -221,14 +218,14 @@ class Pictures:
                 assert viewing.stdout is not None
                 said = (re.search(r"http://\S+", line) for line in viewing.stdout)
                 address = next(match[0] for match in said if match)
-                path = self._out / "viewer.png"
+                path = self.out / "viewer.png"
                 with browser("--hide-scrollbars") as page:
                     page.show(1100, 1270)
                     page.open(address)
                     page.until(f"{_CARD} && !document.querySelector('.busy')")
                     for kind in ("input", "change"):
                         page.run(
-                            f"view.value = {self._view}; view.dispatchEvent(new Event('{kind}'))"
+                            f"view.value = {self.view}; view.dispatchEvent(new Event('{kind}'))"
                         )
                     page.run(f"{_CARD}.click()")
                     page.until(f"{_CARD}.innerText.includes('stated')")
@@ -241,7 +238,7 @@ class Pictures:
 
     def _room(self) -> Scene:
         scenes = [sample.scene for sample in self._samples("rooms", ROOMS)]
-        return next(s for s in scenes if s.provenance["scene_index"] == self._number)
+        return next(s for s in scenes if s.provenance["scene_index"] == self.room)
 
     def _samples(
         self, name: str, changes: Mapping[str, Any], build: str = "tiny"
@@ -249,22 +246,22 @@ class Pictures:
         """Make one of the datasets, unless it is there, and yield its training scenes."""
         options = GenerateOptions(
             build=build,
-            objects=str(self._objects),
-            out=str(self._data / name),
+            objects=str(self.objects),
+            out=str(self.data / name),
             scenes=16,
             seed=1,
             licence="CC0-1.0",
             changes=changes,
         )
         make_dataset(options, ThreadRunner())
-        yield from open_dataset(str(self._data / name)).samples("train")
+        yield from open_dataset(str(self.data / name)).samples("train")
 
     def _meshes(self, scene: Scene) -> tuple[TriangleMesh, TriangleMesh]:
         """Return the object whose file has most triangles: that file, and what the scene has."""
         objects = [row for row, each in enumerate(scene.objects) if each.kind == "object"]
         source = {}
         for row in objects:
-            path = next(self._objects.rglob(f"{Path(scene.objects[row].uid).stem}.*"))
+            path = next(self.objects.rglob(f"{Path(scene.objects[row].uid).stem}.*"))
             mesh = load_mesh(read_source(path, AssetSettings().read_limits))
             source[row] = orient_outward(clean(normalize(mesh)))[0]
         row = max(objects, key=lambda each: len(source[each].faces))
@@ -275,7 +272,7 @@ class Pictures:
         return source[row], orient_outward(clean(normalize(level)))[0]
 
     def _write(self, name: str, pixels: Pixels) -> None:
-        path = self._out / f"{name}.webp"
+        path = self.out / f"{name}.webp"
         Image.fromarray(pixels).save(path, quality=QUALITY, method=6)
         console.print(f"{path}: {path.stat().st_size / 1000:.0f} kB")
 
@@ -284,12 +281,13 @@ _CARD = "[...document.querySelectorAll('.card')].find(c => c.innerText.startsWit
 
 
 def _trace(scene: Scene, view: int, resolution: int, target_db: float) -> RenderedView:
-    quality = ToStatedError(targets={"noise_floor_db": target_db})
-    tracer = PathTracer(RenderChild(choose_variant("auto")), quality, resolution)
+    settings = measured_settings(resolution, {"noise_floor_db": target_db})
+    tracer = PathTracer(RenderChild(choose_variant("auto")), settings)
     with contextlib.closing(tracer):
-        camera = own_camera(scene, view, named="view")
         # no preview, whose error is not measured
-        return cast(RenderedView, tracer.load(scene, "scene").render_view(camera))
+        return cast(
+            RenderedView, tracer.load(scene, "scene").render_view(Camera.of_scene(scene, view))
+        )
 
 
 def _triangles(mesh: TriangleMesh) -> str:
@@ -348,7 +346,7 @@ def main() -> None:
     parser.add_argument("--room", type=int, nargs=2, default=(14, 1), help="scene and view to show")
     parser.add_argument("--only", nargs="*", choices=NAMES, default=NAMES)
     arguments = parser.parse_args()
-    pictures = Pictures(arguments.objects, arguments.data, arguments.out, tuple(arguments.room))
+    pictures = Pictures(arguments.objects, arguments.data, arguments.out, *arguments.room)
     for name in arguments.only:
         getattr(pictures, name)()
 

@@ -1,7 +1,7 @@
 """Repair of a local dataset: makes exactly its missing or bad shards again."""
 
 import contextlib
-from collections.abc import Iterator, Sequence
+from collections.abc import Collection, Iterator, Sequence
 from pathlib import Path
 from typing import cast
 
@@ -60,13 +60,15 @@ def repair(
     require_same_extensions(str(root), manifest.extensions, extension_digests("data"))
     command = read_asked(opened) or ()
     revisits = _revisit_source(opened, command)
-    maps = _user_maps(opened, command)
+    lock = opened.objects_lock()
+    stated = [each for each in lock if each.kind == OBJECT and each.licence_source == BY_USER]
+    maps = _user_maps(opened, {entry.kind for entry in lock}, command)
     options = GenerateOptions(
         build=manifest.build,
         objects=None if scenes_from or revisits else objects or value_of(command, "--objects"),
         out=str(root),
         scenes=None if scenes_from or revisits else manifest.num_scenes,
-        licence=_stated_licence(opened),
+        licence=stated[0].licence if stated else None,  # it applied to all objects
         textures=maps.get("textures"),
         skies=maps.get("skies"),
         map_licence=maps.get("map_licence"),
@@ -143,13 +145,14 @@ def _revisit_source(dataset: Dataset, command: Sequence[str]) -> str | None:
     return place
 
 
-def _user_maps(dataset: Dataset, command: Sequence[str]) -> dict[str, str | None]:
+def _user_maps(
+    dataset: Dataset, kinds: Collection[str], command: Sequence[str]
+) -> dict[str, str | None]:
     """Return the user's folders of textures and sky maps, from `logs/asked.json`.
 
     Raises:
         TrilightError: the dataset uses such maps, and the file does not name their folder.
     """
-    kinds = {entry.kind for entry in dataset.objects_lock()}
     options = {TEXTURE: "textures", SKY: "skies"}
     folders: dict[str, str | None] = {
         name: value_of(command, f"--{name}") for kind, name in options.items() if kind in kinds
@@ -170,9 +173,3 @@ def _changes(manifest: Manifest) -> dict[str, object]:
     if _is_of_files(manifest):
         return {name: now for name, now in changed.items() if name not in _OF_SCENE_FILES}
     return changed
-
-
-def _stated_licence(dataset: Dataset) -> str | None:
-    """Return the value of `--licence` when the objects were frozen; it applies to all of them."""
-    objects = [entry for entry in dataset.objects_lock() if entry.kind == OBJECT]
-    return next((each.licence for each in objects if each.licence_source == BY_USER), None)

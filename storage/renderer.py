@@ -13,6 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from storage.digests import canonical_json, sha256_hex
+from storage.errors import TrilightError
 from storage.records.scene import Scene
 
 Fact = str | int | float
@@ -34,8 +35,13 @@ class Camera:
     """Name of its picture in messages."""
 
     @classmethod
-    def of_scene(cls, scene: Scene, view: int) -> "Camera":
-        """Return a camera of a scene by its row."""
+    def of_scene(cls, scene: Scene, view: int, named: str = "view") -> "Camera":
+        """Return a camera of a scene by its row; raises TrilightError, with `named`, without it."""
+        if not 0 <= view < scene.num_views:
+            raise TrilightError(
+                f"{named} is {view}; expected 0 to {scene.num_views - 1}: the scene has "
+                f"{scene.num_views} cameras."
+            )
         fov_deg = float(scene.fov_deg[view])
         return cls(c2w=scene.c2w[view], fov_deg=fov_deg, view=view, name=f"view {view}")
 

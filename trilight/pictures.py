@@ -9,8 +9,7 @@ from typing import TYPE_CHECKING, cast
 import numpy as np
 from numpy.typing import NDArray
 
-from infra.render.plan import own_camera
-from infra.render.quality import MOST_TRACED_SPP, ToStatedError
+from infra.render.quality import MOST_TRACED_SPP, measured_settings
 from infra.torch_library import require_torch
 from pipeline.renders.renderer import RenderedView
 from pipeline.renders.settings import StatedError
@@ -18,6 +17,7 @@ from storage.atomic import write_atomically
 from storage.conventions import HALF_FLOAT_MAX, preview_srgb8
 from storage.errors import TrilightError
 from storage.records.scene import Scene
+from storage.renderer import Camera
 
 if TYPE_CHECKING:
     from model.inference import NeuralRenderer
@@ -32,7 +32,7 @@ def render(
     noise_floor_linear_db: float | None = None,
     noise_floor_objects_db: float | None = None,
     max_spp: int = MOST_TRACED_SPP,
-    stated_error: StatedError = ToStatedError.stated_error,
+    stated_error: StatedError = "calibrated",
     split: bool = False,
     split_lobes: bool = False,
     seed: int = 0,
@@ -93,7 +93,7 @@ def render_views(
     noise_floor_linear_db: float | None = None,
     noise_floor_objects_db: float | None = None,
     max_spp: int = MOST_TRACED_SPP,
-    stated_error: StatedError = ToStatedError.stated_error,
+    stated_error: StatedError = "calibrated",
     split: bool = False,
     split_lobes: bool = False,
     seed: int = 0,
@@ -112,10 +112,11 @@ def render_views(
     from pipeline.renders.mitsuba_variant import choose_variant
 
     rows = range(scene.num_views) if views is None else views
-    cameras = [own_camera(scene, row, named="view") for row in rows]
+    cameras = [Camera.of_scene(scene, row) for row in rows]
     scene.check()
-    quality = ToStatedError(
-        targets={
+    settings = measured_settings(
+        resolution,
+        {
             "noise_floor_db": noise_floor_db,
             "noise_floor_linear_db": noise_floor_linear_db,
             "noise_floor_objects_db": noise_floor_objects_db,
@@ -126,7 +127,7 @@ def render_views(
         split_lobes=split_lobes,
     )
     child = RenderChild(choose_variant("auto"), threads)
-    tracer = PathTracer(child, quality, resolution, seed=seed)
+    tracer = PathTracer(child, settings, seed=seed)
     with contextlib.closing(tracer):
         loaded = tracer.load(scene, "scene")
         pictures = [loaded.render_view(camera) for camera in cameras]

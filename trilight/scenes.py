@@ -9,7 +9,6 @@ from typing import TYPE_CHECKING
 import numpy as np
 from numpy.typing import NDArray
 
-from infra.render.plan import scene_sources
 from pipeline.exchange.convert import reduce_scene
 from pipeline.exchange.convert import write_scene as write_in_form
 from pipeline.exchange.open_scene import LoadedScene, scene_source
@@ -44,7 +43,7 @@ def read_scenes(source: str | os.PathLike[str]) -> Iterator[Scene]:
         source: such as `train-000000.tar`, `stage.usdc`, `scenes/` or `scenes/{000..119}.json`.
     """
     with SceneReader() as reader:
-        for entry in scene_sources(os.fspath(source), reader):
+        for entry in reader.list_scenes(os.fspath(source)):
             yield _warn_notes(reader.load(entry))
 
 

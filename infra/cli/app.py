@@ -53,7 +53,11 @@ def main() -> None:
         if its_author is not None:
             leave(f"trilight: {its_author}", 1)
         if isinstance(error, OSError):
-            _leave_without_output(error)
+            try:
+                os.write(sys.stdout.fileno(), b"\n")
+            except OSError:
+                said = f"what is printed cannot be written ({error.strerror}); choose another place"
+                leave(f"trilight: {said}. What was finished is safe.", 1)
         if isinstance(error, MemoryError) or _describe_limit():  # libraries fail in various ways
             said = f"too little memory ({type(error).__name__}); what was finished is safe."
             leave(f"trilight: {said}{_describe_limit()}", EnvironmentFailure.exit_status)
@@ -69,15 +73,6 @@ def _describe_limit() -> str:
         f" A process of this shell may take {limit >> 20} MiB of memory; expected "
         f"{_ENOUGH_BYTES >> 20} or more, since less may be the reason: raise `ulimit -v`."
     )
-
-
-def _leave_without_output(error: OSError) -> None:
-    """End the process where standard output cannot be written."""
-    try:
-        os.write(sys.stdout.fileno(), b"\n")
-    except OSError:
-        said = f"what is printed cannot be written ({error.strerror}); choose another place"
-        leave(f"trilight: {said}. What was finished is safe.", 1)
 
 
 def _require_usable_names() -> None:

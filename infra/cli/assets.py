@@ -9,12 +9,12 @@ from rich.table import Table
 from rich.text import Text
 
 from infra.cli.console import (
+    Bars,
     console,
     first_words,
     next_step,
     print_json,
     print_rows,
-    progress_bars,
     suggest_look,
 )
 from infra.cli.options import command
@@ -75,9 +75,10 @@ def assets(options: AssetOptions) -> None:
     out = options.out
     first_words(f"Meshes of {safe_url(source)} to {out}")
     from pipeline.generation.make_assets import AssetFolder, make_assets
+    from pipeline.generation.prepare_isolated import format_unread
 
     folder = AssetFolder(out)
-    with progress_bars() as bars:
+    with Bars() as bars:
         fetched = bars.add_task("download", total=None, note="")
         task = bars.add_task("objects", total=None, note="")
         report = make_assets(
@@ -92,17 +93,6 @@ def assets(options: AssetOptions) -> None:
             on_object=lambda: bars.advance(task),
         )
     print_json(report.as_json())
-    _print_report(report, options, settings, folder)
-    if not report.rows:
-        sys.exit(1)
-
-
-def _print_report(
-    report: "AssetReport", options: AssetOptions, settings: AssetSettings, folder: "AssetFolder"
-) -> None:
-    """Print the result for the objects, the page to look at, and the next command."""
-    from pipeline.generation.prepare_isolated import format_unread
-
     _print_table(report)
     decimated = [row for row in report.rows if row.method != "source"]
     rows = [
@@ -126,6 +116,8 @@ def _print_report(
                 own_materials=options.own_materials,
             )
         )
+    else:
+        sys.exit(1)
 
 
 def _lines(name: str, lines: Sequence[str]) -> list[tuple[str, str]]:

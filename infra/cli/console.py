@@ -136,10 +136,25 @@ class RateColumn(ProgressColumn):
 
 
 class Bars(Progress):
-    """Progress bars, each drawn once its total is known; without a terminal, a line a minute."""
+    """Progress bars with count, rate, elapsed time and ETA; without a terminal, a line a minute.
 
-    def __init__(self, *columns: str | ProgressColumn, **options: Any) -> None:
-        super().__init__(*columns, **options)
+    A bar is drawn once its total is known.
+    """
+
+    def __init__(self) -> None:
+        super().__init__(
+            TextColumn("{task.description:<8}", markup=False),
+            BarColumn(bar_width=20),
+            MofNCompleteColumn(),
+            RateColumn(table_column=Column(no_wrap=True)),
+            TimeElapsedColumn(),
+            TextColumn("left"),
+            # scenes of a shard end together, so that the speed of the last seconds means little
+            TimeRemainingColumn(compact=True),
+            TextColumn("{task.fields[note]}", markup=False),
+            console=console,
+            speed_estimate_period=300,
+        )
         self._next_line_s = time.monotonic() + _LOG_S
 
     def add_task(self, *args: Any, **fields: Any) -> TaskID:
@@ -190,30 +205,13 @@ def _is_drawn(task: Task) -> bool:
     return task.visible and task.total is not None
 
 
-def progress_bars() -> Bars:
-    """Return progress bars with count, rate, elapsed time and ETA."""
-    return Bars(
-        TextColumn("{task.description:<8}", markup=False),
-        BarColumn(bar_width=20),
-        MofNCompleteColumn(),
-        RateColumn(table_column=Column(no_wrap=True)),
-        TimeElapsedColumn(),
-        TextColumn("left"),
-        # scenes of a shard end together, so that the speed of the last seconds means little
-        TimeRemainingColumn(compact=True),
-        TextColumn("{task.fields[note]}", markup=False),
-        console=console,
-        speed_estimate_period=300,
-    )
-
-
 @contextlib.contextmanager
 def progress(noun: str) -> Iterator[Callable[..., None]]:
     """Draw a bar of things called `noun` during the block; yield what moves it.
 
     That takes the number of finished ones, of all, and a note.
     """
-    with progress_bars() as bars:
+    with Bars() as bars:
         task = bars.add_task(noun, total=None, note="")
         yield lambda done, total, note="": bars.update(task, completed=done, total=total, note=note)
 

@@ -10,7 +10,6 @@ from infra.cli.console import (
     print_result,
     print_rows,
     progress,
-    progress_bars,
     suggest_look,
 )
 from infra.cli.options import command
@@ -88,21 +87,14 @@ def export(options: ExportOptions) -> None:
 
     views: list[int] = []
     """Number of views of each written scene."""
-    with progress_bars() as bars:
-        task = bars.add_task("scenes", total=None, note="")
-
-        def on_scene(num_views: int) -> None:
-            views.append(num_views)
-            bars.advance(task)
-
-        notes = export_dataset(
-            options.source,
-            options.form,
-            options.out,
-            split=options.split,
-            scene=options.scene,
-            done=on_scene,
-        )
+    notes = export_dataset(
+        options.source,
+        options.form,
+        options.out,
+        split=options.split,
+        scene=options.scene,
+        done=views.append,
+    )
     about = {"form": options.form, "out": str(options.out)}
     record = {**about, "scenes": len(views), "views": sum(views), "notes": list(notes)}
     rows = [*about.items(), ("written", f"{len(views)} scenes, {sum(views)} views")]

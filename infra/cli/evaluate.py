@@ -37,32 +37,26 @@ def evaluate(options: EvaluationOptions) -> None:
 
             with open_board(board):  # checked first: the evaluation before it may take hours
                 pass
-        record, out = _judge_network(options, options.checkpoint)
+        first_words(f"Judging {options.checkpoint} on the split {options.split}")
+        require_torch("evaluate")
+        from infra.judging import judge_network, write_judgement
+
+        with progress("scenes") as done:
+            judgement = judge_network(
+                options.checkpoint,
+                train_data=options.train_data or None,
+                done=done,
+                **{name: getattr(options, name) for name in _JUDGED_BY},
+            )
+        first_words("Drawing the sheets")
+        out = write_judgement(judgement, options.report_folder)
+        _report(judgement.record, out)
+        record = {name: judgement.record[name] for name in ("about", "contestants", "path tracer")}
         board = board and dataclasses.replace(board, out=out)
     if board:
         standings = judge_methods(board)
         record = record | {"leaderboard": standings} if record else standings
     print_json(record)
-
-
-def _judge_network(options: EvaluationOptions, checkpoint: str) -> tuple[dict[str, Any], Path]:
-    """Evaluate a network, and print the figures; return figures and folder."""
-    first_words(f"Judging {checkpoint} on the split {options.split}")
-    require_torch("evaluate")
-    from infra.judging import judge_network, write_judgement
-
-    with progress("scenes") as done:
-        judgement = judge_network(
-            checkpoint,
-            train_data=options.train_data or None,
-            done=done,
-            **{name: getattr(options, name) for name in _JUDGED_BY},
-        )
-    first_words("Drawing the sheets")
-    record = judgement.record
-    out = write_judgement(judgement, options.report_folder)
-    _report(record, out)
-    return {name: record[name] for name in ("about", "contestants", "path tracer")}, out
 
 
 def _report(record: dict[str, Any], out: Path) -> None:

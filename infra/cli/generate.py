@@ -15,9 +15,8 @@ from importlib.util import find_spec
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
-from rich.progress import Progress as Bars
-
 from infra.cli.console import (
+    Bars,
     duration,
     first_words,
     next_step,
@@ -25,7 +24,6 @@ from infra.cli.console import (
     print_json,
     print_result,
     print_rows,
-    progress_bars,
 )
 from infra.cli.options import command
 from infra.cli.overrides import BaseSettings, with_base_settings
@@ -42,7 +40,7 @@ from pipeline.generation.generate_options import (
 from pipeline.objects.licences import USER_PROVIDED
 from storage.dataset.layout import DatasetFolder, dataset_folder
 from storage.dataset.manifest import read_head
-from storage.dataset.progress import Progress, read_progress
+from storage.dataset.progress import read_progress
 from storage.dataset.statistics import Statistics
 from storage.errors import TrilightError
 from storage.machine import available_cores
@@ -93,71 +91,51 @@ def make(options: GenerateOptions, runner: ExecutorOptions) -> None:
         first_words(text)
     if text := choose_dataset_variant(options, folder).note:
         note(f"{text}; see trilight doctor")
-    with show_progress(folder):
-        outcome = executor.make(options, runner.address)
-    report(folder, outcome, time.monotonic() - started)
-
-
-@contextlib.contextmanager
-def show_progress(folder: DatasetFolder) -> Iterator[None]:
-    """Draw progress bars while the block runs."""
     ended = threading.Event()
-    with progress_bars() as bars:
+    with Bars() as bars:
         watcher = threading.Thread(target=_watch, args=(folder, bars, ended), daemon=True)
         watcher.start()
         try:
-            yield
+            outcome = executor.make(options, runner.address)
         finally:
             ended.set()
             watcher.join()
+    report(folder, outcome, time.monotonic() - started)
 
 
 def _watch(folder: DatasetFolder, bars: Bars, ended: threading.Event) -> None:
-    drawn = _Bars(bars)
+    """Draw downloads, objects and views until their maker has ended.
+
+    A view in progress counts as a fraction.
+    """
+    downloads, objects, views = (
+        bars.add_task(name, total=None, note="") for name in ("download", "objects", "views")
+    )
+    already: float | None = None
+    most = 0.0
     waits = not folder.contact_sheet.exists()
     last = False
     while not last:
         last = ended.wait(_POLL_S)
         with contextlib.suppress(OSError, ValueError):  # a file may vanish between two looks
-            drawn.show(read_progress(folder))
+            now = read_progress(folder)
+            to_load = now.downloads_planned or None
+            bars.update(downloads, completed=now.downloads_done, total=to_load)
+            bars.update(objects, completed=now.objects_done, total=now.objects_planned or None)
+            if now.scenes_planned and now.objects_done >= now.objects_planned:
+                if already is None:  # rate and ETA leave out the views of earlier runs
+                    already = now.views_done
+                    bars.reset(views)
+                total = (now.scenes_planned - now.scenes_given_up) * now.num_views - already
+                # the bar does not go back where a scene begins again
+                most = min(max(most, now.views_done - already), total)
+                given_up = f", {now.scenes_given_up} given up" if now.scenes_given_up else ""
+                earlier = f", {already:.0f} views were there" if already else ""
+                text = f"scenes {now.scenes_done} of {now.scenes_planned}{given_up}{earlier}"
+                bars.update(views, completed=most, total=total, note=text)
         if waits and folder.contact_sheet.exists():
             waits = False
             bars.console.print(f"First pictures: {folder.contact_sheet}", soft_wrap=True)
-
-
-class _Bars:
-    """Three bars: downloads, objects, and views; a view in progress counts as a fraction."""
-
-    def __init__(self, bars: Bars) -> None:
-        self._bars = bars
-        self._downloads, self._objects, self._views = (
-            bars.add_task(name, total=None, note="") for name in ("download", "objects", "views")
-        )
-        self._already: float | None = None
-        self._most = 0.0
-
-    def show(self, now: Progress) -> None:
-        """Update the bars."""
-        downloads = now.downloads_planned or None
-        objects = now.objects_planned or None
-        self._bars.update(self._downloads, completed=now.downloads_done, total=downloads)
-        self._bars.update(self._objects, completed=now.objects_done, total=objects)
-        if not now.scenes_planned or now.objects_done < now.objects_planned:
-            return
-        if self._already is None:  # rate and ETA leave out the views of earlier runs
-            self._already = now.views_done
-            self._bars.reset(self._views)
-        total = (now.scenes_planned - now.scenes_given_up) * now.num_views - self._already
-        # the bar does not go back where a scene begins again
-        self._most = min(max(self._most, now.views_done - self._already), total)
-        given_up = f", {now.scenes_given_up} given up" if now.scenes_given_up else ""
-        earlier = f", {self._already:.0f} views were there" if self._already else ""
-        self._bars.update(
-            self._views,
-            completed=self._most,
-            total=total,
-            note=f"scenes {now.scenes_done} of {now.scenes_planned}{given_up}{earlier}",
-        )
 
 
 def report(folder: DatasetFolder, outcome: "Outcome", seconds: float) -> None:
@@ -276,7 +254,7 @@ def plan(
     first_words(f"Measuring {samples} scenes of {options.build}")
     from infra.planning import measure_scenes, predict_cost  # slow: every stage
 
-    with progress_bars() as bars, temporary_folder("trilight-plan-") as place:
+    with Bars() as bars, temporary_folder("trilight-plan-") as place:
         task = bars.add_task("scenes", total=samples, note="")
         measured = measure_scenes(options, samples, place, lambda: bars.advance(task))
     cores = plan_options.cores

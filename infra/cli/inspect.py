@@ -11,10 +11,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from infra.cli.console import (
+    Bars,
     command_line,
     first_words,
     print_result,
-    progress_bars,
     suggest_look,
 )
 from infra.cli.options import command
@@ -74,7 +74,7 @@ def inspect(options: InspectOptions) -> None:
         )
     from pipeline.documents.distributions import dataset_distributions  # slow: matplotlib
 
-    with progress_bars() as bars:
+    with Bars() as bars:
         total = len(described_shards(opened))
         task = bars.add_task("shards", total=total, note="")
         statistics = dataset_statistics(opened)
@@ -83,7 +83,15 @@ def inspect(options: InspectOptions) -> None:
     if folder and not options.out and not os.access(folder.root, os.W_OK | os.X_OK):
         folder = None
     if folder is not None:
-        _write(opened, statistics, distributions, folder, options)
+        from pipeline.documents.checksums import renew_sums
+        from pipeline.documents.report import write_report
+        from pipeline.documents.sheets import write_contact_sheet, write_template_sheet
+
+        write_contact_sheet(opened, statistics, max_scenes=options.scenes, out=folder)
+        write_report(opened, distributions, out=folder)
+        if options.by_template is not None:
+            write_template_sheet(opened, per_template=options.by_template, out=folder)
+        renew_sums(folder.root)
     _print_summary(name, opened, statistics, distributions)
     suggest_look(f"Look at {folder.report} and {folder.contact_sheet}" if folder else _READ_ONLY)
 
@@ -117,24 +125,6 @@ def _inspect_scene(source: str, turntable: Path | None) -> None:
     print_result(source, _fact_rows(facts), {**facts, "notes": notes}, notes=notes)
     if turntable is not None:
         suggest_look(f"Look at {turntable}")
-
-
-def _write(
-    opened: Dataset,
-    statistics: Statistics,
-    distributions: "Distributions",
-    folder: DatasetFolder,
-    options: InspectOptions,
-) -> None:
-    from pipeline.documents.checksums import renew_sums
-    from pipeline.documents.report import write_report
-    from pipeline.documents.sheets import write_contact_sheet, write_template_sheet
-
-    write_contact_sheet(opened, statistics, max_scenes=options.scenes, out=folder)
-    write_report(opened, distributions, out=folder)
-    if options.by_template is not None:
-        write_template_sheet(opened, per_template=options.by_template, out=folder)
-    renew_sums(folder.root)
 
 
 def _print_summary(

@@ -1,10 +1,11 @@
 """`trilight passes`: writes depth, normals, ids and more of stored scenes as OpenEXR."""
 
+import functools
 from collections.abc import Callable
 from pathlib import Path
 from typing import Annotated
 
-from infra.cli.console import first_words, print_result, progress_bars
+from infra.cli.console import first_words, print_result
 from infra.cli.options import command
 from pipeline.renders.mitsuba_variant import Device, activate, choose_gpu
 from storage.raycast.caster import FirstHitCaster, Surfaces
@@ -43,36 +44,35 @@ class PassOptions:
 @command("source")
 def passes(options: PassOptions) -> None:
     names = pass_names(name for words in options.passes for name in words.split(","))
-    gpu, note = choose_gpu("auto", device=options.device)
     first_words(f"Writing {', '.join(names)} to {options.out}")
     from pipeline.exchange.pass_files import write_passes
 
-    caster: Callable[[Scene], FirstHitCaster] = Surfaces
-    if gpu is not None:
+    files: list[Path] = []
+    notes: list[str] = []
+
+    @functools.cache
+    def caster() -> Callable[[Scene], FirstHitCaster]:
+        gpu, note = choose_gpu("auto", device=options.device)
+        notes.extend([f"{note}; see trilight doctor"] if note else [])
+        if gpu is None:
+            return Surfaces
         activate(gpu)
         from pipeline.renders.kernel_scene import CameraRays
 
-        caster = CameraRays
-    files: list[Path] = []
-    with progress_bars() as bars:
-        task = bars.add_task("views", total=None, note="")
+        return CameraRays
 
-        def on_file(path: Path) -> None:
-            files.append(path)
-            bars.advance(task)
-
-        scene_notes = write_passes(
-            options.source,
-            options.out,
-            names,
-            scene=options.scene,
-            view=options.view,
-            resolution=options.resolution,
-            rays_a_side=options.rays_a_side,
-            done=on_file,
-            caster=caster,
-        )
-    notes = [*scene_notes, *([f"{note}; see trilight doctor"] if note else [])]
+    scene_notes = write_passes(
+        options.source,
+        options.out,
+        names,
+        scene=options.scene,
+        view=options.view,
+        resolution=options.resolution,
+        rays_a_side=options.rays_a_side,
+        done=files.append,
+        caster=lambda scene: caster()(scene),  # probed once a source is there
+    )
+    notes = [*scene_notes, *notes]
     record = {"files": list(map(str, files)), "notes": notes, "passes": names}
     rows = [("files", str(len(files))), ("passes", ", ".join(names))]
     print_result("Passes", rows, record, notes=notes)

@@ -24,15 +24,6 @@ def presets(options: PresetOptions) -> None:
     if options.build is not None:
         _print_settings(options.build)
         return
-    tables = _names()
-    print_json({title.split(":")[0].lower(): rows for title, rows in tables.items()})
-    for title, rows in tables.items():
-        print_table(title, rows)
-        console.print()
-
-
-def _names() -> dict[str, list[dict[str, Any]]]:
-    """Return rows with each name that a command takes, by title."""
     from infra.render.methods import BUILTIN_NETWORKS
     from model.config import SIZES
     from pipeline.objects.sources import SOURCES
@@ -43,7 +34,7 @@ def _names() -> dict[str, list[dict[str, Any]]]:
     trainings = {name: preset() for name, preset in TRAINING_PRESETS.items()}
     sizes = {name: size() for name, size in SIZES.items()}
     sources = ("FOLDER", *(f"{name}:" for name in SOURCES))
-    return {
+    tables: dict[str, list[dict[str, Any]]] = {
         "Datasets: trilight generate PRESET": [
             {
                 "name": _name_for_people(name, PRESET_ALIASES),
@@ -76,6 +67,10 @@ def _names() -> dict[str, list[dict[str, Any]]]:
             {"name": _name_for_people(name, OBJECTS)} for name in sources
         ],
     }
+    print_json({title.split(":")[0].lower(): rows for title, rows in tables.items()})
+    for title, rows in tables.items():
+        print_table(title, rows)
+        console.print()
 
 
 def _print_settings(name: str) -> None:

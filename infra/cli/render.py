@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 from rich.text import Text
 
-from infra.cli.console import note, print_json, print_rows, progress_bars, suggest_look
+from infra.cli.console import Bars, print_result, suggest_look
 from infra.cli.options import command
 from infra.render.networks import NetworkRenderer
 from infra.render.options import RenderOptions
@@ -25,7 +25,7 @@ from storage.renderer import Facts, Image, Renderer, Sampling
 @command("source")
 def render(options: RenderOptions) -> None:
     started = time.monotonic()
-    with progress_bars() as bars, SceneReader(options.albedo_over_one) as reader:
+    with Bars() as bars, SceneReader() as reader:
         plan = plan_render(options, reader)
         if plan.choice is not None:
             bars.console.print(Text(plan.choice.sentence), soft_wrap=True)
@@ -68,7 +68,7 @@ def print_outcome(
     plan: RenderPlan, finished: Sequence[FinishedShot], notes: Sequence[str], seconds: float
 ) -> None:
     """Print files and figures of the only picture, or a summary of many."""
-    record = {
+    record: dict[str, Any] = {
         "engine": plan.engine,
         "notes": list(notes),
         "resolution": plan.resolution,
@@ -79,15 +79,23 @@ def print_outcome(
     if plan.choice is not None:
         record["choice"] = plan.choice.sentence
     shots = [_shot_json(shot, timed=plan.choice is not None) for shot in finished]
-    for text in notes:
-        note(text)
     if plan.output.is_sequence:
         video = plan.output.video
-        print_json({**record, "pictures": shots, "video": None if video is None else str(video)})
-        _print_sequence(plan, finished, seconds)
+        record |= {"pictures": shots, "video": None if video is None else str(video)}
+        rows = _sequence_rows(plan, finished)
+        look = str(video or plan.output.folder)
+        measured = f"the pictures in {plan.output.folder}"
     else:
-        print_json({**record, **shots[0]})
-        _print_one(plan, finished[0], seconds)
+        (shot,) = finished
+        record |= shots[0]
+        rows = _picture_rows(plan, shot)
+        look = str(shot.png)
+        measured = " and ".join(str(picture.path) for picture in shot.pictures.values())
+    rows += [*_time_rows(plan, finished), ("wall time", f"{seconds:.1f} s")]
+    if not plan.output.is_sequence:
+        rows.append(("scene digest", finished[0].scene_sha256))
+    print_result("Rendered", rows, record, notes=notes)
+    suggest_look(f"Look at {look}; measure with {measured}")
 
 
 def _shot_json(done: FinishedShot, *, timed: bool) -> dict[str, Any]:
@@ -117,7 +125,7 @@ def _shot_json(done: FinishedShot, *, timed: bool) -> dict[str, Any]:
     }
 
 
-def _print_one(plan: RenderPlan, done: FinishedShot, seconds: float) -> None:
+def _picture_rows(plan: RenderPlan, done: FinishedShot) -> Rows:
     width = plan.resolution
     factor = enlargement(width)
     enlarged = "" if factor == 1 else f"; in the PNG a pixel is {factor} x {factor}"
@@ -133,12 +141,7 @@ def _print_one(plan: RenderPlan, done: FinishedShot, seconds: float) -> None:
         rows += _describe(renderer, done.pictures[renderer.name].facts)
     if done.psnr_log_db is not None:
         rows.append(("agreement", f"{done.psnr_log_db:.1f} dB (psnr_log_db)"))
-    rows += _time_rows(plan, [done])
-    rows += [("wall time", f"{seconds:.1f} s"), ("scene digest", done.scene_sha256)]
-    print_rows("Rendered", rows)
-    measure = " and ".join(str(picture.path) for picture in done.pictures.values())
-    look = f"Look at {done.png}; measure with {measure}"
-    suggest_look(look)
+    return rows
 
 
 def _describe(renderer: Renderer, facts: Facts) -> Rows:
@@ -187,7 +190,7 @@ def _floor(settings: RenderSettings, facts: Facts, metric: str) -> str:
     return f"{text}; {'reached' if reached else 'the cap came before'} {target_db:g} dB)"
 
 
-def _print_sequence(plan: RenderPlan, shots: Sequence[FinishedShot], seconds: float) -> None:
+def _sequence_rows(plan: RenderPlan, shots: Sequence[FinishedShot]) -> Rows:
     pictures = [picture for shot in shots for picture in shot.pictures.values()]
     num_kept = sum(picture.seconds is None for picture in pictures)
     rows: Rows = [
@@ -208,12 +211,7 @@ def _print_sequence(plan: RenderPlan, shots: Sequence[FinishedShot], seconds: fl
         noise_db = np.median([flicker["noise_db"] for flicker in flickers])
         text = f"median {db:.1f} dB from frame to frame; the traced frames' noise alone"
         rows.append(("flicker", f"{text} {noise_db:.1f}"))
-    rows += _time_rows(plan, shots)
-    rows.append(("wall time", f"{seconds:.1f} s"))
-    print_rows("Rendered", rows)
-    folder = plan.output.folder
-    look = f"Look at {plan.output.video or folder}; measure with the pictures in {folder}"
-    suggest_look(look)
+    return rows
 
 
 def _time_rows(plan: RenderPlan, shots: Sequence[FinishedShot]) -> Rows:

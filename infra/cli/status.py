@@ -6,14 +6,15 @@ import time
 from typing import Annotated
 
 from infra.cli.console import (
+    Bars,
     command_line,
     console,
     duration,
     first_words,
     next_step,
     print_json,
+    print_result,
     print_rows,
-    progress_bars,
     suggest_look,
 )
 from infra.cli.options import command
@@ -66,7 +67,7 @@ def status(options: StatusOptions, core: CorePrice) -> None:
         return
     progress = read_status(options.dataset)
     cost = None if progress.core_hours is None else progress.core_hours * core.price
-    print_json({**dataclasses.asdict(progress), "next": _next(progress), "cost_usd": cost})
+    record = {**dataclasses.asdict(progress), "next": _next(progress), "cost_usd": cost}
     objects = f"{progress.objects_done} of {progress.objects_planned}"
     rows = [
         *([("objects", objects)] if progress.objects_done < progress.objects_planned else []),
@@ -84,7 +85,7 @@ def status(options: StatusOptions, core: CorePrice) -> None:
     if cost is not None:
         rows.append(("cost so far", f"{progress.core_hours:.2f} core-hours, {cost:.2f} USD"))
     preset = name_for_people(progress.build, PRESET_ALIASES)
-    print_rows(f"{progress.display_name}: {preset}, {_state(progress)}", rows)
+    print_result(f"{progress.display_name}: {preset}, {_state(progress)}", rows, record)
     if progress.next_words:
         next_step(progress.next_words, recorded=progress.extensions)
     else:
@@ -181,7 +182,7 @@ def verify(options: VerifyOptions) -> None:
 
 def _verify(dataset: str, *, fast: bool) -> Verification:
     opened = open_dataset(dataset)
-    with progress_bars() as bars:
+    with Bars() as bars:
         total = len(opened.manifest.shards) or None
         task = bars.add_task("shards", total=total, note="")
         return verify_dataset(opened, fast=fast, shard_done=lambda _: bars.advance(task))

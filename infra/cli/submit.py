@@ -1,7 +1,7 @@
 """`trilight submit`: runs `generate` by workers of a Prefect server, or as an array of tasks."""
 
 import shlex
-from collections.abc import Iterable, Sequence
+from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
@@ -9,13 +9,13 @@ from cyclopts import App, Group
 
 from infra.cli.commands import HELP_FLAGS
 from infra.cli.console import (
+    Bars,
     console,
     first_words,
     next_step,
     note,
     print_json,
     print_rows,
-    progress_bars,
 )
 from infra.cli.options import command
 from infra.cli.overrides import BaseSettings, with_base_settings
@@ -166,7 +166,17 @@ def _submit_flow(
         if runs.no_watch:
             print_json({"flow_run": str(run.id), "deployment": run.deployment})
             return
-        last = _watch_run(prefect.poll_run(client, run.id))
+        last: RunStatus | None = None
+        with Bars() as bars:
+            bar = bars.add_task("percent", total=100, note="")
+            for look in prefect.poll_run(client, run.id):
+                if last is None or last.state != look.state:
+                    bars.console.print(look.state)
+                scenes = dict(look.tables.get("progress", ())).get("scenes in shards")
+                text = f"scenes {scenes}" if scenes else ""
+                bars.update(bar, completed=round(look.percent), note=text)
+                last = look
+    assert last is not None  # a run has at least one look
     _report(run, last, options.place)
     if Path(options.place).is_dir():
         next_step(["verify", options.place], ["inspect", options.place])
@@ -210,22 +220,6 @@ def submit_to_array(
         return
     note("the same command submits again what is missing then, once no task is left in the queue")
     next_step(["status", options.place])
-
-
-def _watch_run(looks: "Iterable[RunStatus]") -> "RunStatus":
-    """Draw the progress of a run, and return its last state."""
-    last = None
-    with progress_bars() as bars:
-        bar = bars.add_task("percent", total=100, note="")
-        for look in looks:
-            if last is None or last.state != look.state:
-                bars.console.print(look.state)
-            scenes = dict(look.tables.get("progress", ())).get("scenes in shards")
-            note = f"scenes {scenes}" if scenes else ""
-            bars.update(bar, completed=round(look.percent), note=note)
-            last = look
-    assert last is not None  # a run has at least one look
-    return last
 
 
 def _report(run: "SubmittedRun", last: "RunStatus", where: str) -> None:

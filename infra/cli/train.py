@@ -8,10 +8,9 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, NoReturn
 
-from rich.progress import Progress as Bars
 from rich.progress import TaskID
 
-from infra.cli.console import console, next_step, note, print_rows, progress_bars, suggest_look
+from infra.cli.console import Bars, console, next_step, note, print_rows, suggest_look
 from infra.cli.options import command
 from infra.cli.overrides import BaseSettings, merge_overrides, run_record
 from infra.run_record import tensorboard_command
@@ -98,8 +97,15 @@ def train(options: TrainOptions, watched: WatchSettings, base: BaseSettings) -> 
         )
         options = dataclasses.replace(options, changes=changes)
     settings = options.settings()  # without torch, so that mistakes are named at once
-    if options.processes > 1:
-        _launch(options, watched)
+    if options.processes > 1:  # torchrun starts this command once for each process
+        if "RANK" in os.environ:
+            raise TrilightError(
+                f"--processes is {options.processes} under torchrun, which sets their number; "
+                "omit it."
+            )
+        words = [*options.command(), *option_words(watched)]
+        words += ["--json"] if console.quiet else []
+        os.execve(words[0], words, child_environment())
     if os.environ.get("RANK", "0") == "0":
         _announce(options, settings)
     result = _run_training(options, settings, watched)
@@ -108,17 +114,6 @@ def train(options: TrainOptions, watched: WatchSettings, base: BaseSettings) -> 
     if console.quiet:
         sys.stdout.write(result.folder.summary.read_text())
     _report(result, options.data)
-
-
-def _launch(options: TrainOptions, watched: WatchSettings) -> NoReturn:
-    """Become torchrun, which starts this command once for each process."""
-    if "RANK" in os.environ:
-        raise TrilightError(
-            f"--processes is {options.processes} under torchrun, which sets their number; omit it."
-        )
-    words = [*options.command(), *option_words(watched)]
-    words += ["--json"] if console.quiet else []
-    os.execve(words[0], words, child_environment())
 
 
 def _run_training(
@@ -130,7 +125,7 @@ def _run_training(
     from train.loop.interrupts import Stopped
     from train.run_training import run_training
 
-    with join_processes(options.device) as crew, progress_bars() as bars:
+    with join_processes(options.device) as crew, Bars() as bars:
         try:
             return run_training(
                 settings,

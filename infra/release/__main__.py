@@ -19,17 +19,18 @@ import numpy as np
 from cyclopts import Parameter
 from numpy.typing import NDArray
 
-from infra.cli.console import first_words, next_step, print_rows, progress_bars
+from infra.cli.console import Bars, first_words, next_step, print_rows
 from infra.release.push_to_hub import NETWORK_FILE, kind_of, require_within_limits
 from infra.render.networks import NetworkRenderer
 from infra.render.path_tracer import PathTracer, RenderChild
-from infra.render.quality import FixedSamples
+from infra.render.quality import samples_text
 from model.open import BUILTIN_NETWORKS
 from pipeline.documents.checksums import write_sums
 from pipeline.documents.pages import Figure, render_page
 from pipeline.documents.png import encode_png
 from pipeline.documents.sheets import choose_scenes, read_chosen
 from pipeline.renders.mitsuba_variant import choose_variant
+from pipeline.renders.preview import PreviewSettings
 from storage.atomic import write_atomically
 from storage.conventions import SPLITS, preview_srgb8
 from storage.dataset.dataset import Dataset, open_dataset
@@ -67,7 +68,7 @@ def main(
         raise TrilightError(f"{place}: objects under {named}; a release has CC0 only.")
     _write_network(folder / "network")
     chosen = chosen_scenes(dataset, pictures)
-    with progress_bars() as bars:
+    with Bars() as bars:
         task = bars.add_task("scenes", total=len(chosen), note="")
         comparisons = list(
             compare_scenes(dataset, chosen, checkpoint=_CHECKPOINT, done=lambda: bars.advance(task))
@@ -224,12 +225,12 @@ def compare_scenes(
         for shard, sample in read_chosen(dataset, chosen):
             width = int(sample.radiance_rgb.shape[1])
             if width not in by_width:
-                qualities = [FixedSamples(spp=spp, denoiser="fast") for spp in RIVALS]
+                rivals = [PreviewSettings(resolution=width, spp=spp) for spp in RIVALS]
                 by_width[width] = [
                     NetworkRenderer(name=NETWORK, checkpoint=checkpoint, resolution=width),
                     *(
-                        PathTracer(child, one, width, name=f"{one.count}, filtered")
-                        for one in qualities
+                        PathTracer(child, one, name=f"{samples_text(one.spp)}, filtered")
+                        for one in rivals
                     ),
                 ]
             camera = Camera.of_scene(sample.scene, 0)

@@ -8,7 +8,8 @@ import numpy as np
 
 from infra.render.networks import DirectLightRenderer, NetworkRenderer, traced_network
 from infra.render.path_tracer import PathTracer, RenderChild
-from infra.render.quality import FixedSamples
+from infra.render.quality import samples_text
+from pipeline.renders.preview import PreviewSettings
 from pipeline.renders.settings import Filtered
 from storage.denoiser import Features, Quality, denoise
 from storage.renderer import Renderer
@@ -53,7 +54,7 @@ def network_labels(paths: Sequence[str]) -> tuple[str, ...]:
 
 def samples_name(level: tuple[int, Filtered]) -> str:
     """Return the row's name of a number of samples with a filter."""
-    return f"{FixedSamples(spp=level[0], denoiser=level[1]).count}, {level[1]}"
+    return f"{samples_text(level[0])}, {level[1]}"
 
 
 def kind_of(name: str) -> str:
@@ -96,7 +97,7 @@ def compared_renderers(
             )
         )
     for level in levels:
-        quality = FixedSamples(spp=level[0], denoiser=level[1])
+        settings = PreviewSettings(resolution=resolution, spp=level[0], denoiser=level[1])
         name = samples_name(level)
-        compared.append(PathTracer(child, quality, resolution, seed=SAMPLE_SEED, name=name))
+        compared.append(PathTracer(child, settings, seed=SAMPLE_SEED, name=name))
     return compared

@@ -3,19 +3,14 @@
 from pathlib import Path
 from typing import Annotated, Literal
 
-from infra.render.quality import (
-    MOST_TRACED_SPP,
-    Budget,
-    FixedSamples,
-    Quality,
-    ToStatedError,
-)
+from infra.render.quality import MOST_TRACED_SPP, Budget, measured_settings
 from infra.render.tone_mapping import ToneMap
 from pipeline.exchange.from_description import AlbedoOverOne
-from pipeline.renders.preview import MOST_SPP, usual_filter
+from pipeline.renders.preview import MOST_SPP, PreviewSettings, usual_filter
 from pipeline.renders.settings import (
     Filtered,
     NoiseFloor,
+    RenderSettings,
     Resolution,
     Samples,
     StatedError,
@@ -55,7 +50,7 @@ class RenderOptions:
     none."""
     max_spp: Samples = MOST_TRACED_SPP
     """mitsuba: maximum average of samples per pixel; the last round may end a little above it."""
-    stated_error: StatedError = ToStatedError.stated_error
+    stated_error: StatedError = "calibrated"
     """mitsuba: how the error is stated: calibrated on other scenes, with an expected error; or as a
     bound."""
     spp: Annotated[int | None, Within(1, MOST_SPP, unit="samples")] = None
@@ -111,17 +106,22 @@ class RenderOptions:
                 "since a network makes all light together."
             )
 
-    @property
-    def quality(self) -> Quality:
-        """Quality of traced images, or the budget that chooses it."""
+    def quality(self, resolution: int) -> RenderSettings | PreviewSettings | Budget:
+        """Return the settings of traced images at a width in pixels, or what chooses them.
+
+        Raises:
+            TrilightError: a value is invalid; the message names it.
+        """
         if self.seconds is not None:
             return Budget("--seconds", self.seconds)
         if self.error_db is not None:
             return Budget("--error", self.error_db)
         if self.spp is not None:
-            return FixedSamples(spp=self.spp, denoiser=self.denoiser or usual_filter(self.spp))
-        return ToStatedError(
-            targets=vars(self),
+            filtered = self.denoiser or usual_filter(self.spp)
+            return PreviewSettings(resolution=resolution, spp=self.spp, denoiser=filtered)
+        return measured_settings(
+            resolution,
+            vars(self),
             max_spp=self.max_spp,
             stated_error=self.stated_error,
             split=self.split,

@@ -13,7 +13,6 @@ from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import KW_ONLY, dataclass
 from typing import Any
 
-from infra.render.quality import FixedSamples, ToStatedError
 from pipeline.isolation import ChildFailed, ChildLimits, IsolatedChild, Result, with_retries
 from pipeline.renders.mitsuba_variant import Variant, activate, environment
 from pipeline.renders.noise_floor import MeasuredFloor
@@ -85,17 +84,11 @@ class RenderChild:
 
 @dataclass(eq=False)
 class PathTracer:
-    """Path tracing to a stated error or with fixed samples; equal arguments give equal pictures.
-
-    Raises:
-        TrilightError: a setting is invalid.
-    """
+    """Path tracing to a stated error or with fixed samples; equal arguments give equal pictures."""
 
     child: RenderChild
     """Child that traces; other path tracers may share it."""
-    quality: ToStatedError | FixedSamples
-    resolution: int
-    """Width in pixels, a multiple of 8."""
+    settings: RenderSettings | PreviewSettings
     _: KW_ONLY
     seed: int = 0
     """Seed of the samples of every picture, from 0."""
@@ -103,8 +96,10 @@ class PathTracer:
     shows_looks: bool = False
     """True to yield intermediate pictures on the way to a stated error."""
 
-    def __post_init__(self) -> None:
-        self.settings = self.quality.settings(self.resolution)
+    @property
+    def resolution(self) -> int:
+        """Width in pixels."""
+        return self.settings.resolution
 
     @property
     def notes(self) -> Sequence[str]:

@@ -1,199 +1,69 @@
 """Plan of one call of `trilight render`: all decisions, before any picture is rendered.
 
 A source may hold many scenes and many cameras. The files of `--out` are one picture, or a folder of
-numbered pictures with or without a video. Videos are H.264 in .mp4, which every player reads, or
-animated .webp. WebP needs only Pillow and is shown by browsers; MP4 is written by FFmpeg through
-PyAV.
+numbered pictures with or without a video.
 """
 
 import importlib.util
-import io
-import re
-import tempfile
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
-from fractions import Fraction
 from pathlib import Path
-from typing import Any
 
 import numpy as np
-from PIL import Image
 
 from infra.render.networks import NetworkRenderer
 from infra.render.options import EngineChoice, RenderOptions
 from infra.render.path_tracer import PathTracer, RenderChild
 from infra.render.preview_table import Choice, choose, known_costs, price_all, shipped_table
-from infra.render.quality import Budget, FixedSamples, Traced
+from infra.render.quality import Budget
 from infra.render.tone_mapping import Look
 from infra.torch_library import require_torch
-from pipeline.exchange.formats import readable_suffixes
 from pipeline.exchange.open_scene import SceneSource, scene_source
 from pipeline.exchange.reader import SceneReader
 from pipeline.renders.mitsuba_variant import choose_variant
-from storage.atomic import write_atomically, write_error
-from storage.dataset.shard_set import expand_pattern
+from pipeline.renders.preview import PreviewSettings
 from storage.errors import TrilightError
 from storage.machine import available_cores
 from storage.records.scene import Scene
 from storage.renderer import Camera, Renderer
-
-SUFFIXES = (".mp4", ".webp")
-_CRF = "16"
-"""Quality of H.264: losses are invisible below about 18, and absent at 0."""
-
-_WEBP_QUALITY = 90
-_BT709 = 1
-_SRGB = 13
-_STUDIO_RANGE = 1
-"""Color properties of the video, by their numbers in ITU-T H.273 and in FFmpeg."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class OutputPaths:
     """Paths of the pictures and of the video."""
 
-    stem: Path | None
-    """Path of the only picture without its suffix; None for many pictures."""
+    out: Path
+    """Path as the user named it: of the only picture, of the folder of many, or of the video."""
     folder: Path
-    video: Path | None
 
     @property
     def is_sequence(self) -> bool:
         """True where there may be many pictures."""
-        return self.stem is None
+        return self.out == self.folder or self.video is not None
+
+    @property
+    def video(self) -> Path | None:
+        """Path of the video; None without one."""
+        return self.out if self.out.with_suffix("") == self.folder != self.out else None
 
     def stem_of(self, index: int) -> Path:
         """Return the path of a picture without its suffix."""
-        return self.stem or self.folder / f"{index:06d}"
+        return self.folder / f"{index:06d}" if self.is_sequence else self.out.with_suffix("")
 
 
 def output_paths(out: Path) -> OutputPaths:
-    """Return the paths that `--out` stands for, and make their folder.
-
-    Raises:
-        TrilightError: an unknown suffix, a video without its encoder, or a folder that cannot be
-            written.
-    """
+    """Return the paths that `--out` stands for; raises TrilightError for an unknown suffix."""
     suffix = out.suffix.lower()
     if out.is_dir() or not suffix:
-        return OutputPaths(stem=None, folder=_writable(out, out), video=None)
+        return OutputPaths(out=out, folder=out)
     if suffix == ".exr":
-        return OutputPaths(stem=out.with_suffix(""), folder=_writable(out.parent, out), video=None)
-    if suffix not in SUFFIXES:
+        return OutputPaths(out=out, folder=out.parent)
+    if suffix not in (".mp4", ".webp"):
         raise TrilightError(
             f"--out is {out}; expected picture.exr, or for many pictures a folder, or X.mp4 or "
             "X.webp, beside which they are kept in a folder X."
         )
-    if suffix == ".mp4":
-        _av()  # before anything is rendered
-    return OutputPaths(stem=None, folder=_writable(out.with_suffix(""), out), video=out)
-
-
-def _writable(folder: Path, out: Path) -> Path:
-    try:
-        folder.mkdir(parents=True, exist_ok=True)
-        with tempfile.TemporaryFile(dir=folder):
-            pass
-    except OSError as error:
-        raise write_error(out, error) from error
-    return folder
-
-
-def write_video(path: Path, frames: Sequence[Path], fps: int) -> None:
-    """Write pictures of equal, even width and height as a video.
-
-    A .webp takes all pictures into memory; an .mp4 one after the other.
-
-    Raises:
-        TrilightError: the format needs a missing package, or the file cannot be written.
-    """
-    encode = _mp4 if path.suffix.lower() == ".mp4" else _webp
-    write_atomically(path, encode(frames, fps))
-
-
-def _iter_frames(frames: Sequence[Path]) -> Iterator[Image.Image]:
-    for path in frames:
-        with Image.open(path) as picture:
-            yield picture.convert("RGB")
-
-
-def _mp4(frames: Sequence[Path], fps: int) -> bytes:
-    av = _av()
-    stream = io.BytesIO()
-    with av.open(stream, "w", format="mp4") as container:
-        track: Any = None
-        for picture in _iter_frames(frames):
-            if track is None:
-                track = container.add_stream("libx264", Fraction(fps), options={"crf": _CRF})
-                track.width, track.height = picture.size
-                track.pix_fmt = "yuv420p"
-                track.codec_context.thread_count = 1  # more once gave other bytes
-                track.codec_context.colorspace = _BT709  # without it players guess by the size
-                track.codec_context.color_primaries = _BT709
-                track.codec_context.color_trc = _SRGB
-                track.codec_context.color_range = _STUDIO_RANGE
-            frame = av.VideoFrame.from_image(picture)
-            container.mux(track.encode(frame.reformat(format="yuv420p", dst_colorspace=_BT709)))
-        container.mux(track.encode(None))
-    return stream.getvalue()
-
-
-def _webp(frames: Sequence[Path], fps: int) -> bytes:
-    first, *remaining = _iter_frames(frames)
-    stream = io.BytesIO()
-    first.save(
-        stream,
-        "WEBP",
-        save_all=True,
-        append_images=remaining,
-        duration=round(1000 / fps),
-        loop=0,
-        quality=_WEBP_QUALITY,
-    )
-    return stream.getvalue()
-
-
-def _av() -> Any:
-    try:
-        import av
-    except ImportError as error:
-        raise TrilightError(
-            "--out X.mp4 needs PyAV, which is not installed: pip install av (it holds x264, GPL), "
-            "or choose --out X.webp."
-        ) from error
-    return av
-
-
-def scene_sources(text: str, reader: SceneReader) -> list[SceneSource]:
-    """Return every scene of a source, in order.
-
-    Args:
-        text: one file; `scenes/{000..119}.json` for numbered ones; or a folder, whose scene files
-            are sorted by the numbers in their names. A shard stands for all of its samples, an
-            animated USD stage for all of its frames.
-
-    Raises:
-        TrilightError: a file is unusable, or there is no scene.
-    """
-    if "://" not in text and Path(text).is_dir():
-        paths = [
-            path for path in Path(text).iterdir() if path.suffix.lower() in readable_suffixes()
-        ]
-        if not paths:
-            raise TrilightError(
-                f"{text}: holds no scene file; expected files that end in "
-                f"{' '.join(readable_suffixes())}."
-            )
-        return [scene_source(str(path)) for path in sorted(paths, key=_by_number)]
-    names = expand_pattern(text, "scenes") if "{" in text else [text]
-    files = [scene_source(name, many=True) for name in names]
-    return [scene for source in files for scene in reader.scenes_of(source)]
-
-
-def _by_number(path: Path) -> list[tuple[int, str]]:
-    """Return a key that sorts frame9 before frame10."""
-    parts = re.split(r"([0-9]+)", path.name)
-    return [(int(part), part) if part.isdecimal() else (-1, part) for part in parts]
+    return OutputPaths(out=out, folder=out.with_suffix(""))
 
 
 def pair_cameras(
@@ -214,16 +84,6 @@ def pair_cameras(
         )
     count = max(len(sources), len(cameras))
     return [(sources[at % len(sources)], cameras[at % len(cameras)]) for at in range(count)]
-
-
-def own_camera(scene: Scene, view: int, named: str = "--view") -> Camera:
-    """Return a camera of a scene; raises TrilightError, with `named`, if there is no such view."""
-    if not 0 <= view < scene.num_views:
-        raise TrilightError(
-            f"{named} is {view}; expected 0 to {scene.num_views - 1}: the scene has "
-            f"{scene.num_views} cameras."
-        )
-    return Camera.of_scene(scene, view)
 
 
 def orbit(scene: Scene, start: Camera, count: int, arc_deg: float) -> list[Camera]:
@@ -256,26 +116,6 @@ def orbit(scene: Scene, start: Camera, count: int, arc_deg: float) -> list[Camer
     return cameras
 
 
-def camera_path(text: str, reader: SceneReader, view: int) -> list[Camera]:
-    """Return the cameras of a file: all of one scene, or one of each frame of an animated stage.
-
-    Args:
-        text: JSON file with a list `cameras` as in RenderFormer's scenes, or any scene.
-        view: row of the camera in each frame.
-
-    Raises:
-        TrilightError: the file is unusable, or has no such camera.
-    """
-    source = scene_source(text, many=True)
-    frames = reader.scenes_of(source)
-    if len(frames) > 1:
-        return [own_camera(reader.load(frame).scene, view) for frame in frames]
-    c2w, fov_deg = reader.cameras(frames[0])
-    return [
-        Camera(c2w=pose, fov_deg=float(angle)) for pose, angle in zip(c2w, fov_deg, strict=True)
-    ]
-
-
 Pairs = Sequence[tuple[SceneSource, Camera | int]]
 """Scene and camera of each picture; a number is the row of a camera of the scene."""
 
@@ -306,38 +146,28 @@ class RenderPlan:
 
 
 def plan_render(options: RenderOptions, reader: SceneReader) -> RenderPlan:
-    """Return the plan of a render, and make the folder of its files.
+    """Return the plan of a render, before a file is written.
 
     Raises:
-        TrilightError: an option without effect, an unusable source, camera or checkpoint, or a
-            folder that cannot be written.
+        TrilightError: an option without effect, or an unusable source, camera or checkpoint.
     """
-    checkpoint, resolution = _network_and_width(options)
-    quality = options.quality
-    choice = None
-    FixedSamples(spp=1, denoiser="off").settings(resolution)  # reports a wrong width first
-    renderers = []
-    if not isinstance(quality, Budget):
-        renderers = _renderers(options, quality, checkpoint, resolution)
-    look = Look(tone_map=options.tone_map, exposure_ev=options.exposure_ev)
-    if options.out.suffix.lower() == ".exr":
-        scene_source(options.source)  # reports a wrong name before any library is loaded
     output = output_paths(options.out)
-    pairs = _pairs(options, reader, output)
-    if isinstance(quality, Budget):
-        table = shipped_table()
-        costs, source = known_costs(choose_variant("auto"))
-        cores = available_cores()
-        candidates = price_all(
-            table,
-            costs,
-            width=resolution,
-            threads=min(options.threads or cores, cores),
-            per_scene=len(pairs) / len({source for source, _ in pairs}),
-            network=importlib.util.find_spec("torch") is not None,
-        )
-        choice = choose(quality, candidates, scenes=table.scenes, costs=source, width=resolution)
-        renderers = _renderers(options, choice.priced.samples, None, resolution)
+    if not output.is_sequence and (options.orbit, options.cameras) != (None, None):
+        raise TrilightError(f"--out is {options.out}; expected a folder, X.mp4 or X.webp for many.")
+    look = Look(tone_map=options.tone_map, exposure_ev=options.exposure_ev)
+    checkpoint, resolution = _network_and_width(options)
+    PreviewSettings(resolution=resolution, spp=1)  # reports a wrong width first
+    sources = reader.list_scenes(options.source, options.albedo_over_one, many=output.is_sequence)
+    cameras: Sequence[Camera | int] = [options.view]
+    if options.cameras is not None:
+        file = scene_source(options.cameras, many=True)
+        cameras = reader.cameras(file, options.view)
+    elif options.orbit is not None:
+        scene = reader.load(sources[0]).scene
+        start = Camera.of_scene(scene, options.view, "--view")
+        cameras = orbit(scene, start, options.orbit, options.arc_deg)
+    pairs = pair_cameras(sources, cameras)
+    renderers, choice = _renderers(options, checkpoint, resolution, pairs)
     return RenderPlan(
         source=options.source,
         view=options.view,
@@ -363,24 +193,38 @@ def _network_and_width(options: RenderOptions) -> tuple[str | None, int]:
     if options.resolution is not None:
         return checkpoint, options.resolution
     network = find_network(checkpoint)
-    return (
-        checkpoint,
-        _RESOLUTION if network.any_width else network.trained.resolution or _RESOLUTION,
-    )
+    trained_px = None if network.any_width else network.trained.resolution
+    return checkpoint, trained_px or _RESOLUTION
 
 
 def _renderers(
-    options: RenderOptions, quality: Traced | None, checkpoint: str | None, resolution: int
-) -> list[Renderer]:
-    """Return the renderers of `--engine`; without a quality, the network of budgets alone."""
-    if quality is None:
-        from model.open import BUILTIN_TOKENS
+    options: RenderOptions, checkpoint: str | None, resolution: int, pairs: Pairs
+) -> tuple[list[Renderer], Choice | None]:
+    """Return the renderers of `--engine`, or of what is chosen for a budget; and that choice."""
+    traced = None if options.engine == "neural" else options.quality(resolution)
+    choice = None
+    if isinstance(traced, Budget):
+        table = shipped_table()
+        costs, origin = known_costs(choose_variant("auto"))
+        cores = available_cores()
+        candidates = price_all(
+            table,
+            costs,
+            width=resolution,
+            threads=min(options.threads or cores, cores),
+            per_scene=len(pairs) / len({source for source, _ in pairs}),
+            network=importlib.util.find_spec("torch") is not None,
+        )
+        choice = choose(traced, candidates, scenes=table.scenes, costs=origin, width=resolution)
+        traced = choice.priced.samples
+        if traced is None:
+            from model.open import BUILTIN_TOKENS
 
-        checkpoint = BUILTIN_TOKENS
+            checkpoint = BUILTIN_TOKENS
     renderers = list[Renderer]()
-    if quality is not None and options.engine != "neural":
+    if traced is not None:
         child = RenderChild(choose_variant("auto"), options.threads)
-        renderers.append(PathTracer(child, quality, resolution, seed=options.seed))
+        renderers.append(PathTracer(child, traced, seed=options.seed))
     if checkpoint is not None:
         network = NetworkRenderer(
             checkpoint=checkpoint,
@@ -390,19 +234,4 @@ def _renderers(
             threads=options.threads,
         )
         renderers.append(network)
-    return renderers
-
-
-def _pairs(options: RenderOptions, reader: SceneReader, output: OutputPaths) -> Pairs:
-    if not output.is_sequence:
-        if options.orbit is None and options.cameras is None:
-            return [(scene_source(options.source), options.view)]
-        raise TrilightError(f"--out is {options.out}; expected a folder, X.mp4 or X.webp for many.")
-    sources = scene_sources(options.source, reader)
-    cameras: Sequence[Camera | int] = [options.view]
-    if options.cameras is not None:
-        cameras = camera_path(options.cameras, reader, options.view)
-    elif options.orbit is not None:
-        scene = reader.load(sources[0]).scene
-        cameras = orbit(scene, own_camera(scene, options.view), options.orbit, options.arc_deg)
-    return pair_cameras(sources, cameras)
+    return renderers, choice

@@ -20,9 +20,9 @@ from typing import Annotated, Any, Literal
 import numpy as np
 
 from infra.processor import processor
-from infra.render.quality import Budget, FixedSamples
+from infra.render.quality import Budget, samples_text
 from pipeline.renders.mitsuba_variant import Variant
-from pipeline.renders.preview import MOST_SPP, SCENE, preview_parts
+from pipeline.renders.preview import MOST_SPP, SCENE, PreviewSettings, preview_parts
 from pipeline.renders.settings import Filtered, Resolution
 from storage.atomic import write_atomically
 from storage.cache import cache_folder
@@ -168,7 +168,7 @@ _LEAST_S = 1e-9
 class Priced:
     """Samples or the network, with expected cost and error at one width."""
 
-    samples: FixedSamples | None
+    samples: PreviewSettings | None
     """Samples and filter; None for the network builtin:tokens."""
     seconds: float
     """Wall-clock seconds of a picture, without start-up."""
@@ -203,10 +203,13 @@ class Choice:
     def sentence(self) -> str:
         """The choice as one line of text."""
         one = self.priced
+        what = NETWORK
+        if one.samples:
+            what = f"{samples_text(one.samples.spp)} a pixel, filter {one.samples.denoiser}"
         lead = "chosen" if self.fits else "nothing is as quick; the quickest is chosen"
         seconds = f"{one.seconds:.2g}" if one.seconds < 10 else f"{one.seconds:.0f}"
         return (
-            f"{self.budget}: {lead}: {one.samples or NETWORK}; expected {one.db:.1f} dB in the "
+            f"{self.budget}: {lead}: {what}; expected {one.db:.1f} dB in the "
             f"median of {self.scenes} scenes at {one.judged_px} pixels ({one.least_db:.1f} in the "
             f"worst), in {seconds} s after start-up; {self.costs}"
         )
@@ -239,11 +242,13 @@ def price_all(
             was measured.
     """
     part_s = _part_seconds(costs, width, threads)
-    rows: dict[FixedSamples | None, list[PreviewError]] = {}
+    rows: dict[PreviewSettings | None, list[PreviewError]] = {}
     for row in table.errors:
-        traced = FixedSamples(spp=row.spp, denoiser=row.denoiser)
-        if network or row.rung != "network":
-            rows.setdefault(traced if row.rung == "traced" else None, []).append(row)
+        traced = None
+        if row.rung == "traced":
+            traced = PreviewSettings(resolution=width, spp=row.spp, denoiser=row.denoiser)
+        if traced or network:
+            rows.setdefault(traced, []).append(row)
     priced = []
     for samples, unsorted in rows.items():
         errors = sorted(unsorted, key=lambda each: each.width)

@@ -1,15 +1,13 @@
-"""Quality of a picture: a measured error, a number of samples, or a budget that chooses them."""
+"""Quality of traced pictures: settings to a measured error, and budgets that choose samples."""
 
 from collections.abc import Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from typing import Any, Literal
 
-from pipeline.renders.preview import PreviewSettings
 from pipeline.renders.settings import (
     CALIBRATED_LOOKS,
     FIRST_SPP,
     USUAL_FLOOR_DB,
-    Filtered,
     RenderSettings,
     StatedError,
     Targets,
@@ -20,62 +18,47 @@ MOST_TRACED_SPP = 4096
 """Default maximum number of samples per pixel."""
 
 
-@dataclass(frozen=True, kw_only=True)
-class ToStatedError:
-    """Samples until the measured error reaches its targets."""
+def measured_settings(
+    resolution: int,
+    targets: Targets,
+    *,
+    max_spp: int = MOST_TRACED_SPP,
+    max_depth: int = RenderSettings.max_depth,
+    split: bool = False,
+    split_lobes: bool = False,
+    stated_error: StatedError = "calibrated",
+) -> RenderSettings:
+    """Return the settings of a picture, which may be dark, that is sampled to a measured error.
 
-    targets: Targets = field(default_factory=dict)
-    """Target errors; psnr_log_db of 40 where none is set."""
-    max_spp: int = MOST_TRACED_SPP
-    split: bool = False
-    """True to keep direct and indirect light apart."""
-    split_lobes: bool = False
-    """True to keep diffuse and specular light apart."""
-    max_depth: int = RenderSettings.max_depth
-    """Maximum length of a path in edges; 2 is direct light."""
-    stated_error: StatedError = "calibrated"
+    Args:
+        resolution: width in pixels.
+        targets: target errors; psnr_log_db of 40 where none is set.
+        max_depth: maximum length of a path in edges; 2 is direct light.
+        split: keep direct and indirect light apart.
+        split_lobes: keep diffuse and specular light apart.
 
-    def settings(self, resolution: int) -> RenderSettings:
-        """Return the settings at a width in pixels, of a picture that may be dark.
-
-        Raises:
-            TrilightError: a value is invalid; the message names it.
-        """
-        targets = target_overrides(self.targets) or {"noise_floor_db": USUAL_FLOOR_DB}
-        is_bound = self.stated_error == "bound"
-        looks: Mapping[str, Any] = {"min_spp": FIRST_SPP} if is_bound else CALIBRATED_LOOKS
-        return RenderSettings(
-            resolution=resolution,
-            max_spp=self.max_spp,
-            max_depth=self.max_depth,
-            min_mean_radiance=0.0,
-            split=self.split,
-            split_lobes=self.split_lobes,
-            arithmetic="device",
-            **{**targets, **looks, "min_spp": min(looks["min_spp"], self.max_spp)},
-        )
+    Raises:
+        TrilightError: a value is invalid; the message names it.
+    """
+    looks: Mapping[str, Any] = CALIBRATED_LOOKS
+    if stated_error == "bound":
+        looks = {"min_spp": FIRST_SPP}
+    goals = target_overrides(targets) or {"noise_floor_db": USUAL_FLOOR_DB}
+    return RenderSettings(
+        resolution=resolution,
+        max_spp=max_spp,
+        max_depth=max_depth,
+        min_mean_radiance=0.0,
+        split=split,
+        split_lobes=split_lobes,
+        arithmetic="device",
+        **{**goals, **looks, "min_spp": min(looks["min_spp"], max_spp)},
+    )
 
 
-@dataclass(frozen=True, kw_only=True)
-class FixedSamples:
-    """A number of samples and one denoise, of unmeasured error."""
-
-    spp: int
-    """Number of paths through each pixel, from 1."""
-    denoiser: Filtered
-
-    @property
-    def count(self) -> str:
-        """The number of samples as text, such as `4 samples`."""
-        return f"{self.spp} sample{'s' if self.spp > 1 else ''}"
-
-    def __str__(self) -> str:
-        """Return samples and filter as text."""
-        return f"{self.count} a pixel, filter {self.denoiser}"
-
-    def settings(self, resolution: int) -> PreviewSettings:
-        """Return the settings at a width in pixels; raises TrilightError if it is invalid."""
-        return PreviewSettings(resolution=resolution, spp=self.spp, denoiser=self.denoiser)
+def samples_text(spp: int) -> str:
+    """Return a number of samples as text, such as `4 samples`."""
+    return f"{spp} sample{'s' if spp > 1 else ''}"
 
 
 @dataclass(frozen=True)
@@ -89,7 +72,3 @@ class Budget:
     def __str__(self) -> str:
         """Return the option of the command line."""
         return f"{self.option} {self.limit:g}"
-
-
-Traced = ToStatedError | FixedSamples
-Quality = Traced | Budget

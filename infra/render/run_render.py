@@ -3,14 +3,20 @@
 An equal picture is known by the header of its EXR file. Two engines' pictures of one view are
 compared side by side, and by the flicker of their error: in motion an error that stays at its
 pixels is hardly seen; one that jumps is (storage.metrics.flicker_log_db).
+
+Videos are H.264 in .mp4, which every player reads, or animated .webp. WebP needs only Pillow and is
+shown by browsers; MP4 is written by FFmpeg through PyAV.
 """
 
 import dataclasses
+import io
 import itertools
+import tempfile
 import time
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import ExitStack, closing
 from dataclasses import dataclass
+from fractions import Fraction
 from pathlib import Path
 from typing import Any
 
@@ -19,13 +25,13 @@ from numpy.typing import NDArray
 from PIL import Image as Picture
 from PIL import ImageDraw, ImageFont
 
-from infra.render.plan import RenderPlan, own_camera, write_video
-from infra.render.tone_mapping import Look, display_pixels, enlarge
+from infra.render.plan import OutputPaths, RenderPlan
+from infra.render.tone_mapping import display_pixels, enlarge
 from pipeline.documents.png import encode_png
 from pipeline.exchange.formats import FORMATS, SceneSource
 from pipeline.exchange.reader import SceneReader
 from pipeline.renders.settings import FIRST_SPP
-from storage.atomic import write_atomically
+from storage.atomic import write_atomically, write_error
 from storage.conventions import log10_radiance
 from storage.digests import canonical_json, sha256_hex
 from storage.errors import TrilightError
@@ -37,6 +43,15 @@ from storage.records.scene import Scene
 from storage.records.scene_file import scene_digest
 from storage.renderer import Camera, Fact, Facts, OnProgress, ReadyScene, Renderer
 from train.evaluation.sheet import ERROR_WHITE, error_picture
+
+_CRF = "16"
+"""Quality of H.264: losses are invisible below about 18, and absent at 0."""
+
+_WEBP_QUALITY = 90
+_BT709 = 1
+_SRGB = 13
+_STUDIO_RANGE = 1
+"""Color properties of the video, by their numbers in ITU-T H.273 and in FFmpeg."""
 
 _CAPTION_PX = 24
 _GAP_PX = 8
@@ -73,26 +88,16 @@ def flicker(before: Frame | None, now: Frame) -> Mapping[str, float] | None:
     return {"db": flicker_log_db(before.error_RR3, now.error_RR3), "noise_db": noise_db}
 
 
-def comparison_sheet(
-    traced_rgb: NDArray[np.float32], neural_rgb: NDArray[np.float32], look: Look
-) -> NDArray[np.uint8]:
-    """Return [H, W, 3]: path traced, neural, and the error of the second against the first.
+def captioned_row(tiles: Mapping[str, NDArray[np.uint8]]) -> NDArray[np.uint8]:
+    """Return three pictures of one size side by side, below their captions: [H, W, 3].
 
-    Both [R, R, 3] linear radiance. Height and width are even, as videos need them. Exposure changes
-    the first two, and no error.
+    Height and width are even, as videos need them.
     """
-    agreement = psnr_log_db(neural_rgb, traced_rgb)
-    stops = f", {look.exposure_ev:+g} EV" if look.exposure_ev else ""
-    tiles = (
-        (f"mitsuba{stops}", display_pixels(traced_rgb, look)),
-        (f"neural, {agreement:.1f} dB (log){stops}", display_pixels(neural_rgb, look)),
-        (f"error (white: {ERROR_WHITE} log10)", enlarge(error_picture(neural_rgb, traced_rgb))),
-    )
-    width = len(tiles[0][1])
+    width = len(next(iter(tiles.values())))
     sheet = Picture.new("RGB", (3 * width + 2 * _GAP_PX, width + _CAPTION_PX), _PAPER)
     draw = ImageDraw.Draw(sheet)
     font = ImageFont.load_default(size=_FONT_PX)
-    for column, (caption, pixels) in enumerate(tiles):
+    for column, (caption, pixels) in enumerate(tiles.items()):
         column_px = column * (width + _GAP_PX)
         sheet.paste(Picture.fromarray(pixels), (column_px, _CAPTION_PX))
         draw.text((column_px + 2, 3), caption, fill=_INK, font=font)
@@ -202,6 +207,7 @@ def run_plan(
         TrilightError: a network or a scene cannot be loaded or rendered, or a file cannot be
             written.
     """
+    _require_writable(plan.output)
     finished = list[FinishedShot]()
     notes = dict[str, None]()
     before: Frame | None = None
@@ -210,57 +216,66 @@ def run_plan(
             stack.enter_context(closing(renderer))
         on_picture(0, len(plan.pairs))
         for source, pairs in itertools.groupby(plan.pairs, key=lambda pair: pair[0]):
-            source_scene = reader.load(source)
-            scene = _SceneAtHand(plan, source, source_scene.scene, on_samples)
+            loaded = reader.load(source)
+            scene = _SceneAtHand(plan, source, loaded.scene, on_samples)
             for _, camera in pairs:
+                if isinstance(camera, int):
+                    camera = Camera.of_scene(loaded.scene, camera, "--view")
                 stem = plan.output.stem_of(len(finished))
                 done, before = scene.finish(stem, camera, before)
                 finished.append(done)
                 on_picture(len(finished), len(plan.pairs))
-            notes |= dict.fromkeys([*source_scene.notes, *scene.notes])
-    if plan.output.video is not None:
-        write_video(plan.output.video, [done.png for done in finished], plan.fps)
+            notes |= dict.fromkeys([*loaded.notes, *scene.notes])
     for renderer in plan.renderers:
         notes |= dict.fromkeys(_caveats(renderer, finished))
+    if plan.output.video is not None:
+        write_video(plan.output.video, [done.png for done in finished], plan.fps)
     return finished, list(notes)
 
 
+@dataclass(eq=False)
 class _SceneAtHand:
     """Scene of consecutive pictures; a renderer loads it for the first one that is not kept."""
 
-    def __init__(
-        self, plan: RenderPlan, source: SceneSource, scene: Scene, on_progress: OnProgress
-    ) -> None:
+    plan: RenderPlan
+    source: SceneSource
+    scene: Scene
+    on_progress: OnProgress
+
+    def __post_init__(self) -> None:
+        self.sha256 = scene_digest(self.scene)
         self.notes: list[str] = []
-        self._plan = plan
-        self._source = source
-        self._scene = scene
-        self._sha256 = scene_digest(scene)
-        self._on_progress = on_progress
-        self._loaded: dict[str, ReadyScene] = {}
+        self.loaded: dict[str, ReadyScene] = {}
 
     def finish(
-        self, stem: Path, camera: Camera | int, before: Frame | None
+        self, stem: Path, camera: Camera, before: Frame | None
     ) -> tuple[FinishedShot, Frame | None]:
         """Write the files of a picture; return it, and the frame if there are both renderers."""
-        if isinstance(camera, int):
-            camera = own_camera(self._scene, camera)
-        else:  # of an orbit or a file: the scene has no such row
-            camera = dataclasses.replace(camera, view=None, name=f"picture {stem.name}")
-        made = {each.name: self._picture(stem, camera, each) for each in self._plan.renderers}
+        if camera.view is None:  # of an orbit or a file
+            camera = dataclasses.replace(camera, name=f"picture {stem.name}")
+        made = {each.name: self._picture(stem, camera, each) for each in self.plan.renderers}
         files = {name: file for name, (file, _) in made.items()}
+        look = self.plan.look
+        tiles = {name: display_pixels(rgb, look) for name, (_, rgb) in made.items()}
         now = None
         agreement = None
         if len(made) == 1:
-            ((_, radiance_rgb),) = made.values()
-            pixels = display_pixels(radiance_rgb, self._plan.look)
+            (pixels,) = tiles.values()
         else:
             traced = made["mitsuba"][1]
             neural = made["neural"][1]
-            pixels = comparison_sheet(traced, neural, self._plan.look)
             agreement = psnr_log_db(neural, traced)
+            stops = f", {look.exposure_ev:+g} EV" if look.exposure_ev else ""
+            error = enlarge(error_picture(neural, traced))  # exposure changes no error
+            pixels = captioned_row(
+                {
+                    f"mitsuba{stops}": tiles["mitsuba"],
+                    f"neural, {agreement:.1f} dB (log){stops}": tiles["neural"],
+                    f"error (white: {ERROR_WHITE} log10)": error,
+                }
+            )
             now = Frame(
-                source=self._source,
+                source=self.source,
                 error_RR3=log10_radiance(neural) - log10_radiance(traced),
                 noise_floor_db=float(files["mitsuba"].facts["noise_floor_db"]),
             )
@@ -268,9 +283,9 @@ class _SceneAtHand:
         write_atomically(png, encode_png(pixels))
         finished = FinishedShot(
             png=png,
-            scene_sha256=self._sha256,
-            num_triangles=self._scene.num_triangles,
-            num_lights=num_lights(self._scene),
+            scene_sha256=self.sha256,
+            num_triangles=self.scene.num_triangles,
+            num_lights=num_lights(self.scene),
             pictures=files,
             psnr_log_db=agreement,
             flicker=flicker(before, now) if now else None,
@@ -284,20 +299,20 @@ class _SceneAtHand:
 
         Equal headers and pictures give equal bytes.
         """
-        plan = self._plan
+        plan = self.plan
         path = Path(f"{stem}.{renderer.name}.exr" if len(plan.renderers) > 1 else f"{stem}.exr")
-        header = header_of(renderer, self._source.name, self._sha256, camera)
+        header = header_of(renderer, self.source.name, self.sha256, camera)
         existing = load_matching_picture(path, header) if plan.output.is_sequence else None
         if existing is not None:
             return existing
         seconds = 0.0
-        loaded = self._loaded.get(renderer.name)
+        loaded = self.loaded.get(renderer.name)
         if loaded is None:
-            loaded = self._loaded[renderer.name] = renderer.load(self._scene, self._source.name)
-            self.notes += [f"{self._source.name}: {note}" for note in loaded.notes]
+            loaded = self.loaded[renderer.name] = renderer.load(self.scene, self.source.name)
+            self.notes += [f"{self.source.name}: {note}" for note in loaded.notes]
             seconds = loaded.seconds
         began = time.perf_counter()
-        image = loaded.render(camera, self._on_progress)
+        image = loaded.render(camera, self.on_progress)
         seconds += time.perf_counter() - began
         facts = {**image.facts, **(plan.choice.facts if plan.choice else {})}
         named = {_PREFIX + name: value for name, value in {**header, **facts}.items()}
@@ -330,3 +345,80 @@ def _caveats(renderer: Renderer, finished: Sequence[FinishedShot]) -> list[str]:
     ):
         notes.append(f"below {FIRST_SPP} samples the stated error may flatter")
     return [*notes, *renderer.notes]
+
+
+def _require_writable(output: OutputPaths) -> None:
+    """Make the folder of the pictures, and refuse what would fail after they are rendered."""
+    if output.video is not None and output.video.suffix.lower() == ".mp4":
+        _av()
+    try:
+        output.folder.mkdir(parents=True, exist_ok=True)
+        with tempfile.TemporaryFile(dir=output.folder):
+            pass
+    except OSError as error:
+        raise write_error(output.out, error) from error
+
+
+def write_video(path: Path, frames: Sequence[Path], fps: int) -> None:
+    """Write pictures of equal, even width and height as a video.
+
+    A .webp takes all pictures into memory; an .mp4 one after the other.
+
+    Raises:
+        TrilightError: the format needs a missing package, or the file cannot be written.
+    """
+    encode = _mp4 if path.suffix.lower() == ".mp4" else _webp
+    write_atomically(path, encode(frames, fps))
+
+
+def _iter_frames(frames: Sequence[Path]) -> Iterator[Picture.Image]:
+    for path in frames:
+        with Picture.open(path) as picture:
+            yield picture.convert("RGB")
+
+
+def _mp4(frames: Sequence[Path], fps: int) -> bytes:
+    av = _av()
+    stream = io.BytesIO()
+    with av.open(stream, "w", format="mp4") as container:
+        track: Any = None
+        for picture in _iter_frames(frames):
+            if track is None:
+                track = container.add_stream("libx264", Fraction(fps), options={"crf": _CRF})
+                track.width, track.height = picture.size
+                track.pix_fmt = "yuv420p"
+                track.codec_context.thread_count = 1  # more once gave other bytes
+                track.codec_context.colorspace = _BT709  # without it players guess by the size
+                track.codec_context.color_primaries = _BT709
+                track.codec_context.color_trc = _SRGB
+                track.codec_context.color_range = _STUDIO_RANGE
+            frame = av.VideoFrame.from_image(picture)
+            container.mux(track.encode(frame.reformat(format="yuv420p", dst_colorspace=_BT709)))
+        container.mux(track.encode(None))
+    return stream.getvalue()
+
+
+def _webp(frames: Sequence[Path], fps: int) -> bytes:
+    first, *remaining = _iter_frames(frames)
+    stream = io.BytesIO()
+    first.save(
+        stream,
+        "WEBP",
+        save_all=True,
+        append_images=remaining,
+        duration=round(1000 / fps),
+        loop=0,
+        quality=_WEBP_QUALITY,
+    )
+    return stream.getvalue()
+
+
+def _av() -> Any:
+    try:
+        import av
+    except ImportError as error:
+        raise TrilightError(
+            "--out X.mp4 needs PyAV, which is not installed: pip install av (it holds x264, GPL), "
+            "or choose --out X.webp."
+        ) from error
+    return av

@@ -32,7 +32,6 @@ from infra.render.preview_table import (
     PreviewError,
     PreviewTable,
 )
-from infra.render.quality import FixedSamples
 from infra.render.raw_references import (
     first_camera,
     raw_reference,
@@ -41,7 +40,7 @@ from infra.render.raw_references import (
 from pipeline.isolation import IsolatedChild
 from pipeline.objects.generated import BENCHMARK
 from pipeline.renders.mitsuba_variant import choose_variant
-from pipeline.renders.preview import SCENE, all_parts, timed_parts
+from pipeline.renders.preview import SCENE, PreviewSettings, all_parts, timed_parts
 from pipeline.renders.settings import Filtered
 from storage.atomic import write_atomically
 from storage.conventions import log10_radiance
@@ -166,8 +165,8 @@ def _renderers_at(
         )
     }
     for spp, denoiser in ladder(px):
-        quality = FixedSamples(spp=spp, denoiser=denoiser)
-        renderers[spp, denoiser] = PathTracer(child, quality, px, seed=SAMPLE_SEED)
+        settings = PreviewSettings(resolution=px, spp=spp, denoiser=denoiser)
+        renderers[spp, denoiser] = PathTracer(child, settings, seed=SAMPLE_SEED)
     return renderers
 
 

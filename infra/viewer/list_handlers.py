@@ -22,7 +22,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from infra.render.path_tracer import PathTracer, RenderChild
-from infra.render.quality import FixedSamples
 from infra.viewer.open_source import scene_list
 from infra.viewer.scene_handlers import SceneHandlers, handlers_of_scene
 from infra.viewer.server import (
@@ -40,6 +39,7 @@ from pipeline.exchange.formats import LoadedScene
 from pipeline.exchange.open_scene import scene_source
 from pipeline.exchange.reader import SceneReader
 from pipeline.generation.derive_dataset import Selection, columns_of
+from pipeline.renders.preview import PreviewSettings
 from pipeline.shards.finished_dataset import SceneFacts
 from storage.aliases import PRESET_ALIASES, name_for_people
 from storage.conventions import preview_gain
@@ -185,21 +185,17 @@ class DatasetIndex:
             if self._closed or len(self._rows) >= MOST_SCENES:
                 break
             try:
-                self._read_shard(shard)
+                with self._dataset.open_shard(shard) as opened:
+                    for key in opened.samples:
+                        if self._closed:
+                            return
+                        with reading(self._dataset.display_name, shard.name):
+                            row = _row(opened, key, shard)
+                        self._rows.append(row)
+                        self._by_key[key] = row
             except (TrilightError, OSError) as error:
                 self.problems.append(str(error))
             self.shards_read += 1
-
-    def _read_shard(self, shard: ShardEntry) -> None:
-        dataset = self._dataset
-        with dataset.open_shard(shard) as opened:
-            for key in opened.samples:
-                if self._closed:
-                    return
-                with reading(dataset.display_name, shard.name):
-                    row = _row(opened, key, shard)
-                self._rows.append(row)
-                self._by_key[key] = row
 
 
 def _row(opened: ShardReader, key: str, shard: ShardEntry) -> SceneRow:
@@ -248,7 +244,8 @@ def selected_rows(
         TrilightError: a condition is malformed, or on values that the index does not hold; or the
             sort column is unknown.
     """
-    stated = {name: query.get(name) or None for name in ("split", "template", "where")}
+    names = ("split", "template", "where")
+    stated = {name: query[name] for name in names if query.get(name, "") not in ("", "none")}
     selection = Selection(**stated)  # type: ignore[arg-type]
     where = selection.condition
     if where is not None and (unknown := sorted(where.names - _NAMES)):
@@ -374,7 +371,7 @@ class DatasetHandlers(SceneListHandlers):
 THUMBNAIL_PX = 128
 """Width in pixels of thumbnails."""
 
-_THUMBNAIL = FixedSamples(spp=4, denoiser="fast")
+_THUMBNAIL = PreviewSettings(resolution=THUMBNAIL_PX, spp=4)
 
 
 class FolderHandlers(SceneListHandlers):
@@ -437,7 +434,7 @@ class FolderHandlers(SceneListHandlers):
         loaded = self._load(number)
         if loaded.radiance_rgb is not None and len(loaded.radiance_rgb):
             return thumbnail_png(loaded.radiance_rgb[0], THUMBNAIL_PX)
-        tracer = PathTracer(self._child, _THUMBNAIL, THUMBNAIL_PX)
+        tracer = PathTracer(self._child, _THUMBNAIL)
         traced = tracer.load(loaded.scene, self._names[number])
         image = traced.render(Camera.of_scene(loaded.scene, 0))
         return thumbnail_png(image.radiance_rgb, THUMBNAIL_PX)

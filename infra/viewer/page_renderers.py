@@ -1,26 +1,38 @@
-"""Renderers that a page offers: path tracers, networks, passes, and the picture in the file."""
+"""Renderers that a page offers, and the queue that renders the pictures of one scene.
+
+Renderers are path tracers, networks, passes, and the pictures in the file. The queue renders one
+picture at a time, and a new request cancels the current one. Finished pictures are kept for a
+while, so that switching back to one costs nothing. Pictures of one scene, camera and width are
+compared with the best of them: the one stored in the file, else the path traced one.
+"""
 
 import functools
 import importlib.util
+import itertools
+import threading
 import time
+from collections import OrderedDict
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
-from typing import TYPE_CHECKING
+from dataclasses import dataclass, field
+from typing import TYPE_CHECKING, Any, Literal
 
 import numpy as np
 from numpy.typing import NDArray
 
 from infra.render.networks import NetworkRenderer, RendererHere, SceneHere
 from infra.render.path_tracer import PathTracer, RenderChild
-from infra.render.quality import FixedSamples, ToStatedError
-from infra.viewer.picture_options import PictureOptions
+from infra.render.quality import measured_settings, samples_text
+from infra.viewer.picture_options import PictureOptions, apply_edits
 from pipeline.documents.scene_page import PASS_VIEWS, PassView
-from pipeline.renders.preview import usual_filter
-from storage.errors import Unrenderable
+from pipeline.exchange.formats import LoadedScene
+from pipeline.renders.preview import PreviewSettings, usual_filter
+from pipeline.renders.settings import RenderSettings
+from storage.errors import TrilightError, Unrenderable
+from storage.metrics import psnr_log_db
 from storage.records.passes.declared import pass_names
 from storage.records.passes.pictures import view_passes
 from storage.records.scene import Scene
-from storage.renderer import Camera, Image, Renderer
+from storage.renderer import Camera, Image, ReadyScene, Renderer, Sampling
 
 if TYPE_CHECKING:
     from model.inference import NeuralRenderer
@@ -121,12 +133,12 @@ class StoredPictures(RendererHere):
 
 
 def page_renderers(
-    child: RenderChild, target: StoredPictures | None, checkpoint: str | None
+    loaded: LoadedScene, child: RenderChild, checkpoint: str | None, errors_db: Sequence[float]
 ) -> Mapping[str, PageRenderer]:
-    """Return the renderers by name, in the order of the page.
+    """Return the renderers of a scene by name, in the order of the page.
 
     Args:
-        target: pictures of the file; None where it holds none.
+        errors_db: stated errors of the pictures in the file as psnr_log_db; may be empty.
     """
     offered = {
         "traced": PageRenderer(
@@ -153,7 +165,9 @@ def page_renderers(
         means="Light, surface, camera: traced without any further bounce.",
         make=lambda options: _path_tracer(child, options, max_depth=_DIRECT_DEPTH),
     )
-    if target is not None:
+    targets_rgb = loaded.radiance_rgb
+    if targets_rgb is not None and len(targets_rgb):
+        target = StoredPictures(scene=loaded.scene, radiance_rgb=targets_rgb, errors_db=errors_db)
         offered["target"] = PageRenderer(
             title="Target",
             means="The image that the file holds of this camera.",
@@ -165,21 +179,22 @@ def page_renderers(
 
 
 def _path_tracer(
-    child: RenderChild, options: PictureOptions, max_depth: int = ToStatedError.max_depth
+    child: RenderChild, options: PictureOptions, max_depth: int = RenderSettings.max_depth
 ) -> PathTracer:
     targets = {"noise_floor_db": options.error_db}
-    quality = ToStatedError(targets=targets, max_depth=max_depth)
-    return PathTracer(child, quality, options.resolution, shows_looks=True)
+    settings = measured_settings(options.resolution, targets, max_depth=max_depth)
+    return PathTracer(child, settings, shows_looks=True)
 
 
 def samples_on_page(child: RenderChild, spp: int) -> PageRenderer:
     """Return a preview of a number of samples per pixel with one denoise."""
-    quality = FixedSamples(spp=spp, denoiser=usual_filter(spp))
+    denoiser = usual_filter(spp)
     return PageRenderer(
-        title=f"{quality.count}, filtered",
-        means=f"{spp} path{'s' if spp > 1 else ''} a pixel, then Open Image Denoise "
-        f"({quality.denoiser}).",
-        make=lambda options: PathTracer(child, quality, options.resolution),
+        title=f"{samples_text(spp)}, filtered",
+        means=f"{spp} path{'s' if spp > 1 else ''} a pixel, then Open Image Denoise ({denoiser}).",
+        make=lambda options: PathTracer(
+            child, PreviewSettings(resolution=options.resolution, spp=spp, denoiser=denoiser)
+        ),
         words=("--spp", str(spp)),
     )
 
@@ -210,4 +225,216 @@ def _pass_on_page(pass_view: PassView) -> PageRenderer:
         title=pass_view.title.capitalize(),
         means="What the pixels see, without light.",
         make=lambda options: PassRenderer(pass_view=pass_view, resolution=options.resolution),
+    )
+
+
+MOST_KEPT = 32
+"""Maximum number of pictures that are kept; one of 1024 pixels takes 13 MB."""
+
+PATIENCE_S = 20.0
+"""Seconds that a response waits for an update."""
+
+LAST_PICTURE_S = 15.0
+"""Seconds that `join` waits for the current picture."""
+
+_REFERENCES = ("target", "traced")
+
+State = Literal["waiting", "working", "done", "failed", "cancelled"]
+
+
+class _Superseded(Exception):
+    """Ends the current picture, which is cancelled."""
+
+
+@dataclass(kw_only=True, eq=False)
+class RenderJob:
+    """Requested picture and its state."""
+
+    id: str
+    options: PictureOptions
+    state: State = "waiting"
+    version: int = 0
+    """Counter of updates, by which `wait_for_update` sees a new one."""
+    image: Image | None = None
+    scene_core_s: float | None = None
+    """CPU seconds of the scene's preparation; None where they are unknown."""
+    notes: Sequence[str] = ()
+    sampling: Sampling | None = None
+    """Progress of a path tracer since the last image."""
+    error: str = ""
+    costs: list[Mapping[str, float | int | None]] = field(default_factory=list)
+    """Samples, CPU seconds and stated error of each image so far."""
+
+
+class RenderQueue:
+    """Render queue of one scene: each picture has a thread, and one of them works at a time.
+
+    `_changed` guards `_jobs` (every kept job, oldest first) and the state of each job.
+    `wait_for_update` waits for a newer version of a job. The working thread holds `_rendering`,
+    which guards `_loaded`, the last scene of each renderer. It and exports use `_edited`.
+    """
+
+    def __init__(self, scene: Scene, renderers: Mapping[str, PageRenderer]) -> None:
+        self._scene = scene
+        self._renderers = renderers
+        self._changed = threading.Condition()
+        self._rendering = threading.Lock()
+        self._jobs = OrderedDict[str, RenderJob]()
+        self._thread: threading.Thread | None = None
+        self._numbers = itertools.count(1)
+        self._edited: tuple[str, Scene] | None = None
+        self._loaded: dict[str, tuple[object, ReadyScene, Sequence[str]]] = {}
+
+    def submit(self, options: PictureOptions) -> RenderJob:
+        """Queue a picture, or return an equal job; the current picture is cancelled."""
+        with self._changed:
+            same = [job for job in self._jobs.values() if _is_same(job, options)]
+            if same:
+                self._jobs.move_to_end(same[-1].id)
+                return same[-1]
+            self.cancel_all()
+            job = RenderJob(id=str(next(self._numbers)), options=options)
+            self._jobs[job.id] = job
+            while len(self._jobs) > MOST_KEPT:
+                self._jobs.popitem(last=False)
+            self._thread = threading.Thread(target=self._render, args=(job,), daemon=True)
+            self._thread.start()
+            return job
+
+    def cancel_all(self) -> None:
+        """Cancel the current and the waiting picture; the current one ends at its next step."""
+        with self._changed:
+            for job in self._jobs.values():
+                if not _is_over(job):
+                    self._update(job, state="cancelled")
+
+    def job(self, number: str) -> RenderJob:
+        """Return a job by its id; raises TrilightError where it is no longer kept."""
+        with self._changed:
+            if number not in self._jobs:
+                raise TrilightError("The image is not kept any more; ask for it again.")
+            return self._jobs[number]
+
+    def wait_for_update(self, number: str, after: int) -> RenderJob:
+        """Return a job once it is newer than a version, or after PATIENCE_S."""
+        job = self.job(number)
+        with self._changed:
+            self._changed.wait_for(lambda: job.version > after or _is_over(job), PATIENCE_S)
+        return job
+
+    def reference(self, job: RenderJob) -> RenderJob | None:
+        """Return the job whose picture is the reference of another job; None without one."""
+        with self._changed:
+            for engine in _REFERENCES:
+                for other in reversed(self._jobs.values()):
+                    if _can_judge(other, job, engine):
+                        return other
+        return None
+
+    def scene(self, scene_key: str, edits: Mapping[str, Any]) -> Scene:
+        """Return the scene with edits; the last edited scene is kept."""
+        if self._edited is None or self._edited[0] != scene_key:
+            self._edited = (scene_key, apply_edits(self._scene, edits))
+        return self._edited[1]
+
+    def join(self) -> None:
+        """Wait for the current picture, which `cancel_all` ends at its next step.
+
+        Libraries abort a process that ends while they work in one of its threads.
+        """
+        if self._thread is not None:
+            self._thread.join(LAST_PICTURE_S)
+
+    def _render(self, job: RenderJob) -> None:
+        def show(step: Image | Sampling) -> None:
+            with self._changed:
+                if job.state != "working":
+                    raise _Superseded
+                if isinstance(step, Image):
+                    job.image = step
+                    job.sampling = None
+                    job.costs.append(
+                        {
+                            "spp": step.samples,
+                            "core_s": step.cpu_seconds,
+                            "floor_db": step.stated_error_db,
+                        }
+                    )
+                else:
+                    job.sampling = step
+                self._update(job)
+
+        with self._rendering:
+            with self._changed:
+                if job.state == "cancelled":
+                    return
+                self._update(job, state="working")
+            state: State = "done"
+            try:
+                loaded, job.notes = self._load(job.options)
+                job.scene_core_s = loaded.cpu_seconds
+                show(loaded.render(job.options.camera, show))
+            except _Superseded:
+                state = "cancelled"
+            except TrilightError as mistake:
+                state = "failed"
+                job.error = str(mistake)
+            except Exception as defect:  # of any library: the page shows it, the queue goes on
+                state = "failed"
+                job.error = f"{type(defect).__name__}: {defect}"
+            with self._changed:
+                self._update(job, state=state)
+
+    def _load(self, options: PictureOptions) -> tuple[ReadyScene, Sequence[str]]:
+        """Return the edited scene in the renderer of a request, and the notes on its pictures."""
+        renderer = self._renderers[options.engine].make(options)
+        key = (options.scene_key, renderer.identity)
+        if self._loaded.get(options.engine, (None,))[0] != key:
+            scene = self.scene(options.scene_key, options.edits)
+            loaded = renderer.load(scene, "the scene")
+            self._loaded[options.engine] = (key, loaded, [*loaded.notes, *renderer.notes])
+        return self._loaded[options.engine][1:]
+
+    def _update(self, job: RenderJob, *, state: State | None = None) -> None:
+        job.state = state or job.state
+        job.version += 1
+        self._changed.notify_all()
+
+
+def agreement_db(job: RenderJob, reference: RenderJob | None) -> float | None:
+    """Return psnr_log_db of a picture against the reference; None where one is missing."""
+    if reference is None or reference is job or job.image is None or reference.image is None:
+        return None
+    if not _are_comparable(job.image, reference.image):
+        return None
+    return float(psnr_log_db(job.image.radiance_rgb, reference.image.radiance_rgb))
+
+
+def _are_comparable(image: Image, other: Image) -> bool:
+    if isinstance(image, PassImage) or isinstance(other, PassImage):
+        return False
+    return image.radiance_rgb.shape == other.radiance_rgb.shape
+
+
+def _is_over(job: RenderJob) -> bool:
+    return job.state in ("done", "failed", "cancelled")
+
+
+def _is_same(job: RenderJob, options: PictureOptions) -> bool:
+    return (
+        job.state in ("waiting", "working", "done")
+        and job.options.engine == options.engine
+        and job.options.camera_key == options.camera_key
+        and job.options.error_db == options.error_db
+    )
+
+
+def _can_judge(other: RenderJob, job: RenderJob, engine: str) -> bool:
+    return (
+        other.options.engine == engine
+        and other is not job
+        and other.options.camera_key == job.options.camera_key
+        and other.image is not None
+        and (engine == "target" or other.image.stated_error_db is not None)
+        and (job.image is None or _are_comparable(job.image, other.image))
     )

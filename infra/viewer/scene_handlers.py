@@ -1,35 +1,37 @@
 """Request handlers of a scene's page: the scene in 3D, pictures by every engine, and exports.
 
-Below the page of many scenes, the most recent ones stay open. A queue renders one picture of a
-scene at a time, and a new request cancels the current one. Finished pictures are kept for a while,
-so that switching back to one costs nothing. Pictures of one scene, camera and width are compared
-with the best of them: the one stored in the file, else the path traced one.
+Below the page of many scenes, the most recent ones stay open.
 """
 
-import itertools
+import dataclasses
 import json
 import shlex
+import struct
 import tempfile
 import threading
-from collections import OrderedDict
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
+from PIL import Image as Picture
 
 from infra.render.path_tracer import RenderChild
 from infra.render.tone_mapping import ToneMap, tone_mapped
-from infra.viewer.page_renderers import PageRenderer, PassImage, StoredPictures, page_renderers
+from infra.viewer.page_renderers import (
+    PageRenderer,
+    PassImage,
+    RenderJob,
+    RenderQueue,
+    agreement_db,
+    page_renderers,
+)
 from infra.viewer.picture_options import (
-    PictureOptions,
-    apply_edits,
     parse_picture_options,
     short_digest,
 )
-from infra.viewer.scene_bytes import scene_bytes, sky_bytes, texture_png
 from infra.viewer.server import (
     NotFound,
     Request,
@@ -41,224 +43,15 @@ from pipeline.documents.png import encode_png
 from pipeline.exchange.convert import write_scene
 from pipeline.exchange.formats import FORMATS, LoadedScene
 from pipeline.exchange.renderformer_json import camera_entry
+from storage.conventions import srgb8
 from storage.errors import TrilightError
-from storage.metrics import psnr_log_db
 from storage.records.lights import num_lights
+from storage.records.lookup import environment_values
+from storage.records.material import DIFFUSE, EMISSION, ROUGHNESS, SPECULAR
 from storage.records.scene import Scene
-from storage.renderer import Image, ReadyScene, Sampling
+from storage.records.scene_facts import lights
+from storage.records.texture import TEXTURED, Texture
 from train.evaluation.sheet import ERROR_WHITE, error_picture
-
-MOST_KEPT = 32
-"""Maximum number of pictures that are kept; one of 1024 pixels takes 13 MB."""
-
-PATIENCE_S = 20.0
-"""Seconds that a response waits for an update."""
-
-LAST_PICTURE_S = 15.0
-"""Seconds that `join` waits for the current picture."""
-
-_REFERENCES = ("target", "traced")
-
-State = Literal["waiting", "working", "done", "failed", "cancelled"]
-
-
-class _Superseded(Exception):
-    """Ends the current picture, which is cancelled."""
-
-
-@dataclass(kw_only=True, eq=False)
-class RenderJob:
-    """Requested picture and its state."""
-
-    id: str
-    options: PictureOptions
-    state: State = "waiting"
-    version: int = 0
-    """Counter of updates, by which `wait_for_update` sees a new one."""
-    image: Image | None = None
-    scene_core_s: float | None = None
-    """CPU seconds of the scene's preparation; None where they are unknown."""
-    notes: Sequence[str] = ()
-    sampling: Sampling | None = None
-    """Progress of a path tracer since the last image."""
-    error: str = ""
-    costs: list[Mapping[str, float | int | None]] = field(default_factory=list)
-    """Samples, CPU seconds and stated error of each image so far."""
-
-
-class RenderQueue:
-    """Render queue of one scene: each picture has a thread, and one of them works at a time.
-
-    `_changed` guards `_jobs` (every kept job, oldest first) and the state of each job.
-    `wait_for_update` waits for a newer version of a job. The working thread holds `_rendering`,
-    which guards `_loaded`, the last scene of each renderer. It and exports use `_edited`.
-    """
-
-    def __init__(self, scene: Scene, renderers: Mapping[str, PageRenderer]) -> None:
-        self._scene = scene
-        self._renderers = renderers
-        self._changed = threading.Condition()
-        self._rendering = threading.Lock()
-        self._jobs = OrderedDict[str, RenderJob]()
-        self._thread: threading.Thread | None = None
-        self._numbers = itertools.count(1)
-        self._edited: tuple[str, Scene] | None = None
-        self._loaded: dict[str, tuple[object, ReadyScene, Sequence[str]]] = {}
-
-    def submit(self, options: PictureOptions) -> RenderJob:
-        """Queue a picture, or return an equal job; the current picture is cancelled."""
-        with self._changed:
-            same = [job for job in self._jobs.values() if _is_same(job, options)]
-            if same:
-                self._jobs.move_to_end(same[-1].id)
-                return same[-1]
-            self.cancel_all()
-            job = RenderJob(id=str(next(self._numbers)), options=options)
-            self._jobs[job.id] = job
-            while len(self._jobs) > MOST_KEPT:
-                self._jobs.popitem(last=False)
-            self._thread = threading.Thread(target=self._render, args=(job,), daemon=True)
-            self._thread.start()
-            return job
-
-    def cancel_all(self) -> None:
-        """Cancel the current and the waiting picture; the current one ends at its next step."""
-        with self._changed:
-            for job in self._jobs.values():
-                if not _is_over(job):
-                    self._update(job, state="cancelled")
-
-    def job(self, number: str) -> RenderJob:
-        """Return a job by its id; raises TrilightError where it is no longer kept."""
-        with self._changed:
-            if number not in self._jobs:
-                raise TrilightError("The image is not kept any more; ask for it again.")
-            return self._jobs[number]
-
-    def wait_for_update(self, number: str, after: int) -> RenderJob:
-        """Return a job once it is newer than a version, or after PATIENCE_S."""
-        job = self.job(number)
-        with self._changed:
-            self._changed.wait_for(lambda: job.version > after or _is_over(job), PATIENCE_S)
-        return job
-
-    def reference(self, job: RenderJob) -> RenderJob | None:
-        """Return the job whose picture is the reference of another job; None without one."""
-        with self._changed:
-            for engine in _REFERENCES:
-                for other in reversed(self._jobs.values()):
-                    if _can_judge(other, job, engine):
-                        return other
-        return None
-
-    def scene(self, scene_key: str, edits: Mapping[str, Any]) -> Scene:
-        """Return the scene with edits; the last edited scene is kept."""
-        if self._edited is None or self._edited[0] != scene_key:
-            self._edited = (scene_key, apply_edits(self._scene, edits))
-        return self._edited[1]
-
-    def join(self) -> None:
-        """Wait for the current picture, which `cancel_all` ends at its next step.
-
-        Libraries abort a process that ends while they work in one of its threads.
-        """
-        if self._thread is not None:
-            self._thread.join(LAST_PICTURE_S)
-
-    def _render(self, job: RenderJob) -> None:
-        def show(step: Image | Sampling) -> None:
-            with self._changed:
-                if job.state != "working":
-                    raise _Superseded
-                if isinstance(step, Image):
-                    job.image = step
-                    job.sampling = None
-                    job.costs.append(
-                        {
-                            "spp": step.samples,
-                            "core_s": step.cpu_seconds,
-                            "floor_db": step.stated_error_db,
-                        }
-                    )
-                else:
-                    job.sampling = step
-                self._update(job)
-
-        with self._rendering:
-            with self._changed:
-                if job.state == "cancelled":
-                    return
-                self._update(job, state="working")
-            state: State = "done"
-            try:
-                loaded, job.notes = self._load(job.options)
-                job.scene_core_s = loaded.cpu_seconds
-                show(loaded.render(job.options.camera, show))
-            except _Superseded:
-                state = "cancelled"
-            except TrilightError as mistake:
-                state = "failed"
-                job.error = str(mistake)
-            except Exception as defect:  # of any library: the page shows it, the queue goes on
-                state = "failed"
-                job.error = f"{type(defect).__name__}: {defect}"
-            with self._changed:
-                self._update(job, state=state)
-
-    def _load(self, options: PictureOptions) -> tuple[ReadyScene, Sequence[str]]:
-        """Return the edited scene in the renderer of a request, and the notes on its pictures."""
-        renderer = self._renderers[options.engine].make(options)
-        key = (options.scene_key, renderer.identity)
-        if self._loaded.get(options.engine, (None,))[0] != key:
-            scene = self.scene(options.scene_key, options.edits)
-            loaded = renderer.load(scene, "the scene")
-            self._loaded[options.engine] = (key, loaded, [*loaded.notes, *renderer.notes])
-        return self._loaded[options.engine][1:]
-
-    def _update(self, job: RenderJob, *, state: State | None = None) -> None:
-        job.state = state or job.state
-        job.version += 1
-        self._changed.notify_all()
-
-
-def agreement_db(job: RenderJob, reference: RenderJob | None) -> float | None:
-    """Return psnr_log_db of a picture against the reference; None where one is missing."""
-    if reference is None or reference is job or job.image is None or reference.image is None:
-        return None
-    if not _are_comparable(job.image, reference.image):
-        return None
-    return float(psnr_log_db(job.image.radiance_rgb, reference.image.radiance_rgb))
-
-
-def _are_comparable(image: Image, other: Image) -> bool:
-    if isinstance(image, PassImage) or isinstance(other, PassImage):
-        return False
-    return image.radiance_rgb.shape == other.radiance_rgb.shape
-
-
-def _is_over(job: RenderJob) -> bool:
-    return job.state in ("done", "failed", "cancelled")
-
-
-def _is_same(job: RenderJob, options: PictureOptions) -> bool:
-    return (
-        job.state in ("waiting", "working", "done")
-        and job.options.engine == options.engine
-        and job.options.camera_key == options.camera_key
-        and job.options.error_db == options.error_db
-    )
-
-
-def _can_judge(other: RenderJob, job: RenderJob, engine: str) -> bool:
-    return (
-        other.options.engine == engine
-        and other is not job
-        and other.options.camera_key == job.options.camera_key
-        and other.image is not None
-        and (engine == "target" or other.image.stated_error_db is not None)
-        and (job.image is None or _are_comparable(job.image, other.image))
-    )
-
 
 EXPORTS = {
     ".usdz": "USD with textures",
@@ -281,12 +74,8 @@ class SceneHandlers:
     """Handlers of one scene and its pictures."""
 
     name: str
-    scene: Scene
-    notes: Sequence[str]
-    """Losses of the conversion from the scene's file."""
+    loaded: LoadedScene
     renderers: Mapping[str, PageRenderer]
-    target_px: int | None
-    """Width in pixels of the pictures in the file; None without such pictures."""
     source: str = ""
     """Scene as `trilight render` takes it; empty where it cannot."""
     child: RenderChild | None = None
@@ -294,6 +83,7 @@ class SceneHandlers:
     queue: RenderQueue = field(init=False)
 
     def __post_init__(self) -> None:
+        self.scene = self.loaded.scene
         self.queue = RenderQueue(self.scene, self.renderers)
         self._writing = threading.Lock()
 
@@ -320,6 +110,7 @@ class SceneHandlers:
 
     def _facts(self, _: Request) -> Response:
         scene = self.scene
+        target = self.loaded.radiance_rgb
         engines = [
             {"name": name, "title": each.title, "means": each.means}
             for name, each in self.renderers.items()
@@ -332,9 +123,9 @@ class SceneHandlers:
                 "materials": len(scene.materials),
                 "textures": len(scene.textures),
                 "views": scene.num_views,
-                "target_px": self.target_px,
+                "target_px": None if target is None or not len(target) else target.shape[1],
                 "template": str(scene.provenance.get("template", "")),
-                "notes": list(self.notes),
+                "notes": list(self.loaded.notes),
                 "engines": engines,
                 "exports": [pair for pair in EXPORTS.items() if self._is_offered(pair[0])],
             }
@@ -434,19 +225,8 @@ def handlers_of_scene(
         child, checkpoint: render child and network of the page.
         errors_db: stated errors of the pictures as psnr_log_db.
     """
-    target = None
-    if loaded.radiance_rgb is not None and len(loaded.radiance_rgb):
-        target = StoredPictures(
-            scene=loaded.scene, radiance_rgb=loaded.radiance_rgb, errors_db=errors_db
-        )
-    return SceneHandlers(
-        name=name,
-        scene=loaded.scene,
-        notes=loaded.notes,
-        renderers=page_renderers(child, target, checkpoint),
-        target_px=None if target is None else target.resolution,
-        source=source,
-    )
+    renderers = page_renderers(loaded, child, checkpoint, errors_db)
+    return SceneHandlers(name=name, loaded=loaded, renderers=renderers, source=source)
 
 
 def _job_record(job: RenderJob, reference: RenderJob | None) -> Mapping[str, Any]:
@@ -488,3 +268,126 @@ def _tone_map(radiance_rgb: NDArray[np.float32], query: Mapping[str, str]) -> ND
     if not -32 <= exposure_ev <= 32:
         raise TrilightError(f"ev is {exposure_ev}; expected -32 to 32.")
     return tone_mapped(radiance_rgb * np.float32(2.0**exposure_ev), tone_map)
+
+
+MOST_TRIANGLES = 1_500_000
+"""Maximum number of triangles; a browser holds 96 bytes of each, three times."""
+
+MOST_GROUPS = 5000
+"""Maximum number of pairs of object and material; each needs a draw call."""
+
+_SIDE = 2048
+"""Maximum width and height in pixels of textures for the browser; larger ones are reduced."""
+
+_SKY_ROWS = 128
+
+
+def scene_bytes(scene: Scene) -> bytes:
+    """Return a scene as one block of bytes for the browser's 3D view, which reads it in place.
+
+        4 bytes      length of the JSON, little-endian; the JSON is padded to a multiple of 4
+        JSON         groups, materials, textures, sky, cameras, lamps, bounds
+        float32      positions [3T, 3], normals [3T, 3], and uv [3T, 2] where anything is textured
+
+    Triangles are sorted into groups of one object and one material. The 3D view is for orientation
+    only; the rendered pictures beside it are exact.
+
+    Raises:
+        TrilightError: the scene has more triangles or groups than a browser draws.
+    """
+    if scene.num_triangles > MOST_TRIANGLES:
+        raise TrilightError(
+            f"{scene.num_triangles} triangles; expected at most {MOST_TRIANGLES} to turn the scene "
+            "in 3D. Its pictures are made all the same."
+        )
+    order, groups = _groups(scene)
+    corners = scene.faces[order].reshape(-1)
+    arrays = [scene.vertex_positions[corners], scene.vertex_normals[corners]]
+    if scene.uv is not None:
+        arrays.append(scene.uv.reshape(-1, 3, 2)[order].reshape(-1, 2))
+    head = {
+        "groups": groups,
+        "materials": [_material(scene, row) for row in range(len(scene.materials))],
+        "objects": [{"name": entry.name, "kind": entry.kind} for entry in scene.objects],
+        "lamps": [
+            {"object": light.row, "centre": light.centre, "area": light.area,
+             "radiance": light.radiance_rgb}
+            for light in lights(scene)
+        ],
+        "cameras": [
+            {"c2w": c2w.reshape(-1).tolist(), "fov": float(fov_deg)}
+            for c2w, fov_deg in zip(scene.c2w, scene.fov_deg, strict=True)
+        ],
+        "corners": len(corners),
+        "uv": scene.uv is not None,
+        "sky": None if scene.environment is None else {"seen": scene.environment.is_seen},
+    }  # fmt: skip
+    text = json.dumps(head).encode()
+    text += b" " * (-len(text) % 4)
+    blocks = [np.ascontiguousarray(array, "<f4").tobytes() for array in arrays]
+    return b"".join((struct.pack("<I", len(text)), text, *blocks))
+
+
+def texture_png(texture: Texture) -> bytes:
+    """Return a texture as PNG: colors sRGB-encoded, numbers linear, the bottom row last."""
+    linear = texture.linear(texture.texels)[::-1]
+    if texture.channels == 3:
+        pixels = srgb8(linear)
+    else:
+        pixels = np.round(255 * linear).astype(np.uint8).repeat(3, axis=2)
+    if max(pixels.shape[:2]) > _SIDE:
+        picture = Picture.fromarray(pixels)
+        picture.thumbnail((_SIDE, _SIDE))
+        pixels = np.asarray(picture)
+    return encode_png(pixels)
+
+
+def sky_bytes(scene: Scene) -> bytes:
+    """Return the environment map in the layout of three.js, for directions of Trilight's world.
+
+    There u is atan2(z, x) / 2 pi + 1/2 and v is asin(y) / pi + 1/2: small, [rows, 2 rows, 4] in
+    float32, v rising, after its width and height as two unsigned integers.
+    """
+    assert scene.environment is not None
+    texels = scene.environment.radiance_rgb
+    step = max(1, len(texels) // _SKY_ROWS)  # blocks of texels are averaged
+    rows = len(texels) // step
+    blocks = texels[: rows * step, : 2 * rows * step].reshape(rows, step, 2 * rows, step, 3)
+    sky = dataclasses.replace(scene.environment, radiance_rgb=blocks.mean(axis=(1, 3)))
+    height = (np.arange(rows) + 0.5) / rows * np.pi - np.pi / 2
+    around = (np.arange(2 * rows) + 0.5) / rows * np.pi - np.pi
+    flat = np.cos(height)[:, None]
+    up = np.broadcast_to(np.sin(height)[:, None], (rows, 2 * rows))
+    directions = np.stack([flat * np.cos(around), up, flat * np.sin(around)], axis=-1)
+    rgba = np.ones((rows, 2 * rows, 4), "<f4")
+    rgba[..., :3] = environment_values(sky, directions)
+    return struct.pack("<II", 2 * rows, rows) + rgba.tobytes()
+
+
+def _groups(scene: Scene) -> tuple[NDArray[np.int64], list[Mapping[str, int]]]:
+    """Return the order of triangles, and the range of each pair of object and material in it."""
+    pair = scene.object_index.astype(np.int64) << 16 | scene.material_index
+    order = np.argsort(pair, kind="stable")
+    values, first, count = np.unique(pair[order], return_index=True, return_counts=True)
+    if len(values) > MOST_GROUPS:
+        raise TrilightError(
+            f"{len(values)} parts of objects and materials; expected at most {MOST_GROUPS} to turn "
+            "the scene in 3D. Its pictures are made all the same."
+        )
+    return order, [
+        {"object": v >> 16, "material": v & 0xFFFF, "first": 3 * f, "count": 3 * n}
+        for v, f, n in zip(values.tolist(), first.tolist(), count.tolist(), strict=True)
+    ]
+
+
+def _material(scene: Scene, row: int) -> Mapping[str, Any]:
+    values = scene.materials[row]
+    worn = None if scene.material_textures is None else scene.material_textures[row].tolist()
+    maps = {name: at for name, at in zip(TEXTURED, worn or (), strict=False) if at >= 0}
+    return {
+        "diffuse": values[DIFFUSE].tolist(),
+        "specular": values[SPECULAR].tolist(),
+        "roughness": float(values[ROUGHNESS]),
+        "emission": values[EMISSION].tolist(),
+        "maps": maps,
+    }

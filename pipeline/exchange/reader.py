@@ -3,14 +3,15 @@
 import contextlib
 import dataclasses
 import logging
+import re
 from collections.abc import Callable, Iterable
 from pathlib import Path
 from typing import Any
 
 from pipeline.assets.settings import AssetSettings
-from pipeline.exchange.formats import LoadedScene, SceneSource
-from pipeline.exchange.from_description import AlbedoOverOne, Cameras, LoadedMesh
-from pipeline.exchange.open_scene import load_cameras, load_source, source_keys
+from pipeline.exchange.formats import LoadedScene, SceneSource, readable_suffixes
+from pipeline.exchange.from_description import AlbedoOverOne, LoadedMesh
+from pipeline.exchange.open_scene import load_cameras, load_source, scene_source, source_keys
 from pipeline.exchange.scene_files import load_mesh_file
 from pipeline.isolation import (
     ChildFailed,
@@ -20,7 +21,9 @@ from pipeline.isolation import (
     call_with_retries,
     reach,
 )
+from storage.dataset.shard_set import expand_pattern
 from storage.errors import TrilightError
+from storage.renderer import Camera
 
 log = logging.getLogger("trilight.exchange")
 
@@ -28,17 +31,9 @@ log = logging.getLogger("trilight.exchange")
 class SceneReader(contextlib.AbstractContextManager["SceneReader"]):
     """A child process that reads any number of sources; close it, or use a `with` block."""
 
-    def __init__(
-        self, albedo_over_one: AlbedoOverOne = "scale", *, writes: Iterable[Path] = ()
-    ) -> None:
-        """Create the reader; the child starts with the first call.
-
-        Args:
-            albedo_over_one: treatment of albedos over 1 in RenderFormer's JSON.
-            writes: folders that the child may write into.
-        """
+    def __init__(self, *, writes: Iterable[Path] = ()) -> None:
+        """Create the reader, whose child may write into some folders; it starts with a call."""
         self._child = IsolatedChild(limits=LIMITS, confined_to=reach(writes=writes))
-        self._over_one = albedo_over_one
 
     def scenes_of(self, source: SceneSource) -> list[SceneSource]:
         """Return a source for each scene of a file, in the order of the file.
@@ -51,14 +46,63 @@ class SceneReader(contextlib.AbstractContextManager["SceneReader"]):
             raise TrilightError(f"{source.name}: holds no scene.")
         return [dataclasses.replace(source, key=key) for key in keys]
 
+    def list_scenes(
+        self, text: str, albedo_over_one: AlbedoOverOne = "scale", *, many: bool = True
+    ) -> list[SceneSource]:
+        """Return every scene of a source, in order.
+
+        Args:
+            text: one file; `scenes/{000..119}.json` for numbered ones; or a folder, whose scene
+                files are sorted by the numbers in their names. A shard stands for all of its
+                samples, an animated USD stage for all of its frames.
+            albedo_over_one: treatment of albedos over 1 in RenderFormer's JSON.
+            many: False where `text` must name one scene, whose file is not opened.
+
+        Raises:
+            TrilightError: a file is unusable, or there is no scene.
+        """
+        names = [text]
+        is_folder = many and "://" not in text and Path(text).is_dir()
+        if is_folder:
+            suffixes = readable_suffixes()
+            paths = [path for path in Path(text).iterdir() if path.suffix.lower() in suffixes]
+            if not paths:
+                raise TrilightError(
+                    f"{text}: holds no scene file; expected files that end in {' '.join(suffixes)}."
+                )
+            names = [str(path) for path in sorted(paths, key=_by_number)]
+        elif many and "{" in text:
+            names = expand_pattern(text, "scenes")
+        holds_many = many and not is_folder
+        files = [
+            scene_source(name, many=holds_many, albedo_over_one=albedo_over_one) for name in names
+        ]
+        if not holds_many:
+            return files
+        return [scene for file in files for scene in self.scenes_of(file)]
+
     def load(self, source: SceneSource, *, pictures: bool = False) -> LoadedScene:
         """Read one scene; see `pipeline.exchange.open_scene.load_source`."""
-        source = dataclasses.replace(source, albedo_over_one=self._over_one)
         return self._read(load_source, source, pictures)
 
-    def cameras(self, source: SceneSource) -> Cameras:
-        """Read poses and angles; see `pipeline.exchange.open_scene.load_cameras`."""
-        return self._read(load_cameras, source)
+    def cameras(self, file: SceneSource, view: int) -> list[Camera]:
+        """Read all cameras of the scene of a file, or one of each frame of an animated stage.
+
+        Args:
+            file: JSON file with a list `cameras` as in RenderFormer's scenes, or any scene.
+            view: row of the camera in each frame.
+
+        Raises:
+            TrilightError: the file is unusable, or has no such camera.
+        """
+        frames = self.scenes_of(file)
+        if len(frames) == 1:
+            return [
+                Camera(c2w=pose, fov_deg=float(angle))
+                for pose, angle in zip(*self._read(load_cameras, frames[0]), strict=True)
+            ]
+        of_frames = [Camera.of_scene(self.load(each).scene, view, "--view") for each in frames]
+        return [dataclasses.replace(camera, view=None) for camera in of_frames]
 
     def mesh(self, path: Path, licence: str) -> LoadedMesh:
         """Read the mesh of an object file; log the parts of the file that are ignored.
@@ -103,6 +147,12 @@ class SceneReader(contextlib.AbstractContextManager["SceneReader"]):
             return call_with_retries(self._child, function, *args)
         except ChildFailed as failure:
             raise TrilightError(f"{name}: could not be {done} ({failure}).") from failure
+
+
+def _by_number(path: Path) -> list[tuple[int, str]]:
+    """Return a key that sorts frame9 before frame10."""
+    parts = re.split(r"([0-9]+)", path.name)
+    return [(int(part), part) if part.isdecimal() else (-1, part) for part in parts]
 
 
 LIMITS = ChildLimits(memory_bytes=16 << 30, wall_s=1800, calls_per_child=1000)

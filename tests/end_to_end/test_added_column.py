@@ -13,12 +13,12 @@ import torch
 from numpy.typing import NDArray
 
 from infra.render.path_tracer import PathTracer, RenderChild
-from infra.render.quality import FixedSamples
 from model.inference import NeuralRenderer
 from model.open import open_network, save_published
 from model.scene_tensors import SceneTensors, batch_scenes, scene_tensors
 from pipeline.generation.inspect_scene import _facts
 from pipeline.renders.mitsuba_variant import choose_variant
+from pipeline.renders.preview import PreviewSettings
 from scene_templates.families import DEFAULT_FAMILIES
 from scene_templates.settings import SceneSettings
 from storage.dataset.dataset import Dataset
@@ -187,7 +187,7 @@ def test_the_shipped_network_gives_the_same_bytes_and_says_what_it_does_not_read
 def test_the_path_tracer_says_what_it_does_not_read(monkeypatch: pytest.MonkeyPatch) -> None:
     use_children_here(monkeypatch)
     child = RenderChild(choose_variant(), threads=1)
-    tracer = PathTracer(child, FixedSamples(spp=1, denoiser="off"), 8)
+    tracer = PathTracer(child, PreviewSettings(resolution=8, spp=1, denoiser="off"))
     scene = tiny_scene()
     assert tracer.load(scene, "floor").notes == ()
     scene.materials[FLOOR, -1] = 0.9

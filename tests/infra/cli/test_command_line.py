@@ -274,7 +274,7 @@ def test_a_log_has_a_line_of_progress_a_minute(
 ) -> None:
     now = [0.0]
     monkeypatch.setattr(console.time, "monotonic", lambda: now[0])
-    with console.progress_bars() as bars:
+    with console.Bars() as bars:
         task = bars.add_task("scenes", total=None, note="")
         for second in (59, 60, 61, 119, 120):
             now[0] = second
@@ -304,7 +304,7 @@ def test_what_is_printed_tells_the_terminal_nothing(monkeypatch: pytest.MonkeyPa
             console.first_words(name)
             console.suggest_look(name)
             console.next_step([name])
-            with console.progress_bars() as bars:
+            with console.Bars() as bars:
                 bars.update(bars.add_task(name, total=2, note=name), completed=1)
                 bars.console.print(f"{name}")
             text = out.getvalue()

@@ -14,7 +14,7 @@ from unittest import mock
 
 import pytest
 
-from infra.cli.console import progress_bars
+from infra.cli.console import Bars
 from infra.cli.overrides import (
     BaseSettings,
     merge_overrides,
@@ -124,13 +124,13 @@ def test_a_second_ctrl_c_ends_a_step_that_does_not(tmp_path: Path) -> None:
     """The step is a call into C that hears no signal, as a backward pass."""
     code = (
         "import ctypes, time\n"
-        "from infra.cli.console import progress_bars\n"
+        "from infra.cli.console import Bars\n"
         "from infra.cli.train import _BarProgress\n"
         "from train.loop.interrupts import deferred_interrupts\n"
         "c, mutex = ctypes.CDLL(None), (ctypes.c_byte * 64)()\n"
         "c.pthread_mutex_lock(mutex)\n"
         "until = (ctypes.c_long * 2)(int(time.time()) + 300, 0)\n"
-        "with progress_bars() as bars, deferred_interrupts(_BarProgress(bars).report_interrupt):\n"
+        "with Bars() as bars, deferred_interrupts(_BarProgress(bars).report_interrupt):\n"
         "    print('in the step', flush=True)\n"
         "    c.pthread_mutex_timedlock(mutex, until)\n"
     )
@@ -157,7 +157,7 @@ def test_a_run_that_hangs_and_is_to_stop_ends_with_status_1(
 ) -> None:
     ended: list[int] = []
     monkeypatch.setattr(os, "_exit", ended.append)
-    with progress_bars() as bars:
+    with Bars() as bars:
         _BarProgress(bars).report_hang("training: step 7 hangs")
     assert ended == [1]
     said = capsys.readouterr().err

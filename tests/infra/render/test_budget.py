@@ -30,10 +30,10 @@ from infra.render.preview_table import (
     price_all,
     shipped_table,
 )
-from infra.render.quality import Budget, FixedSamples
+from infra.render.quality import Budget
 from infra.setup.preview_table import NETWORK, WIDTHS, ladder, part_names, table_of
 from pipeline.renders.mitsuba_variant import Variant
-from pipeline.renders.preview import all_parts
+from pipeline.renders.preview import PreviewSettings, all_parts
 from pipeline.renders.settings import Filtered
 from storage.errors import TrilightError
 from storage.settings.described import settings_record
@@ -43,7 +43,7 @@ FILTERS: tuple[Filtered, ...] = ("fast", "high")
 
 
 def priced(seconds: float, db: float, spp: int = 1) -> Priced:
-    samples = FixedSamples(spp=spp, denoiser="fast")
+    samples = PreviewSettings(resolution=64, spp=spp)
     return Priced(samples=samples, seconds=seconds, db=db, least_db=db - 5, judged_px=64)
 
 

@@ -4,9 +4,7 @@ import contextlib
 import dataclasses
 import json
 import re
-from collections.abc import Callable
 from pathlib import Path
-from typing import Any
 from unittest import mock
 
 import numpy as np
@@ -24,23 +22,20 @@ from infra.render.networks import (
 from infra.render.options import RenderOptions
 from infra.render.path_tracer import MOST_SCENES, PathTracer, RenderChild, RenderWorker
 from infra.render.plan import (
-    camera_path,
     orbit,
-    own_camera,
     pair_cameras,
     plan_render,
-    scene_sources,
 )
-from infra.render.quality import FixedSamples, ToStatedError
+from infra.render.quality import measured_settings
 from infra.render.raw_references import RawReference, true_error, true_error_db
 from infra.render.run_render import Frame, flicker
 from model.config import SIZES
 from model.inference import NeuralRenderer
-from pipeline.exchange.open_scene import SceneSource
+from pipeline.exchange.open_scene import SceneSource, scene_source
 from pipeline.exchange.reader import SceneReader
-from pipeline.isolation import Result
 from pipeline.renders.mitsuba_variant import choose_variant
 from pipeline.renders.noise_floor import clamped_radiance
+from pipeline.renders.preview import PreviewSettings
 from storage.conventions import log10_radiance, look_at_c2w
 from storage.dataset.shard import write_shard
 from storage.errors import TrilightError, Unrenderable
@@ -175,8 +170,8 @@ def test_two_renderers_without_noise() -> None:
 
 TINY = tiny_scene()
 TINY_CAMERA = Camera.of_scene(TINY, 0)
-FEW = FixedSamples(spp=4, denoiser="fast")
-MEASURED = ToStatedError(targets={"noise_floor_db": 95.0}, max_spp=1024)
+FEW = PreviewSettings(resolution=32, spp=4)
+MEASURED = measured_settings(32, {"noise_floor_db": 95.0}, max_spp=1024)
 
 
 class Enough(Exception):
@@ -186,7 +181,7 @@ class Enough(Exception):
 def test_path_tracers_share_a_child_that_can_be_stopped_and_keeps_few_scenes() -> None:
     told = list[Sampling | Image]()
     with contextlib.closing(RenderChild(choose_variant(), threads=1)) as child:
-        growing = PathTracer(child, MEASURED, 32, shows_looks=True)
+        growing = PathTracer(child, MEASURED, shows_looks=True)
         grown = growing.load(TINY, "tiny")
         with pytest.raises(Enough):
             grown.render(TINY_CAMERA, mock.Mock(side_effect=Enough))
@@ -196,9 +191,9 @@ def test_path_tracers_share_a_child_that_can_be_stopped_and_keeps_few_scenes() -
         assert looks[0].stated_error_db is None and "not measured" in looks[0].remark
         assert last.stated_error_db is not None and (last.samples or 0) > 256
         assert (last.cpu_seconds or 0) > (looks[0].cpu_seconds or 0) > 0
-        plain = PathTracer(child, MEASURED, 32).load(TINY, "tiny").render(TINY_CAMERA)
+        plain = PathTracer(child, MEASURED).load(TINY, "tiny").render(TINY_CAMERA)
         np.testing.assert_array_equal(last.radiance_rgb, plain.radiance_rgb)
-        preview = PathTracer(child, FEW, 32).load(TINY, "tiny")
+        preview = PathTracer(child, FEW).load(TINY, "tiny")
         assert child._child.call_method(count_loaded) == MOST_SCENES
         picture = preview.render(TINY_CAMERA)
         assert (picture.samples, picture.facts) == (4, {"spp": 4})
@@ -221,22 +216,15 @@ def count_loaded(worker: RenderWorker) -> int:
 def test_a_fingerprint_tells_quality_width_and_seed_apart() -> None:
     child = RenderChild(choose_variant(), threads=1)
     tracers = [
-        PathTracer(child, FEW, 32),
-        PathTracer(child, FEW, 32, seed=1),
-        PathTracer(child, FEW, 64),
-        PathTracer(child, MEASURED, 32),
+        PathTracer(child, FEW),
+        PathTracer(child, FEW, seed=1),
+        PathTracer(child, PreviewSettings(resolution=64, spp=4)),
+        PathTracer(child, MEASURED),
     ]
     assert len({fingerprint(tracer.identity) for tracer in tracers}) == len(tracers)
-    assert fingerprint(PathTracer(child, FEW, 32, name="other").identity) == fingerprint(
+    assert fingerprint(PathTracer(child, FEW, name="other").identity) == fingerprint(
         tracers[0].identity
     )
-
-
-class HereReader(SceneReader):
-    """Reads in this process: the tests' own files crash nobody."""
-
-    def _call(self, name: str, function: Callable[..., Result], *args: Any) -> Result:
-        return function(*args)
 
 
 def sources(count: int) -> list[SceneSource]:
@@ -250,7 +238,7 @@ def cameras(count: int) -> list[Camera]:
 def test_a_turn_begins_at_the_camera_and_looks_at_one_point() -> None:
     """And an arc has it in its middle. Float32 positions of about 2 m are exact to 1e-6."""
     scene = tiny_scene()
-    start = own_camera(scene, 0)
+    start = Camera.of_scene(scene, 0)
     turn = orbit(scene, start, 8, 360)
     np.testing.assert_allclose(turn[0].c2w, start.c2w, atol=1e-6)
     eyes = np.array([camera.c2w[:3, 3] for camera in turn])
@@ -288,10 +276,11 @@ def test_a_path_is_a_list_of_cameras_or_any_scene(tmp_path: Path) -> None:
     path = tmp_path / "path.json"
     path.write_text(json.dumps({"cameras": [listed, {**listed, "fov": 1}]}))
     (tmp_path / "tiny.safetensors").write_bytes(encode_scene(tiny_scene()))
-    found = camera_path(str(path), HereReader(), 0)
+    reader = SceneReader()
+    found = reader.cameras(scene_source(str(path)), 0)
     assert [camera.fov_deg for camera in found] == [45, 1]
     np.testing.assert_allclose(found[0].c2w, tiny_scene().c2w[0], atol=1e-6)  # rounded to float32
-    own = camera_path(str(tmp_path / "tiny.safetensors"), HereReader(), 0)
+    own = reader.cameras(scene_source(str(tmp_path / "tiny.safetensors")), 0)
     np.testing.assert_array_equal([camera.c2w for camera in own], tiny_scene().c2w)
     for broken, message in (
         ({**listed, "look_at": [2, 0, 1]}, r"path.json: cameras\[0\] looks from"),
@@ -299,35 +288,35 @@ def test_a_path_is_a_list_of_cameras_or_any_scene(tmp_path: Path) -> None:
     ):
         path.write_text(json.dumps({"cameras": [broken]}))
         with pytest.raises(TrilightError, match=message):
-            camera_path(str(path), HereReader(), 0)
+            reader.cameras(scene_source(str(path)), 0)
 
 
 def test_numbered_scenes_come_in_the_order_of_their_numbers(tmp_path: Path) -> None:
     for number in (2, 10, 1):
         (tmp_path / f"scene{number}.safetensors").write_bytes(encode_scene(tiny_scene()))
     (tmp_path / "notes.txt").write_text("no scene")
-    folder = [source.path.name for source in scene_sources(str(tmp_path), HereReader())]
+    folder = [source.path.name for source in SceneReader().list_scenes(str(tmp_path))]
     assert folder == ["scene1.safetensors", "scene2.safetensors", "scene10.safetensors"]
-    braces = scene_sources(f"{tmp_path}/scene{{1..2}}.safetensors", HereReader())
+    braces = SceneReader().list_scenes(f"{tmp_path}/scene{{1..2}}.safetensors")
     assert [source.path.name for source in braces] == folder[:2]
     with pytest.raises(TrilightError, match=r"scene3.safetensors: no such file"):
-        scene_sources(f"{tmp_path}/scene{{1..3}}.safetensors", HereReader())
+        SceneReader().list_scenes(f"{tmp_path}/scene{{1..3}}.safetensors")
     with pytest.raises(TrilightError, match="scenes .*: a brace is not closed"):
-        scene_sources(f"{tmp_path}/scene{{1.safetensors", HereReader())
+        SceneReader().list_scenes(f"{tmp_path}/scene{{1.safetensors")
     (tmp_path / "none").mkdir()
     with pytest.raises(TrilightError, match="none: holds no scene file"):
-        scene_sources(str(tmp_path / "none"), HereReader())
+        SceneReader().list_scenes(str(tmp_path / "none"))
     keys = ["000000003", "000000007"]
     shard = tmp_path / "train-000000.tar"
     write_shard(shard, [(key, encode_sample(tiny_sample(key=key))) for key in keys])
-    assert [source.key for source in scene_sources(str(shard), HereReader())] == keys
-    assert [source.key for source in scene_sources(f"{shard}::{keys[1]}", HereReader())] == keys[1:]
+    assert [source.key for source in SceneReader().list_scenes(str(shard))] == keys
+    assert [source.key for source in SceneReader().list_scenes(f"{shard}::{keys[1]}")] == keys[1:]
 
 
 def test_a_plan_has_all_that_was_asked(source: Path, tmp_path: Path) -> None:
     """One picture is of the scene's own camera; both engines share the width."""
     one = {"out": tmp_path / "new/x.exr", "view": 1, "threads": 3}
-    plan = plan_render(RenderOptions(source=str(source), **one), HereReader())  # type: ignore[arg-type]
+    plan = plan_render(RenderOptions(source=str(source), **one), SceneReader())  # type: ignore[arg-type]
     ((_, camera),), (tracer,) = plan.pairs, plan.renderers
     assert isinstance(tracer, PathTracer)
     assert (tracer.child.threads, tracer.settings.resolution, plan.resolution) == (3, 512, 512)
@@ -337,7 +326,7 @@ def test_a_plan_has_all_that_was_asked(source: Path, tmp_path: Path) -> None:
         source=str(source), out=tmp_path / "turn.webp", engine="both", checkpoint=network,
         resolution=16, orbit=3,
     )  # fmt: skip
-    plan = plan_render(asked, HereReader())
+    plan = plan_render(asked, SceneReader())
     mitsuba, neural = plan.renderers
     assert isinstance(mitsuba, PathTracer) and isinstance(neural, NetworkRenderer)
     assert mitsuba.settings.resolution == neural.resolution == plan.resolution == 16
@@ -354,7 +343,7 @@ def test_the_pictures_of_a_turn_share_the_loading_of_its_scene(
     monkeypatch.setattr(plan, "price_all", price_all)
     for more in ({"out": tmp_path / "x.exr"}, {"out": tmp_path / "turn", "orbit": 3}):
         with pytest.raises(TrilightError, match="no way"):
-            plan_render(RenderOptions(source=str(source), seconds=1.0, **more), HereReader())
+            plan_render(RenderOptions(source=str(source), seconds=1.0, **more), SceneReader())
     assert [each.kwargs["per_scene"] for each in price_all.call_args_list] == [1, 3]
 
 

@@ -15,20 +15,18 @@ from infra.render.plan import (
     RenderPlan,
     orbit,
     output_paths,
-    own_camera,
     pair_cameras,
-    write_video,
 )
-from infra.render.run_render import FinishedShot, run_plan
+from infra.render.run_render import FinishedShot, run_plan, write_video
 from infra.render.tone_mapping import Look, tone_mapped
 from pipeline.exchange.open_scene import SceneSource
+from pipeline.exchange.reader import SceneReader
 from storage.conventions import preview_srgb8
 from storage.errors import TrilightError
 from storage.records.exr import decode_exr
 from storage.records.scene import Scene
 from storage.records.scene_file import encode_scene
 from storage.renderer import Camera, Image, ReadyScene
-from tests.infra.render.test_methods import HereReader
 from tests.scenes_by_hand import tiny_scene
 
 
@@ -67,7 +65,7 @@ Pairs = list[tuple[SceneSource, Camera | int]]
 def turn(tmp_path: Path) -> Pairs:
     path = tmp_path / "tiny.safetensors"
     path.write_bytes(encode_scene(tiny_scene()))
-    cameras = orbit(tiny_scene(), own_camera(tiny_scene(), 0), 4, 360)
+    cameras = orbit(tiny_scene(), Camera.of_scene(tiny_scene(), 0), 4, 360)
     return pair_cameras([SceneSource(path=path, key=None)], cameras)
 
 
@@ -88,7 +86,7 @@ def run(
         pairs=pairs,
         fps=24,
     )
-    return run_plan(plan, HereReader(), lambda done, total: None, lambda now: None)
+    return run_plan(plan, SceneReader(), lambda done, total: None, lambda now: None)
 
 
 def test_pictures_are_numbered_and_what_is_there_is_kept(turn: Pairs, tmp_path: Path) -> None:
@@ -207,7 +205,7 @@ def test_out_says_what_is_made(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) 
     one = output_paths(tmp_path / "new/one.exr")
     assert (one.stem_of(7), one.is_sequence) == (tmp_path / "new/one", False)
     many = output_paths(tmp_path / "turn")
-    assert many == OutputPaths(stem=None, folder=tmp_path / "turn", video=None)
+    assert many == OutputPaths(out=tmp_path / "turn", folder=tmp_path / "turn")
     assert many.stem_of(7) == tmp_path / "turn/000007"
     shown = output_paths(tmp_path / "turn.webp")
     assert (shown.folder, shown.video) == (tmp_path / "turn", tmp_path / "turn.webp")
@@ -218,7 +216,7 @@ def test_out_says_what_is_made(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) 
         output_paths(tmp_path / "x.gif")
     monkeypatch.setitem(__import__("sys").modules, "av", None)
     with pytest.raises(TrilightError, match="needs PyAV, which is not installed: pip install av"):
-        output_paths(tmp_path / "x.mp4")
+        run([FlatRenderer()], tmp_path / "x.mp4", [])
     monkeypatch.setitem(__import__("sys").modules, "PyOpenColorIO", None)
     look_module._filmic.cache_clear()
     with pytest.raises(TrilightError, match="OpenColorIO is not installed"):

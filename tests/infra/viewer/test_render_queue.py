@@ -13,16 +13,19 @@ import pytest
 from PIL import Image as Picture
 
 from infra.render.networks import RendererHere
-from infra.viewer import scene_bytes as module
+from infra.viewer import scene_handlers as module
 from infra.viewer.page_renderers import (
     PageRenderer,
+    RenderJob,
+    RenderQueue,
     StoredPictures,
+    agreement_db,
     network_on_page,
     samples_on_page,
 )
 from infra.viewer.picture_options import PictureOptions, apply_edits, parse_picture_options
-from infra.viewer.scene_bytes import scene_bytes, sky_bytes, texture_png
-from infra.viewer.scene_handlers import RenderJob, RenderQueue, SceneHandlers, agreement_db
+from infra.viewer.scene_handlers import SceneHandlers, scene_bytes, sky_bytes, texture_png
+from pipeline.exchange.formats import LoadedScene
 from storage.errors import TrilightError
 from storage.records.environment import Environment
 from storage.records.material import DIFFUSE, EMISSION, ROUGHNESS
@@ -83,12 +86,12 @@ def wanted(engine: str = "traced", **changes: Any) -> PictureOptions:
     return parse_picture_options(request(engine, **changes), {engine: None}, 2)
 
 
-def room_of(renderers: Mapping[str, Renderer], target_px: int | None = None) -> SceneHandlers:
-    notes = ("a note",)
-    return SceneHandlers(
-        name="tiny", scene=tiny_scene(), notes=notes, renderers=offered(renderers),
-        target_px=target_px,
-    )  # fmt: skip
+def room_of(
+    renderers: Mapping[str, Renderer], target_px: int | None = None, scene: Scene | None = None
+) -> SceneHandlers:
+    targets = None if target_px is None else np.zeros((2, target_px, target_px, 3), np.float32)
+    loaded = LoadedScene(scene=scene or tiny_scene(), notes=("a note",), radiance_rgb=targets)
+    return SceneHandlers(name="tiny", loaded=loaded, renderers=offered(renderers))
 
 
 def until_begun(easel: RenderQueue, job: RenderJob) -> RenderJob:
@@ -223,7 +226,7 @@ def test_a_scene_is_saved_with_its_changes_and_nothing_is_written_here() -> None
                 assert len(changed[1]) > 500 and changed[1] != plain[1]
                 for bad in ("../x.usda", ".exe", "", None, ".json"):
                     assert asker.ask("api/export", {"form": bad})[0] == 422
-    textured = dataclasses.replace(room_of({}), scene=textured_scene())  # in more files than one
+    textured = room_of({}, scene=textured_scene())  # in more files than one
     assert textured._is_offered(".usdz") and not textured._is_offered(".usda")
 
 

@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from PIL import Image
 
 from infra.render.path_tracer import PathTracer, RenderChild
-from infra.render.quality import ToStatedError
+from infra.render.quality import measured_settings
 from pipeline.exchange.convert import convert_scene
 from pipeline.exchange.open_scene import SceneSource
 from pipeline.exchange.reader import SceneReader
@@ -184,8 +184,8 @@ def _grey(source: SceneSource, variant: Variant) -> NDArray[np.uint8]:
 def test_rendering() -> None:
     """The child is killed between two passes of samples; the next one opens the scene again."""
     scene, kills = tiny_scene(), list[int]()
-    quality = ToStatedError(targets={"noise_floor_db": 99.0}, max_spp=64)
-    tracer = PathTracer(RenderChild(choose_variant(), threads=1), quality, 8)
+    settings = measured_settings(8, {"noise_floor_db": 99.0}, max_spp=64)
+    tracer = PathTracer(RenderChild(choose_variant(), threads=1), settings)
     disturbed = False
 
     def sampled(step: object) -> None:

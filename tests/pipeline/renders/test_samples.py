@@ -10,7 +10,7 @@ from hypothesis import strategies as st
 from hypothesis.extra import numpy as hnp
 from numpy.typing import NDArray
 
-from infra.render.quality import ToStatedError
+from infra.render.quality import measured_settings
 from pipeline.renders.calibrated_error import first_spp
 from pipeline.renders.noise_floor import Curve
 from pipeline.renders.pictures import NUMPY, means, pixel_errors, read_sums
@@ -153,7 +153,7 @@ def test_targets_go_by_the_name_of_their_metric() -> None:
         ({"noise_floor_db": 44.0, "noise_floor_objects_db": 43.0},
          {"psnr_log_db": 44.0, "object_psnr_log_db": 43.0}),
     ):  # fmt: skip
-        assert ToStatedError(targets=targets).settings(64).targets_db == expected
+        assert measured_settings(64, targets).targets_db == expected
         assert RenderSettings(**{**GOOD, **target_overrides(targets)}).targets_db == expected
 
 
