@@ -184,10 +184,11 @@ def largest_shift(metric: str, looks: Sequence[Look], stated_db: Values, allowed
     def risk(shift: float) -> float:
         stated = stated_db + shift
         wrong = stated - truth > 1
-        return max(
+        risks = [
             np.mean(np.bincount(layouts[at], wrong[at]) / np.bincount(layouts[at]))
             for at in (np.arange(len(looks)), stops(metric, looks, stated))
-        )
+        ]
+        return float(max(risks))
 
     return next((float(shift) for shift in _GRID_DB if risk(shift) <= allowed), float(_GRID_DB[-1]))
 

@@ -2,9 +2,8 @@
 
 import io
 import time
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import TypeVar
 
 import h5py
 import numpy as np
@@ -47,17 +46,24 @@ def write_copies(
 TEXTURES = {"HDF5 float16": "float16", "HDF5 float32": "float32"}
 LAYOUTS = (*PROFILES, *TEXTURES)
 
-Packed = TypeVar("Packed")
-
 
 def unpacking_figures(samples: Sequence[Sample], layout: str, work: Path) -> Mapping[str, float]:
     """Return mean bytes before and after, and CPU milliseconds, of unpacking samples in memory."""
     if layout in TEXTURES:
-        files = [_h5_bytes(sample, work, TEXTURES[layout]) for sample in samples]
-        return _time_unpacking(files, _unpacked_h5, len)
-    profile: Profile = "lossless" if layout == "lossless" else "compact"
-    members = [encode_sample(sample, profile) for sample in samples]
-    return _time_unpacking(members, _unpacked_sample, lambda packed: sum(map(len, packed.values())))
+        packed = [_h5_members(sample, work, TEXTURES[layout]) for sample in samples]
+        unpack = _unpacked_h5
+    else:
+        profile: Profile = "lossless" if layout == "lossless" else "compact"
+        packed = [encode_sample(sample, profile) for sample in samples]
+        unpack = _unpacked_sample
+    began = time.process_time()
+    memory = sum(map(unpack, packed))
+    spent_s = time.process_time() - began
+    return {
+        "bytes": float(np.mean([sum(map(len, members.values())) for members in packed])),
+        "memory_bytes": memory / len(packed),
+        "sample_ms": 1000 * spent_s / len(packed),
+    }
 
 
 def _unpacked_sample(members: Mapping[str, bytes]) -> int:
@@ -66,30 +72,17 @@ def _unpacked_sample(members: Mapping[str, bytes]) -> int:
     return int(arrays + sample.radiance_rgb.nbytes)
 
 
-def _h5_bytes(sample: Sample, work: Path, texture_type: str) -> bytes:
+def _h5_members(sample: Sample, work: Path, texture_type: str) -> Members:
     write_renderformer_h5(work / "scene.h5", sample.scene, sample.radiance_rgb)
     stream = io.BytesIO()
     with h5py.File(work / "scene.h5") as source, h5py.File(stream, "w") as file:
         for name, array in source.items():
             data = array[()].astype(texture_type if name == "texture" else array.dtype)
             file.create_dataset(name, data=data, compression="gzip", compression_opts=9)
-    return stream.getvalue()
+    return {"scene.h5": stream.getvalue()}
 
 
-def _unpacked_h5(data: bytes) -> int:
+def _unpacked_h5(members: Members) -> int:
     """Read every array without checks, as a loader that trusts its files does."""
-    with h5py.File(io.BytesIO(data)) as file:
+    with h5py.File(io.BytesIO(members["scene.h5"])) as file:
         return sum(file[name][()].nbytes for name in file)
-
-
-def _time_unpacking(
-    packed: Sequence[Packed], unpack: Callable[[Packed], int], size: Callable[[Packed], int]
-) -> Mapping[str, float]:
-    began = time.process_time()
-    memory = sum(map(unpack, packed))
-    spent_s = time.process_time() - began
-    return {
-        "bytes": float(np.mean([size(one) for one in packed])),
-        "memory_bytes": memory / len(packed),
-        "sample_ms": 1000 * spent_s / len(packed),
-    }

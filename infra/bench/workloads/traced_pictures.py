@@ -17,6 +17,7 @@ figure does not depend on whether its reference was cached.
 
 import dataclasses
 import time
+from collections.abc import Mapping
 
 import numpy as np
 from numpy.typing import NDArray
@@ -175,7 +176,10 @@ class _Plain:
         return np.array(picture, np.float32)
 
 
-_CURVES = {"log": log10_radiance, "linear": clamped_radiance, "object": log10_radiance}
+CURVES: Mapping[str, Curve] = {
+    "log": log10_radiance, "linear": clamped_radiance, "object": log10_radiance
+}  # fmt: skip
+"""Tone curve of each metric of stated errors, by its name."""
 
 
 def load_or_render_reference(
@@ -209,7 +213,7 @@ def figures(view: RenderedView, reference: RawReference) -> dict[str, float]:
         "spp": float(view.spp),
         "at_cap": float(view.at_cap),
     }
-    for name, curve in _CURVES.items():
+    for name, curve in CURVES.items():
         pixels = view.hits if name == "object" else None
         true_db, open_db = true_error_db(view.radiance_rgb, reference, curve, pixels)
         excess_db = stated_db[name] - true_db
