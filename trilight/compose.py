@@ -338,12 +338,7 @@ class SceneBuilder:
                 roughness=material.roughness,
                 emissive=vector("emission", material.emission),
                 smooth_shading=material.smooth,
-                random_diffuse_max=1.0,
-                random_diffuse_type="per-triangle",
-                rand_tri_diffuse_seed=None,
             ),
-            remesh=False,
-            remesh_target_face_num=0,
         )
         self._objects.append(described)
         self._meshes.append(mesh)
