@@ -78,6 +78,12 @@ class Look:
         """The use of its layout: `fit`, `calibrate` or `judge`."""
         return use_of(self.layout)
 
+    def measures(self, metric: str) -> ErrorMeasures:
+        """Return the measures of its picture in a metric."""
+        errors = {name: self.figures[f"{metric}_{name}"] * 1e-6 for name in MEASURES}
+        share = self.figures[f"{metric}_block_agreement"]
+        return ErrorMeasures(**errors, block_agreement=share, hits=self.figures["hits"])
+
 
 def true_db(metric: str, looks: Sequence[Look]) -> Values:
     """Return the true error of each look in dB."""
@@ -95,21 +101,13 @@ def filter_known(metric: str, looks: Sequence[Look]) -> list[Look]:
     ]
 
 
-def six_terms(metric: str, look: Look) -> dict[str, float]:
-    """Return the terms of the product's statement, by name."""
-    errors = {name: look.figures[f"{metric}_{name}"] * 1e-6 for name in MEASURES}
-    share = look.figures[f"{metric}_block_agreement"]
-    measures = ErrorMeasures(**errors, block_agreement=share, hits=look.figures["hits"])
-    return terms_of(measures, look.px, look.figures["spp"])
-
-
-def fit_weights(metric: str, looks: Sequence[Look]) -> tuple[float, dict[str, float]]:
-    """Return intercept and weights by a ridge regression, weights of errors at least 0.
+def fit_weights(metric: str, looks: Sequence[Look]) -> MetricStatement:
+    """Return a statement without shifts by a ridge regression, weights of errors at least 0.
 
     Few rows give the geometric mean of MEASURES. Rows weigh less the less their true error is
     known.
     """
-    rows = [six_terms(metric, look) for look in looks]
+    rows = [terms_of(look.measures(metric), look.px, look.figures["spp"]) for look in looks]
     names = list(rows[0])
     design = np.array([[row[name] for name in names] for row in rows])
     ratio = [look.figures[f"{metric}_open"] / look.figures[f"{metric}_true"] for look in looks]
@@ -126,16 +124,19 @@ def fit_weights(metric: str, looks: Sequence[Look]) -> tuple[float, dict[str, fl
     free = ("hits", "samples", "width")
     least = [-np.inf if name in free else 0.0 for name in names]
     solution = lsq_linear(matrix, values, bounds=(least, np.inf)).x / spread
-    return middle - float(solution @ center), dict(zip(names, map(float, solution), strict=True))
+    return MetricStatement(
+        intercept=middle - float(solution @ center),
+        weights=dict(zip(names, map(float, solution), strict=True)),
+        bound={},
+        expected={},
+        judged={},
+    )
 
 
-def apply_weights(
-    metric: str, fitted: tuple[float, Mapping[str, float]], looks: Sequence[Look]
-) -> Values:
-    """Return what fitted weights say of each look, in dB."""
-    intercept, weights = fitted
-    rows = [six_terms(metric, look) for look in looks]
-    return np.array([intercept + sum(weights[name] * row[name] for name in row) for row in rows])
+def centers_db(metric: str, statement: MetricStatement, looks: Sequence[Look]) -> Values:
+    """Return what a statement says of each look without its shifts, in dB."""
+    taken = [(look.measures(metric), look.px, look.figures["spp"]) for look in looks]
+    return np.array([statement.center_db(*each) for each in taken])
 
 
 def cross_fitted(metric: str, looks: Sequence[Look]) -> Values:
@@ -145,7 +146,7 @@ def cross_fitted(metric: str, looks: Sequence[Look]) -> Values:
     for fold in np.unique(folds):
         mine = folds == fold
         fitted = fit_weights(metric, list(compress(looks, ~mine)))
-        stated[mine] = apply_weights(metric, fitted, list(compress(looks, mine)))
+        stated[mine] = centers_db(metric, fitted, list(compress(looks, mine)))
     return stated
 
 
@@ -208,7 +209,7 @@ def judge(metric: str, looks: Sequence[Look], stated_db: Values) -> JudgedShare:
 def fit_metric(metric: str, looks: Sequence[Look]) -> MetricStatement:
     """Return the statement of a metric, fitted and calibrated on the looks that do not judge."""
     mine = [look for look in filter_known(metric, looks) if look.use != "judge"]
-    intercept, weights = fit_weights(metric, mine)
+    fitted = fit_weights(metric, mine)
     crossed = cross_fitted(metric, mine)
     misses = true_db(metric, mine) - crossed
     groups = np.array([group_of(look.px) for look in mine])
@@ -219,12 +220,12 @@ def fit_metric(metric: str, looks: Sequence[Look]) -> MetricStatement:
             shift = largest_shift(metric, list(compress(mine, at)), crossed[at], allowed)
             bound[group] = round(shift, 3)
             expected[group] = round(float(np.median(misses[at])), 3)
-    statement = MetricStatement(
-        intercept=round(intercept, 4),
-        weights={name: round(value, 4) for name, value in weights.items()},
+    statement = replace(
+        fitted,
+        intercept=round(fitted.intercept, 4),
+        weights={name: round(value, 4) for name, value in fitted.weights.items()},
         bound=bound,
         expected=expected,
-        judged={},
     )
     judging = [look for look in filter_known(metric, looks) if look.use == "judge"]
     judged = {
@@ -237,9 +238,8 @@ def fit_metric(metric: str, looks: Sequence[Look]) -> MetricStatement:
 
 def stated_by(metric: str, statement: MetricStatement, looks: Sequence[Look]) -> Values:
     """Return the bound of each look in dB."""
-    center = apply_weights(metric, (statement.intercept, statement.weights), looks)
     shifts: Values = np.array([statement.bound[group_of(look.px)] for look in looks])
-    return center + shifts
+    return centers_db(metric, statement, looks) + shifts
 
 
 ROWS = ROOT / "docs" / "results" / "stated-errors.jsonl"

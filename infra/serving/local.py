@@ -301,8 +301,8 @@ def main(arguments: list[str]) -> None:
             _say(f"ended: {stop()} processes")
             return
         host = os.environ.get("TRILIGHT_HOST", "127.0.0.1")
-        port = whole_number(os.environ, "TRILIGHT_PORT", 4200, 65535)
-        workers = whole_number(os.environ, "TRILIGHT_WORKERS", 1, 1024)
+        port = whole_number("TRILIGHT_PORT", 4200, 65535)
+        workers = whole_number("TRILIGHT_WORKERS", 1, 1024)
         url = start(host=host, port=port, workers=workers)
         _say(f"Prefect: {url.removesuffix('/api')}; logs: {state_folder()}")
         # not the password itself, because output gets into recordings and logs

@@ -169,13 +169,16 @@ def test_cards_are_those_of_this_machine_or_of_all_workers(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     monkeypatch.setenv("CUDA_VISIBLE_DEVICES", "0,1,2")
-    assert limits({}) == {DISK_LIMIT: 2, GPU_LIMIT: 3}
-    assert limits({"TRILIGHT_CARDS": "16"})[GPU_LIMIT] == 16
-    for wrong in ("0", "-1", "many", "", "100001"):
-        with pytest.raises(TrilightError, match=f"TRILIGHT_CARDS is '{wrong}'; expected a whole"):
-            limits({"TRILIGHT_CARDS": wrong})
+    monkeypatch.delenv("TRILIGHT_CARDS", raising=False)
+    assert limits() == {DISK_LIMIT: 2, GPU_LIMIT: 3}
     monkeypatch.setenv("CUDA_VISIBLE_DEVICES", "")
-    assert limits({})[GPU_LIMIT] == 1  # a limit of 0 would let nothing begin
+    assert limits()[GPU_LIMIT] == 1  # a limit of 0 would let nothing begin
+    monkeypatch.setenv("TRILIGHT_CARDS", "16")
+    assert limits()[GPU_LIMIT] == 16
+    for wrong in ("0", "-1", "many", "", "100001"):
+        monkeypatch.setenv("TRILIGHT_CARDS", wrong)
+        with pytest.raises(TrilightError, match=f"TRILIGHT_CARDS is '{wrong}'; expected a whole"):
+            limits()
 
 
 URL = "http://127.0.0.1:4321/api"
