@@ -13,6 +13,7 @@ from train.settings import WatchSettings
 if TYPE_CHECKING:
     from train.progress import TrainProgress
     from train.run_training import TrainResult
+    from train.settings import TrainSettings
 
 
 def train_network(
@@ -57,9 +58,6 @@ def train_network(
             already holds a run.
     """
     require_torch("train_network")
-    from train.loop.distributed import DistributedContext, choose_device
-    from train.run_training import run_training
-
     settings = override_training_preset(run, changes or {}, steps=steps)
     start = StartOptions(
         resume=resume,
@@ -69,16 +67,31 @@ def train_network(
         lpips=lpips,
     )
     start.check(settings)
-    roots = [data] if isinstance(data, str | os.PathLike) else data
-    result = run_training(
+    return _train_alone(
         settings,
-        data=[os.fspath(root) for root in roots],
+        [data] if isinstance(data, str | os.PathLike) else data,
+        device=device,
         out=Path(out),
         start=start,
         workers=workers,
-        dist_context=DistributedContext(device=choose_device(device)),
         watched=watched,
         progress=progress,
     )
-    assert result is not None  # the only rank is the one that returns a result
+
+
+def _train_alone(
+    settings: "TrainSettings",
+    roots: Sequence[str | os.PathLike[str]],
+    *,
+    device: str | None,
+    **options: Any,
+) -> "TrainResult":
+    """Run `train.run_training.run_training` in this process as the only rank."""
+    from train.loop.distributed import DistributedContext, choose_device
+    from train.run_training import run_training
+
+    data = [os.fspath(root) for root in roots]
+    dist_context = DistributedContext(device=choose_device(device))
+    result = run_training(settings, data=data, dist_context=dist_context, **options)
+    assert result is not None  # rank 0 returns a result
     return result
