@@ -248,9 +248,8 @@ class SceneBuilder:
             TrilightError: invalid numbers.
         """
         name = self._unique_name("lamp")
-        middle, target = (
-            vector(f"{name}: {what}", value) for what, value in (("at", at), ("towards", towards))
-        )
+        middle = vector(f"{name}: at", at)
+        target = vector(f"{name}: towards", towards)
         if middle == target or not 0 < size < np.inf:
             raise TrilightError(
                 f"{name}: size is {size} and towards is {target} from {middle}; expected meters "

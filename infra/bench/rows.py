@@ -128,8 +128,7 @@ def _figures(column: Column, run: Run, point: Point) -> dict[str, float]:
 
 def _figures_by_trial(column: Column, run: Run, point: str) -> dict[str, float]:
     trials = {trial: run.trials[trial][point] for trial in run.whole_trials()}
-    name = column.figure
-    return {trial: figures[name] for trial, figures in trials.items() if name in figures}
+    return {trial: row[column.figure] for trial, row in trials.items() if column.figure in row}
 
 
 def _front(experiment: Experiment, known: Sequence[Row]) -> dict[str, bool]:
