@@ -16,10 +16,9 @@ from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
 
-from infra.bench.context import BenchContext
+from infra.bench.context import BenchContext, write_copies
 from infra.bench.experiment import BenchScale, Column, Experiment, Figures, Point, rounds
 from infra.bench.workloads.named_scenes import cost_scene
-from infra.bench.workloads.reading import write_copies
 from infra.bench.workloads.traced_pictures import fixed_samples, render_shot
 from infra.bench_options import BenchOptions
 from pipeline.renders.mitsuba_variant import activate, choose_variant
