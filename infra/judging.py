@@ -18,7 +18,6 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
-from infra.processor import processor
 from infra.render.methods import (
     BUILTIN_NETWORKS,
     compared_renderers,
@@ -39,6 +38,7 @@ from storage.atomic import write_atomically
 from storage.dataset.training_data import TrainingData, open_training_data
 from storage.digests import sha256_hex
 from storage.errors import TrilightError
+from storage.machine import processor
 from storage.records.safe_read import read_plain
 from storage.records.sample import Sample
 from storage.renderer import Renderer

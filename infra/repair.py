@@ -137,12 +137,16 @@ def _revisit_source(dataset: Dataset, command: Sequence[str]) -> str | None:
     if "revisit" not in settings:
         return None
     if (place := value_of(command, "--revisits")) is None:
-        raise TrilightError(
-            f"{dataset.display_name}: its scenes are those of the dataset "
-            f"{settings['revisit']['source_digest']}, and logs/asked.json does not say where that "
-            "is. Delete the bad shards, and run the same `trilight revisit` again."
-        )
+        digest = settings["revisit"]["source_digest"]
+        raise _forgotten(dataset, f"are those of the dataset {digest}", "revisit")
     return place
+
+
+def _forgotten(dataset: Dataset, scenes: str, command: str) -> TrilightError:
+    return TrilightError(
+        f"{dataset.display_name}: its scenes {scenes}, and logs/asked.json does not say where that "
+        f"is. Delete the bad shards, and run the same `trilight {command}` again."
+    )
 
 
 def _user_maps(
@@ -158,11 +162,7 @@ def _user_maps(
         name: value_of(command, f"--{name}") for kind, name in options.items() if kind in kinds
     }
     if None in folders.values():
-        raise TrilightError(
-            f"{dataset.display_name}: its scenes have textures or maps of a folder, and "
-            "logs/asked.json does not say where that is. Delete the bad shards, and run the same "
-            "`trilight generate` again."
-        )
+        raise _forgotten(dataset, "have textures or maps of a folder", "generate")
     return folders | ({"map_licence": value_of(command, "--map-licence")} if folders else {})
 
 

@@ -1,7 +1,7 @@
 """Location of our packages and files: in a checkout, or below `trilight` as a wheel installs them.
 
 A wheel moves the packages into `trilight`, so that a user's own `model` or `train` stays the user's
-(infra/setup/wheel_tree.py). Commands that name one of our modules take its name from here.
+(infra/setup/build_backend.py). Commands that name one of our modules take its name from here.
 """
 
 import os

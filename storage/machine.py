@@ -1,7 +1,11 @@
-"""Cores and memory that this process may use, by affinity, control groups and TRILIGHT_CORES."""
+"""Processor of this machine; cores and memory that this process may use.
+
+They are limited by affinity, control groups and TRILIGHT_CORES.
+"""
 
 import math
 import os
+import platform
 from collections.abc import Iterator
 from pathlib import Path
 
@@ -10,6 +14,12 @@ from storage.errors import TrilightError
 _ROOT = Path("/")
 _NO_LIMIT = 1 << 60
 """Threshold of memory limits: old control groups store a larger number for no limit."""
+
+
+def processor() -> str:
+    """Return the name of the processor; empty if the system does not state it."""
+    lines = [line for line in _lines(Path("/proc/cpuinfo")) if line.startswith("model name")]
+    return lines[0].split(":")[1].strip() if lines else platform.processor()
 
 
 def available_cores() -> int:

@@ -248,9 +248,8 @@ class SceneBuilder:
             TrilightError: invalid numbers.
         """
         name = self._unique_name("lamp")
-        middle, target = (
-            vector(f"{name}: {what}", value) for what, value in (("at", at), ("towards", towards))
-        )
+        middle = vector(f"{name}: at", at)
+        target = vector(f"{name}: towards", towards)
         if middle == target or not 0 < size < np.inf:
             raise TrilightError(
                 f"{name}: size is {size} and towards is {target} from {middle}; expected meters "
@@ -338,12 +337,7 @@ class SceneBuilder:
                 roughness=material.roughness,
                 emissive=vector("emission", material.emission),
                 smooth_shading=material.smooth,
-                random_diffuse_max=1.0,
-                random_diffuse_type="per-triangle",
-                rand_tri_diffuse_seed=None,
             ),
-            remesh=False,
-            remesh_target_face_num=0,
         )
         self._objects.append(described)
         self._meshes.append(mesh)

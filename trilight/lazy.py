@@ -9,7 +9,7 @@ def offered_names(file: str) -> dict[str, tuple[str, str]]:
 
     The exports are the imports under `if TYPE_CHECKING:`, so that type checkers and `import` read
     one list; `import join as joined` exports `joined`. The wheel's build rewrites them with all
-    other imports (infra/setup/wheel_tree.py).
+    other imports (infra/setup/build_backend.py).
 
     Args:
         file: the module's `__file__`.

@@ -8,13 +8,12 @@ import dataclasses
 import functools
 import os
 import tempfile
-from collections.abc import Callable
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Any, TypeVar
 
 from infra.bench.experiment import BenchScale
 from infra.bench.workloads.named_scenes import given_scenes, preset_scene, read_given
-from infra.bench.workloads.reading import Members, write_copies
 from infra.bench_options import BenchOptions
 from infra.planning import measure_scenes
 from infra.render.held_out_scenes import composing_child
@@ -25,13 +24,19 @@ from pipeline.isolation import ChildLimits, IsolatedChild
 from pipeline.presets.settings import DatasetSettings
 from pipeline.presets.training import smoke
 from storage.dataset.layout import DatasetFolder
+from storage.dataset.manifest import Manifest, index_shard, write_manifest
+from storage.dataset.shard import write_shard
 from storage.dataset.splits import shard_name
 from storage.dataset.staging import read_staged_scene
 from storage.dataset.training_data import TrainingData, open_training_data
+from storage.records.sample import sample_key
 from storage.records.scene import Scene
 
 _RENDERED = 3
 """Number of rendered scenes, fewer than a shard of the preset."""
+
+Members = Mapping[str, bytes]
+"""Files of a sample by name."""
 
 Result = TypeVar("Result")
 Closable = TypeVar("Closable", IsolatedChild, RenderChild)
@@ -124,3 +129,26 @@ class BenchContext:
         root = self.folder()
         write_copies(root, self.rendered)
         return open_training_data([str(root)])
+
+
+def write_copies(
+    root: Path, members: Sequence[Members], *, copies: int = 16, per_shard: int = 16
+) -> int:
+    """Write a dataset that holds each sample under many keys; return the number of samples.
+
+    Args:
+        root: folder of the dataset; it may be missing.
+        copies: number of keys of each sample.
+    """
+    folder = DatasetFolder(root)
+    every = [(sample_key(k), members[k % len(members)]) for k in range(copies * len(members))]
+    names = []
+    for number, start in enumerate(range(0, len(every), per_shard)):
+        names.append(f"train-{number:06d}.tar")
+        write_shard(folder.shard(names[-1]), every[start : start + per_shard])
+    manifest = Manifest(
+        build="bench", settings={}, environment={}, num_scenes=len(every), num_views=4,
+        objects_lock_sha256="", shards=tuple(index_shard(folder.shard(name)) for name in names),
+    )  # fmt: skip
+    write_manifest(folder.manifest, manifest)
+    return len(every)

@@ -95,8 +95,8 @@ class Column:
     """Name of the figure among those that a trial returns."""
     over: Over = "median"
     """Reduction of the figures of all trials to one number."""
-    then: Callable[[float], float] | None = None
-    """Conversion of that number, such as `3600 / seconds`; None leaves it as it is."""
+    then: Callable[[float], float] = float
+    """Conversion of that number, such as `3600 / seconds`; by default it stays as it is."""
 
 
 Measure = Callable[["BenchContext", str], Figures]

@@ -1,5 +1,6 @@
 """Table of a run, a row for each point with its Pareto front, and its plot."""
 
+import dataclasses
 from collections import defaultdict
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
@@ -44,7 +45,7 @@ class Row:
     """95 % interval of each column over `pair`, by name."""
     cost_range: tuple[float, float] | None
     """Smallest and largest cost over the trials; None for a single trial."""
-    on_front: bool | None
+    on_front: bool | None = None
     """True on the Pareto front of its group; None without an error, and for a yardstick."""
 
 
@@ -59,23 +60,12 @@ def rows_of(experiment: Experiment, run: Run) -> list[Row]:
             f"bench {experiment.name}: the file holds results of {run.plan['experiment']!r}; "
             "expected one experiment a file. Name another one by --out."
         )
-    points = [Point(**record) for record in run.plan["points"]]
-    reduced = {point.name: _values(experiment, run, point) for point in points}
-    values = {name: figures for name, (figures, _) in reduced.items()}
-    known = [point for point in points if values[point.name].get(experiment.cost.name, 0) > 0]
+    rows = [_row(experiment, run, Point(**record)) for record in run.plan["points"]]
+    known = [row for row in rows if row.values.get(experiment.cost.name, 0) > 0]
     if not known:
         raise TrilightError(f"bench {experiment.name}: no point was measured; run it again.")
-    front = _front(experiment, known, values)
-    return [
-        Row(
-            point=point,
-            values=values[point.name],
-            intervals=reduced[point.name][1],
-            cost_range=_cost_range(experiment, run, point.name),
-            on_front=front.get(point.name),
-        )
-        for point in known
-    ]
+    front = _front(experiment, known)
+    return [dataclasses.replace(row, on_front=front.get(row.point.name)) for row in known]
 
 
 def table_of(experiment: Experiment, run: Run) -> Iterator[list[str]]:
@@ -104,10 +94,8 @@ def _cell(column: Column, row: Row) -> str:
     return f"{value:.1f}" if "dB" in column.name else number_text(value)
 
 
-def _values(
-    experiment: Experiment, run: Run, point: Point
-) -> tuple[dict[str, float], dict[str, tuple[float, float]]]:
-    """Return the values of a point's columns, and the intervals of those over `pair`."""
+def _row(experiment: Experiment, run: Run, point: Point) -> Row:
+    """Return a point with the values of its columns, before fronts are known."""
     values = {}
     intervals = {}
     for column in columns_of(experiment):
@@ -122,8 +110,11 @@ def _values(
             value = interval[column.over == "high"]
         else:
             value = float(_OVER[column.over](taken))
-        values[column.name] = column.then(value) if column.then else value
-    return values, intervals
+        values[column.name] = column.then(value)
+    costs = _figures_by_trial(experiment.cost, run, point.name).values()
+    ordered = sorted(map(experiment.cost.then, costs))
+    cost_range = (ordered[0], ordered[-1]) if len(ordered) > 1 else None
+    return Row(point=point, values=values, intervals=intervals, cost_range=cost_range)
 
 
 def _figures(column: Column, run: Run, point: Point) -> dict[str, float]:
@@ -137,39 +128,26 @@ def _figures(column: Column, run: Run, point: Point) -> dict[str, float]:
 
 def _figures_by_trial(column: Column, run: Run, point: str) -> dict[str, float]:
     trials = {trial: run.trials[trial][point] for trial in run.whole_trials()}
-    name = column.figure
-    return {trial: figures[name] for trial, figures in trials.items() if name in figures}
+    return {trial: row[column.figure] for trial, row in trials.items() if column.figure in row}
 
 
-def _cost_range(experiment: Experiment, run: Run, point: str) -> tuple[float, float] | None:
-    column = experiment.cost
-    costs = _figures_by_trial(column, run, point).values()
-    if len(costs) < 2:
-        return None
-    least, most = sorted(column.then(c) if column.then else c for c in (min(costs), max(costs)))
-    return least, most
-
-
-def _front(
-    experiment: Experiment, known: Sequence[Point], values: Mapping[str, Mapping[str, float]]
-) -> dict[str, bool]:
+def _front(experiment: Experiment, known: Sequence[Row]) -> dict[str, bool]:
     """Return by name whether a point is on the Pareto front of its group."""
     if experiment.error is None:
         return {}
     error = experiment.error.name
     sign = -1 if experiment.better == "higher" else 1
     costs = (experiment.cost.name, *experiment.also_cost)
+    groups = defaultdict[str, list[Row]](list)
+    for row in known:
+        if row.point.judged and error in row.values:
+            groups[row.point.group].append(row)
     front = dict[str, bool]()
-    for group in dict.fromkeys(point.group for point in known):
-        names = [
-            point.name
-            for point in known
-            if point.group == group and point.judged and error in values[point.name]
-        ]
-        figures = [
-            (sign * values[name][error], [values[name][cost] for cost in costs]) for name in names
-        ]
-        front |= dict(zip(names, on_front(figures), strict=True))
+    for rows in groups.values():
+        marks = on_front(
+            [(sign * row.values[error], [row.values[cost] for cost in costs]) for row in rows]
+        )
+        front |= zip([row.point.name for row in rows], marks, strict=True)
     return front
 
 

@@ -30,9 +30,9 @@ from infra.bench.experiment import (
 )
 from infra.bench.rows import plot
 from infra.bench_options import BenchOptions
-from infra.processor import processor
 from pipeline.isolation import ChildFailed
 from storage.errors import Rejected, TrilightError
+from storage.machine import processor
 
 ROOT = Path(__file__).parents[2]
 RESULTS = ROOT / "docs" / "results" / "bench"

@@ -13,6 +13,7 @@ import math
 import sys
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass, replace
+from itertools import compress
 from pathlib import Path
 
 import numpy as np
@@ -77,6 +78,12 @@ class Look:
         """The use of its layout: `fit`, `calibrate` or `judge`."""
         return use_of(self.layout)
 
+    def measures(self, metric: str) -> ErrorMeasures:
+        """Return the measures of its picture in a metric."""
+        errors = {name: self.figures[f"{metric}_{name}"] * 1e-6 for name in MEASURES}
+        share = self.figures[f"{metric}_block_agreement"]
+        return ErrorMeasures(**errors, block_agreement=share, hits=self.figures["hits"])
+
 
 def true_db(metric: str, looks: Sequence[Look]) -> Values:
     """Return the true error of each look in dB."""
@@ -94,31 +101,17 @@ def filter_known(metric: str, looks: Sequence[Look]) -> list[Look]:
     ]
 
 
-def open_db(metric: str, looks: Sequence[Look]) -> Values:
-    """Return how far the true error of each look is known, in dB."""
-    ratio = [look.figures[f"{metric}_open"] / look.figures[f"{metric}_true"] for look in looks]
-    db: Values = 10 * np.log10(1 + np.array(ratio))
-    return db
-
-
-def six_terms(metric: str, look: Look) -> dict[str, float]:
-    """Return the terms of the product's statement, by name."""
-    errors = {name: look.figures[f"{metric}_{name}"] * 1e-6 for name in MEASURES}
-    share = look.figures[f"{metric}_block_agreement"]
-    measures = ErrorMeasures(**errors, block_agreement=share, hits=look.figures["hits"])
-    return terms_of(measures, look.px, look.figures["spp"])
-
-
-def fit_weights(metric: str, looks: Sequence[Look]) -> tuple[float, dict[str, float]]:
-    """Return intercept and weights by a ridge regression, weights of errors at least 0.
+def fit_weights(metric: str, looks: Sequence[Look]) -> MetricStatement:
+    """Return a statement without shifts by a ridge regression, weights of errors at least 0.
 
     Few rows give the geometric mean of MEASURES. Rows weigh less the less their true error is
     known.
     """
-    rows = [six_terms(metric, look) for look in looks]
+    rows = [terms_of(look.measures(metric), look.px, look.figures["spp"]) for look in looks]
     names = list(rows[0])
     design = np.array([[row[name] for name in names] for row in rows])
-    weight = 1 / (0.5 + np.square(open_db(metric, looks)))
+    ratio = [look.figures[f"{metric}_open"] / look.figures[f"{metric}_true"] for look in looks]
+    weight = 1 / (0.5 + np.square(10 * np.log10(1 + np.array(ratio))))
     center = np.average(design, axis=0, weights=weight)
     spread = np.sqrt(np.average(np.square(design - center), axis=0, weights=weight)) + 1e-9
     target = true_db(metric, looks)
@@ -131,30 +124,36 @@ def fit_weights(metric: str, looks: Sequence[Look]) -> tuple[float, dict[str, fl
     free = ("hits", "samples", "width")
     least = [-np.inf if name in free else 0.0 for name in names]
     solution = lsq_linear(matrix, values, bounds=(least, np.inf)).x / spread
-    return middle - float(solution @ center), dict(zip(names, map(float, solution), strict=True))
+    return MetricStatement(
+        intercept=middle - float(solution @ center),
+        weights=dict(zip(names, map(float, solution), strict=True)),
+        bound={},
+        expected={},
+        judged={},
+    )
 
 
-def apply_weights(
-    metric: str, fitted: tuple[float, Mapping[str, float]], looks: Sequence[Look]
-) -> Values:
-    """Return what fitted weights say of each look, in dB."""
-    intercept, weights = fitted
-    rows = [six_terms(metric, look) for look in looks]
-    return np.array([intercept + sum(weights[name] * row[name] for name in row) for row in rows])
+def centers_db(metric: str, statement: MetricStatement, looks: Sequence[Look]) -> Values:
+    """Return what a statement says of each look without its shifts, in dB."""
+    taken = [(look.measures(metric), look.px, look.figures["spp"]) for look in looks]
+    return np.array([statement.center_db(*each) for each in taken])
 
 
 def cross_fitted(metric: str, looks: Sequence[Look]) -> Values:
     """Return of each look what weights say that were fitted on other layouts, in dB."""
-    layouts = sorted({look.layout for look in looks})
-    fold = {layout: number % _FOLDS for number, layout in enumerate(layouts)}
+    folds = _layout_numbers(looks) % _FOLDS
     stated = np.zeros(len(looks))
-    for number in range(_FOLDS):
-        mine = [row for row, look in enumerate(looks) if fold[look.layout] == number]
-        rest = [look for look in looks if fold[look.layout] != number]
-        if mine:
-            fitted = fit_weights(metric, rest)
-            stated[mine] = apply_weights(metric, fitted, [looks[row] for row in mine])
+    for fold in np.unique(folds):
+        mine = folds == fold
+        fitted = fit_weights(metric, list(compress(looks, ~mine)))
+        stated[mine] = centers_db(metric, fitted, list(compress(looks, mine)))
     return stated
+
+
+def _layout_numbers(looks: Sequence[Look]) -> NDArray[np.int64]:
+    """Return the number of each look's layout, counted from 0 in the order of the layouts."""
+    numbers: NDArray[np.int64] = np.unique([look.layout for look in looks], return_inverse=True)[1]
+    return numbers
 
 
 def stops(metric: str, looks: Sequence[Look], stated_db: Values) -> list[int]:
@@ -180,31 +179,19 @@ def largest_shift(metric: str, looks: Sequence[Look], stated_db: Values, allowed
     The risk is the share of pictures over 1 dB worse than stated, averaged over layouts: of all
     looks, or of those at which sampling stops, whichever is larger.
     """
-    rows = np.array([look.layout for look in looks])
-    layouts = sorted(set(rows.tolist()))
+    layouts = _layout_numbers(looks)
     truth = true_db(metric, looks)
-    for shift in _GRID_DB:
+
+    def risk(shift: float) -> float:
         stated = stated_db + shift
-        wrong = (stated - truth > 1).astype(np.float64)
-        risks = []
-        for chosen in (range(len(looks)), stops(metric, looks, stated)):
-            at = np.array(chosen)
-            by_layout = [wrong[at][rows[at] == each].mean() for each in layouts]
-            risks.append(float(np.mean(by_layout)))
-        if max(risks) <= allowed:
-            return float(shift)
-    return float(_GRID_DB[-1])
+        wrong = stated - truth > 1
+        risks = [
+            np.mean(np.bincount(layouts[at], wrong[at]) / np.bincount(layouts[at]))
+            for at in (np.arange(len(looks)), stops(metric, looks, stated))
+        ]
+        return float(max(risks))
 
-
-def shifts_of(metric: str, looks: Sequence[Look], stated_db: Values) -> dict[str, float]:
-    """Return the `largest_shift` of each group of widths that has looks."""
-    shifts = {}
-    for group, allowed in ALLOWED[metric].items():
-        at = [row for row, look in enumerate(looks) if group_of(look.px) == group]
-        if at:
-            some = [looks[row] for row in at]
-            shifts[group] = largest_shift(metric, some, stated_db[at], allowed)
-    return shifts
+    return next((float(shift) for shift in _GRID_DB if risk(shift) <= allowed), float(_GRID_DB[-1]))
 
 
 def judge(metric: str, looks: Sequence[Look], stated_db: Values) -> JudgedShare:
@@ -222,33 +209,37 @@ def judge(metric: str, looks: Sequence[Look], stated_db: Values) -> JudgedShare:
 def fit_metric(metric: str, looks: Sequence[Look]) -> MetricStatement:
     """Return the statement of a metric, fitted and calibrated on the looks that do not judge."""
     mine = [look for look in filter_known(metric, looks) if look.use != "judge"]
-    intercept, weights = fit_weights(metric, mine)
+    fitted = fit_weights(metric, mine)
     crossed = cross_fitted(metric, mine)
-    bound = shifts_of(metric, mine, crossed)
-    groups = np.array([group_of(look.px) for look in mine])
     misses = true_db(metric, mine) - crossed
-    statement = MetricStatement(
-        intercept=round(intercept, 4),
-        weights={name: round(value, 4) for name, value in weights.items()},
-        bound={group: round(shift, 3) for group, shift in bound.items()},
-        expected={group: round(float(np.median(misses[groups == group])), 3) for group in bound},
-        judged={},
+    groups = np.array([group_of(look.px) for look in mine])
+    bound = {}
+    expected = {}
+    for group, allowed in ALLOWED[metric].items():
+        if (at := groups == group).any():
+            shift = largest_shift(metric, list(compress(mine, at)), crossed[at], allowed)
+            bound[group] = round(shift, 3)
+            expected[group] = round(float(np.median(misses[at])), 3)
+    statement = replace(
+        fitted,
+        intercept=round(fitted.intercept, 4),
+        weights={name: round(value, 4) for name, value in fitted.weights.items()},
+        bound=bound,
+        expected=expected,
     )
     judging = [look for look in filter_known(metric, looks) if look.use == "judge"]
-    by_width = {px: [look for look in judging if look.px == px] for px in LOOKS}
     judged = {
         str(px): judge(metric, some, stated_by(metric, statement, some))
-        for px, some in by_width.items()
-        if some
+        for px in LOOKS
+        if (some := [look for look in judging if look.px == px])
     }
     return replace(statement, judged=judged)
 
 
 def stated_by(metric: str, statement: MetricStatement, looks: Sequence[Look]) -> Values:
     """Return the bound of each look in dB."""
-    center = apply_weights(metric, (statement.intercept, statement.weights), looks)
     shifts: Values = np.array([statement.bound[group_of(look.px)] for look in looks])
-    return center + shifts
+    return centers_db(metric, statement, looks) + shifts
 
 
 ROWS = ROOT / "docs" / "results" / "stated-errors.jsonl"

@@ -22,6 +22,8 @@ import numpy as np
 from mathutils import Matrix
 
 _PREFIX = "trilight:"
+_VISIBLE = f"{_PREFIX}visibleToCamera"
+"""Property of an emitter, on the object or on its data."""
 
 _GLOSS = "Trilight gloss"
 _SUM = "Trilight sum"
@@ -36,9 +38,10 @@ def restore_scene() -> tuple[int, int]:
         restore_material(material)
     emitters = 0
     for item in bpy.data.objects:
-        visible = property_of(item, "visibleToCamera")
-        if item.type == "MESH" and visible is not None:
-            item.visible_camera = bool(visible)
+        marked = [each for each in (item, item.data) if each is not None and _VISIBLE in each]
+        if item.type == "MESH" and marked:
+            visible = bool(marked[0][_VISIBLE])
+            item.visible_camera = visible
             # Blender lifts shadow rays off coarse triangles; Trilight traces them as they are
             item.shadow_terminator_geometry_offset = 0.0
             emitters += not visible
@@ -94,14 +97,6 @@ def interpolate_linear_values(image: Any) -> Any:
     held.pixels.foreach_set(linear.astype(np.float32))
     held.pack()
     return held
-
-
-def property_of(item: Any, name: str) -> Any:
-    """Return a Trilight property of an object or of its data; None where there is none."""
-    for holder in (item, item.data):
-        if holder is not None and _PREFIX + name in holder:
-            return holder[_PREFIX + name]
-    return None
 
 
 def restore_material(material: Any) -> None:

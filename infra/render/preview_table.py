@@ -19,7 +19,6 @@ from typing import Annotated, Any, Literal
 
 import numpy as np
 
-from infra.processor import processor
 from infra.render.quality import Budget, samples_text
 from pipeline.renders.mitsuba_variant import Variant
 from pipeline.renders.preview import MOST_SPP, SCENE, PreviewSettings, preview_parts
@@ -28,7 +27,7 @@ from storage.atomic import write_atomically
 from storage.cache import cache_folder
 from storage.digests import canonical_json
 from storage.errors import TrilightError
-from storage.machine import available_cores
+from storage.machine import available_cores, processor
 from storage.metrics import MAX_DB
 from storage.settings.described import checked, from_record, settings_record
 from storage.settings.ranges import Within

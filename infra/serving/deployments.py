@@ -14,7 +14,6 @@ import importlib
 import json
 import os
 import sys
-from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
@@ -38,7 +37,7 @@ def deploy(name: str, template: Path) -> None:
     Raises:
         TrilightError: the server refuses or does not answer, or TRILIGHT_CARDS is no number.
     """
-    slots = limits(os.environ)
+    slots = limits()
     load_prefect()
     from prefect.client.schemas.actions import WorkPoolCreate
 
@@ -83,23 +82,22 @@ def _deploy_flow(row: dict[str, Any]) -> None:
     deployment.apply()
 
 
-def limits(environment: Mapping[str, str]) -> dict[str, int]:
+def limits() -> dict[str, int]:
     """Return the number of slots by limit, at least 1: a limit of 0 would block every flow.
 
-    Args:
-        environment: TRILIGHT_CARDS is the number of GPUs of all workers, if these have others than
-            this machine.
+    The variable TRILIGHT_CARDS is the number of GPUs of all workers, if these have others than this
+    machine.
 
     Raises:
         TrilightError: TRILIGHT_CARDS is no number of GPUs.
     """
-    cards = whole_number(environment, "TRILIGHT_CARDS", len(visible_gpus()) or 1, _MOST_CARDS)
+    cards = whole_number("TRILIGHT_CARDS", len(visible_gpus()) or 1, _MOST_CARDS)
     return {DISK_LIMIT: _DISK_SLOTS, GPU_LIMIT: cards}
 
 
-def whole_number(environment: Mapping[str, str], name: str, default: int, most: int) -> int:
+def whole_number(name: str, default: int, most: int) -> int:
     """Return the number of an environment variable; raises TrilightError for other text."""
-    text = environment.get(name, str(default))
+    text = os.environ.get(name, str(default))
     if not (text.isascii() and text.isdecimal()) or not 1 <= int(text) <= most:
         raise TrilightError(f"{name} is {text!r}; expected a whole number from 1 to {most}.")
     return int(text)

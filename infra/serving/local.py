@@ -153,8 +153,10 @@ def start(*, host: str, port: int, workers: int) -> str:
         process = _launch("server", server, environment)
         wait_until_healthy(url, process, _log("server"), _say)
         _say(f"making the pool `{POOL}`, its limits and the deployments")
-        deploy = [sys.executable, "-m", f"{__package__}.deployments", POOL]
-        _call([*deploy, "infra/serving/pool.json"], environment)
+        deploy = ["-m", f"{__package__}.deployments", POOL, "infra/serving/pool.json"]
+        if _launch("deployments", [sys.executable, *deploy], environment).wait():
+            last = _log("deployments").read_text().strip().rpartition("\n")[2]
+            raise TrilightError(f"python {' '.join(deploy)} failed: {last}")
         _say(f"starting {workers} worker{'s' if workers > 1 else ''}")
         for number, share in enumerate(shares):
             name = f"worker-{number}"
@@ -229,21 +231,6 @@ def running(*, without: str | None = None) -> list[int]:
     return pids
 
 
-def _call(command: Sequence[str], environment: Mapping[str, str]) -> None:
-    done = subprocess.run(
-        command,
-        cwd=ROOT,
-        env=environment,
-        stdin=subprocess.DEVNULL,
-        capture_output=True,
-        text=True,
-        check=False,
-    )
-    if done.returncode:
-        last = (done.stderr.strip() or done.stdout.strip()).splitlines()[-1:]
-        raise TrilightError(f"{' '.join(command)} failed: {' '.join(last)}")
-
-
 def _launch(
     name: str, command: Sequence[str], environment: Mapping[str, str]
 ) -> "subprocess.Popen[bytes]":
@@ -314,8 +301,8 @@ def main(arguments: list[str]) -> None:
             _say(f"ended: {stop()} processes")
             return
         host = os.environ.get("TRILIGHT_HOST", "127.0.0.1")
-        port = whole_number(os.environ, "TRILIGHT_PORT", 4200, 65535)
-        workers = whole_number(os.environ, "TRILIGHT_WORKERS", 1, 1024)
+        port = whole_number("TRILIGHT_PORT", 4200, 65535)
+        workers = whole_number("TRILIGHT_WORKERS", 1, 1024)
         url = start(host=host, port=port, workers=workers)
         _say(f"Prefect: {url.removesuffix('/api')}; logs: {state_folder()}")
         # not the password itself, because output gets into recordings and logs

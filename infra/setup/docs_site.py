@@ -35,11 +35,7 @@ def on_files(files: Files, config: Any) -> Files:
             if target in known or target.startswith("docs/") or not (ROOT / target).is_file():
                 continue
             known.add(target)
-            if target.endswith(PICTURES):
-                source = str(ROOT / target)
-                added = File.generated(config, _site_uri(target), abs_src_path=source)
-            else:
-                added = File.generated(config, _site_uri(target), content=_source_page(target))
+            added = File.generated(config, _site_uri(target), content=_source_page(target))
             added.inclusion = InclusionLevel.NOT_IN_NAV
             files.append(added)
             if target.endswith(".md"):
@@ -83,7 +79,10 @@ def _site_uri(path: str) -> str:
     return f"source/{path}" if path.endswith((".md", *PICTURES)) else f"source/{path}.md"
 
 
-def _source_page(path: str) -> str:
+def _source_page(path: str) -> str | bytes:
+    """Return a picture as it is, and another file as a page of Markdown."""
+    if path.endswith(PICTURES):
+        return (ROOT / path).read_bytes()
     text = (ROOT / path).read_text()
     if path.endswith(".md"):
         return text

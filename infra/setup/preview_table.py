@@ -17,7 +17,6 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from infra.processor import processor
 from infra.render.held_out_scenes import composing_child, held_out_scene, held_out_settings
 from infra.render.machine_costs import PROBES
 from infra.render.methods import SAMPLE_SEED
@@ -45,6 +44,7 @@ from pipeline.renders.settings import Filtered
 from storage.atomic import write_atomically
 from storage.conventions import log10_radiance
 from storage.errors import Rejected
+from storage.machine import processor
 from storage.records.scene import Scene
 from storage.renderer import Camera, Renderer
 from storage.settings.described import settings_record

@@ -13,17 +13,17 @@ from pathlib import Path
 
 import pytest
 
-from infra.setup import wheel_tree
+from infra.setup import build_backend
 from tests.command_line import run_program
 from tests.conftest import ROOT
 
-PACKAGES = ("trilight", *wheel_tree.PACKAGES)
+PACKAGES = ("trilight", *build_backend.PACKAGES)
 MAX_FILE_LINES = 600
 MAX_FUNCTION_LINES = 60
 DOCSTRING = re.compile(r'(?:#[^\n]*\n|\s)*[rR]?"""\s*\S')
 """How a module begins that says what it is."""
-IMPORTS = re.compile(rf"\b(?:from|import) (?:{'|'.join(wheel_tree.PACKAGES)})\b(?:\.| import)")
-MODULE = re.compile(rf"(?:{'|'.join(wheel_tree.PACKAGES)})(?:\.[a-z_0-9]+)+")
+IMPORTS = re.compile(rf"\b(?:from|import) (?:{'|'.join(build_backend.PACKAGES)})\b(?:\.| import)")
+MODULE = re.compile(rf"(?:{'|'.join(build_backend.PACKAGES)})(?:\.[a-z_0-9]+)+")
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -22,7 +22,7 @@ from pathlib import Path
 
 import pytest
 
-from infra.setup.wheel_tree import PACKAGES
+from infra.setup.build_backend import PACKAGES
 from tests.conftest import ROOT
 
 LIST = Path(__file__).parent / "mutants.jsonl"

@@ -15,7 +15,7 @@ import pytest
 from PIL import Image
 
 import trilight
-from infra.setup.wheel_tree import PACKAGES
+from infra.setup.build_backend import PACKAGES
 from pipeline.objects.generated import encode_ply
 from pipeline.renders.mitsuba_variant import Variant
 from storage.errors import TrilightError

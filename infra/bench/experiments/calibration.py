@@ -9,17 +9,18 @@ first trials of an unfinished run are balanced too.
 """
 
 import dataclasses
-import functools
-from collections.abc import Mapping
 from functools import partial
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 
 from infra.bench.context import BenchContext
 from infra.bench.experiment import BenchScale, Column, Experiment, Figures, Point
-from infra.bench.workloads.traced_pictures import load_or_render_reference, shrink_reference
+from infra.bench.workloads.traced_pictures import (
+    CURVES,
+    load_or_render_reference,
+    shrink_reference,
+)
 from infra.bench_options import BenchOptions
 from infra.render.held_out_scenes import first_composed
 from infra.render.raw_references import RawReference, first_camera, true_error
@@ -27,21 +28,16 @@ from pipeline.isolation import IsolatedChild
 from pipeline.objects.generated import BENCHMARK, PREFIX
 from pipeline.presets.training import smoke
 from pipeline.renders.calibrated_error import MEASURES, METRICS, versions_of_pictures
-from pipeline.renders.noise_floor import Curve, clamped_radiance
 from pipeline.renders.pictures import ViewPictures
 from pipeline.renders.renderer import SceneRenderer
 from pipeline.renders.settings import Filtered, RenderSettings
 from pipeline.renders.view_pictures import MeasuredLook
 from scene_templates.settings import SceneSettings
-from storage.conventions import log10_radiance
 from storage.dataset.splits import JUDGED_SPLIT
 from storage.digests import canonical_json, sha256_hex
 from storage.records.scene import Scene
 from storage.settings.overrides import apply_overrides
 
-CURVES: Mapping[str, Curve] = {
-    "log": log10_radiance, "linear": clamped_radiance, "object": log10_radiance
-}  # fmt: skip
 _MEASURED = (*MEASURES, "block_agreement")
 """Fields of ErrorMeasures beside the share of hits."""
 
@@ -65,59 +61,36 @@ def record_looks(
         seed: of the samples.
     """
     looks: list[dict[str, float]] = []
-    renderer = _RecordingRenderer(scene, settings, reference, looks)
+
+    class RecordingPictures(ViewPictures):
+        """Pictures in numpy that append the figures of each look to the list."""
+
+        def look(self, quality: Filtered) -> MeasuredLook:
+            look = super().look(quality)
+            (picture,) = pictures = self.finish()
+            measured = self._measures(self._numbers(pictures))
+            row = {
+                "spp": float(self._samples.spp),
+                "hits": float(self.hits.mean()),
+                "bound_log": look.floor.log_db,
+                "bound_linear": look.floor.linear_db,
+                "bound_object": look.floor.object_log_db,
+            }
+            everywhere = np.ones_like(self.hits)
+            for metric, curve in CURVES.items():
+                pixels = self.hits if metric == "object" and self.hits.any() else everywhere
+                true, open_error = true_error(picture, reference, curve, pixels)
+                errors = {name: getattr(measured[metric], name) for name in _MEASURED}
+                errors |= {"true": true, "open": open_error}
+                row |= {f"{metric}_{name}": 1e6 * value for name, value in errors.items()}
+                row[f"{metric}_block_agreement"] /= 1e6  # a share
+            looks.append({name: float(f"{row[name]:.4g}") for name in FIGURES})
+            return look
+
+    renderer = SceneRenderer(scene, settings)
+    renderer._arithmetic = RecordingPictures
     renderer.render_view(scene.c2w[0], float(scene.fov_deg[0]), seed)
     return looks
-
-
-class _RecordingRenderer(SceneRenderer):
-    """Renderer whose pictures note what they measure at every look."""
-
-    def __init__(
-        self,
-        scene: Scene,
-        settings: RenderSettings,
-        reference: RawReference,
-        looks: list[dict[str, float]],
-    ) -> None:
-        super().__init__(scene, settings)
-        self._arithmetic = functools.partial(_RecordingPictures, reference, looks)
-        self._arithmetic.mean_radiance = ViewPictures.mean_radiance
-
-
-class _RecordingPictures(ViewPictures):
-    """Pictures in numpy that append the figures of each look to a list."""
-
-    def __init__(self, reference: RawReference, looks: list[dict[str, float]], *rest: Any) -> None:
-        super().__init__(*rest)
-        self._reference = reference
-        self._recorded = looks
-
-    def look(self, quality: Filtered) -> MeasuredLook:
-        """Measure, and record what was measured."""
-        look = super().look(quality)
-        (picture,) = pictures = self.finish()
-        measured = self._measures(self._numbers(pictures))
-        row = {
-            "spp": float(self._samples.spp),
-            "hits": float(self.hits.mean()),
-            "bound_log": look.floor.log_db,
-            "bound_linear": look.floor.linear_db,
-            "bound_object": look.floor.object_log_db,
-        }
-        everywhere = np.ones_like(self.hits)
-        for metric in METRICS:
-            curve = CURVES[metric]
-            objects = metric == "object"
-            measures = measured[metric]
-            pixels = self.hits if objects and self.hits.any() else everywhere
-            true, open_error = true_error(picture, self._reference, curve, pixels)
-            errors = {name: getattr(measures, name) for name in _MEASURED}
-            errors |= {"true": true, "open": open_error}
-            row |= {f"{metric}_{name}": 1e6 * value for name, value in errors.items()}
-            row[f"{metric}_block_agreement"] /= 1e6  # a share
-        self._recorded.append({name: float(f"{row[name]:.4g}") for name in FIGURES})
-        return look
 
 
 def unreachable(settings: RenderSettings, resolution: int, max_spp: int) -> RenderSettings:

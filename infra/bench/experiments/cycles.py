@@ -21,7 +21,6 @@ from infra.bench_options import BenchOptions
 from infra.render.raw_references import RawReference, first_camera, raw_reference, true_error_db
 from pipeline.presets.training import object_views
 from pipeline.renders.noise_floor import clamped_radiance
-from pipeline.renders.renderer import RenderedView
 from pipeline.renders.settings import USUAL_FLOOR_DB
 from pipeline.renders.tracer import pixel_camera
 from storage.conventions import log10_radiance
@@ -82,10 +81,15 @@ def _measure(kind: str, context: BenchContext, trial: str) -> Figures:
     pictures, core_s = render_with_cycles(scene, RESOLUTION, spp, seeds=(0, 1))
     a_rgb, b_rgb = (picture.astype(np.float64) for picture in pictures)
     theirs = RawReference(a_rgb=a_rgb, b_rgb=b_rgb)
+    true_db = {
+        f"to_{name}_db": true_error_db(view.radiance_rgb, reference, log10_radiance)[0]
+        for name, reference in (("ours", ours), ("theirs", theirs))
+    }
     return {
         "core_s": core_s,
         **agreement_figures(ours, theirs),
-        **_stated_figures(view, ours, theirs),
+        "stated_db": view.noise_floor_db,
+        **true_db,
     }
 
 
@@ -153,17 +157,6 @@ def agreement_figures(ours: RawReference, theirs: RawReference) -> dict[str, flo
 
 def _linear_db(one: NDArray[np.float64], other: NDArray[np.float64]) -> float:
     return float(psnr_linear_db(one.astype(np.float32), other.astype(np.float32)))
-
-
-def _stated_figures(
-    view: RenderedView, ours: RawReference, theirs: RawReference
-) -> dict[str, float]:
-    """Return a picture's stated error, and its true errors to Trilight's and Cycles' samples."""
-    figures = {"stated_db": view.noise_floor_db}
-    for name, reference in (("ours", ours), ("theirs", theirs)):
-        error_db, _ = true_error_db(view.radiance_rgb, reference, log10_radiance)
-        figures[f"to_{name}_db"] = error_db
-    return figures
 
 
 EXPERIMENT = Experiment(

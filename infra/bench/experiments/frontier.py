@@ -239,13 +239,13 @@ def cost_at_error(levels: Sequence[tuple[float, float, float]], db: float) -> tu
     return core_s_below + slope * (spp - spp_below), 0
 
 
-_STATED: tuple[tuple[str, str, Over, Callable[[float], float] | None], ...] = (
+_STATED: tuple[tuple[str, str, Over, Callable[[float], float]], ...] = (
     ("over 1 dB worse than stated, %", "over_1", "mean", percent),
     ("95 % interval from, %", "over_1", "low", percent),
     ("to, %", "over_1", "high", percent),
     ("over 3 dB, %", "over_3", "mean", percent),
-    ("caution, median dB", "caution_db", "median", None),
-    ("worst dB", "caution_db", "least", None),
+    ("caution, median dB", "caution_db", "median", float),
+    ("worst dB", "caution_db", "least", float),
 )
 
 _WRONG = tuple(

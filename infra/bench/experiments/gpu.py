@@ -39,18 +39,10 @@ def _points(scale: BenchScale, options: BenchOptions) -> list[Point]:
 
 
 def _runs(scale: BenchScale, options: BenchOptions) -> Sequence[str]:
-    if unknown := [name for name in options.run if name not in TRAINING_PRESETS]:
-        raise TrilightError(
-            f"bench gpu: --run {unknown[0]!r} is no training preset; expected some of "
-            f"{', '.join(sorted(TRAINING_PRESETS))}."
-        )
-    if options.run:
-        return options.run
-    return (
-        _QUICK_RUNS
-        if scale.name == "quick"
-        else [name for name in TRAINING_PRESETS if TRAINING_PRESETS.is_ours(name)]
-    )
+    for name in options.run:
+        TRAINING_PRESETS.find(name)  # refuses an unknown one before anything is measured
+    ours = [name for name in TRAINING_PRESETS if TRAINING_PRESETS.is_ours(name)]
+    return options.run or (_QUICK_RUNS if scale.name == "quick" else ours)
 
 
 def _measure(work: Sequence[str], context: BenchContext, trial: str) -> Figures:

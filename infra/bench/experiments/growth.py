@@ -9,7 +9,6 @@ import os
 import subprocess
 import sys
 import tempfile
-import threading
 import time
 from collections.abc import Callable, Mapping
 from contextlib import closing
@@ -17,10 +16,9 @@ from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
 
-from infra.bench.context import BenchContext
+from infra.bench.context import BenchContext, write_copies
 from infra.bench.experiment import BenchScale, Column, Experiment, Figures, Point, rounds
 from infra.bench.workloads.named_scenes import cost_scene
-from infra.bench.workloads.reading import write_copies
 from infra.bench.workloads.traced_pictures import fixed_samples, render_shot
 from infra.bench_options import BenchOptions
 from pipeline.renders.mitsuba_variant import activate, choose_variant
@@ -62,20 +60,20 @@ def measure_work(name: str, size: int, folder: Path) -> dict[str, float]:
         words, cwd=IMPORT_ROOT, env=child_environment(), stdout=subprocess.PIPE,
         stderr=subprocess.STDOUT, text=True, start_new_session=True,
     ) as process:  # fmt: skip
-        peak = [0]
-        done = threading.Event()
-        watch = threading.Thread(target=_watch_memory, args=(process.pid, peak, done))
-        watch.start()
-        output, _ = process.communicate()
-        done.set()
-        watch.join()
+        peak_bytes = 0
+        output = None
+        while output is None:
+            try:
+                output, _ = process.communicate(timeout=_SAMPLING_S)
+            except subprocess.TimeoutExpired:  # nothing that it has written is lost
+                peak_bytes = max(peak_bytes, session_bytes(process.pid))
     if process.returncode:
         said = output.strip().splitlines() or ["no message"]
         raise TrilightError(
             f"bench growth: {name} of {size} ended with exit status {process.returncode}: "
             f"{said[-1]}"
         )
-    return {"seconds": float(json.loads(output.splitlines()[-1])), "peak_bytes": float(peak[0])}
+    return {"seconds": float(json.loads(output.splitlines()[-1])), "peak_bytes": float(peak_bytes)}
 
 
 def main(words: list[str]) -> None:
@@ -89,11 +87,6 @@ def main(words: list[str]) -> None:
         began = time.perf_counter()
         work.do(count, place)
     sys.stdout.write(f"\n{json.dumps(time.perf_counter() - began)}\n")
-
-
-def _watch_memory(session: int, peak: list[int], done: threading.Event) -> None:
-    while not done.wait(_SAMPLING_S):
-        peak[0] = max(peak[0], session_bytes(session))
 
 
 def session_bytes(session: int) -> int:

@@ -5,21 +5,31 @@ It reads rendered scenes of `smoke`, each under many keys so that there are enou
 """
 
 import dataclasses
+import io
 import itertools
 import time
+from collections.abc import Sequence
 from contextlib import closing
 from functools import partial
+from pathlib import Path
 
-from infra.bench.context import BenchContext
+import h5py
+import numpy as np
+
+from infra.bench.context import BenchContext, Members
 from infra.bench.experiment import BenchScale, Column, Experiment, Figures, Point, rounds
-from infra.bench.workloads.reading import LAYOUTS, unpacking_figures
 from infra.bench_options import BenchOptions
+from pipeline.exchange.renderformer_h5 import write_renderformer_h5
 from storage.dataset.settings import StorageSettings
 from storage.dataset.training_data import TrainingData
-from storage.records.sample import decode_sample
+from storage.records.profiles import PROFILES, Profile
+from storage.records.sample import Sample, decode_sample, encode_sample
+from storage.records.scene import ARRAY_FIELDS
 from train.presets import training_preset
 from train.settings import AugmentationSettings
 
+TEXTURES = {"HDF5 float16": "float16", "HDF5 float32": "float32"}
+LAYOUTS = (*PROFILES, *TEXTURES)
 UNPACK = "unpacking, one thread"
 TRAIN = "batches as training reads them"
 THREADS = (0, 1, 2, 4)
@@ -55,6 +65,47 @@ def _points(scale: BenchScale, options: BenchOptions) -> list[Point]:
 def _unpack(layout: str, context: BenchContext, trial: str) -> Figures:
     samples = [decode_sample(str(row), files) for row, files in enumerate(context.rendered)]
     return unpacking_figures(samples, layout, context.folder())
+
+
+def unpacking_figures(samples: Sequence[Sample], layout: str, work: Path) -> Figures:
+    """Return mean bytes before and after, and CPU milliseconds, of unpacking samples in memory."""
+    if layout in TEXTURES:
+        packed = [_h5_members(sample, work, TEXTURES[layout]) for sample in samples]
+        unpack = _unpacked_h5
+    else:
+        profile: Profile = "lossless" if layout == "lossless" else "compact"
+        packed = [encode_sample(sample, profile) for sample in samples]
+        unpack = _unpacked_sample
+    began = time.process_time()
+    memory = sum(map(unpack, packed))
+    spent_s = time.process_time() - began
+    return {
+        "bytes": float(np.mean([sum(map(len, members.values())) for members in packed])),
+        "memory_bytes": memory / len(packed),
+        "sample_ms": 1000 * spent_s / len(packed),
+    }
+
+
+def _unpacked_sample(members: Members) -> int:
+    sample = decode_sample("0", members)
+    arrays = sum(getattr(sample.scene, name).nbytes for name in ARRAY_FIELDS)
+    return int(arrays + sample.radiance_rgb.nbytes)
+
+
+def _h5_members(sample: Sample, work: Path, texture_type: str) -> Members:
+    write_renderformer_h5(work / "scene.h5", sample.scene, sample.radiance_rgb)
+    stream = io.BytesIO()
+    with h5py.File(work / "scene.h5") as source, h5py.File(stream, "w") as file:
+        for name, array in source.items():
+            data = array[()].astype(texture_type if name == "texture" else array.dtype)
+            file.create_dataset(name, data=data, compression="gzip", compression_opts=9)
+    return {"scene.h5": stream.getvalue()}
+
+
+def _unpacked_h5(members: Members) -> int:
+    """Read every array without checks, as a loader that trusts its files does."""
+    with h5py.File(io.BytesIO(members["scene.h5"])) as file:
+        return sum(file[name][()].nbytes for name in file)
 
 
 def _read(threads: int, context: BenchContext, trial: str) -> Figures:

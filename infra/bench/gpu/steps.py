@@ -24,6 +24,7 @@ from numpy.typing import NDArray
 from infra.bench.workloads.named_scenes import cost_scene
 from model.config import SIZES, ModelConfig
 from model.costs import Workload, training_flops
+from model.hits.tracing import with_traced
 from model.inference import NeuralRenderer
 from model.open import BUILTIN_NETWORKS
 from model.precision import fast_float32_products
@@ -58,27 +59,17 @@ def twin_figures(network: str, precision: str, device: torch.device) -> dict[str
     Raises:
         TrilightError: the stored picture belongs to other weights than the built-in network's.
     """
-    twin = stored_twin(network)
-    picture, seconds = _render(network, device, precision)
-    return {"ms": 1e3 * seconds, "db": psnr_log_db(picture, twin)}
-
-
-def stored_twin(network: str) -> NDArray[np.float64]:
-    """Return the stored picture [64, 64, 3] of a network, linear radiance.
-
-    Raises:
-        TrilightError: the picture belongs to other weights.
-    """
     with np.load(STORED, allow_pickle=False) as stored:
         digest = str(stored[f"{network} sha256"])
-        picture = stored[network]
+        twin = radiance_from_log10(stored[network].astype(np.float64))
     if digest != (now := _digest(network)):
         raise TrilightError(
             f"bench gpu: the stored picture of {network} is by weights of sha256 {digest[:8]}, "
             f"and {now[:8]} is what this Trilight has; make it again: python -m "
             f"{module_name('infra.bench.gpu.steps')}."
         )
-    return radiance_from_log10(picture.astype(np.float64))
+    picture, seconds = _render(network, device, precision)
+    return {"ms": 1e3 * seconds, "db": psnr_log_db(picture, twin)}
 
 
 def _digest(network: str) -> str:
@@ -165,21 +156,20 @@ def step_figures(run: str, steps: int, device: torch.device) -> dict[str, float]
         try:
             figures = _measure_steps(settings, scenes, steps, device)
             if device.type == "cuda" and settings.compile == "auto":
-                _free_memory(device)
+                _free_memory()
                 plain = dataclasses.replace(settings, compile="no")
                 figures["plain_ms"] = _measure_steps(plain, scenes, steps, device)["ms"]
             return figures
         except torch.OutOfMemoryError:
             scenes //= 2
         finally:
-            _free_memory(device)
+            _free_memory()
     return {}
 
 
-def _free_memory(device: torch.device) -> None:
+def _free_memory() -> None:
     gc.collect()
-    if device.type == "cuda":
-        torch.cuda.empty_cache()
+    torch.cuda.empty_cache()  # nothing happens where CUDA was not used
 
 
 def _measure_steps(
@@ -244,12 +234,11 @@ def scene_of(workload: Workload) -> SceneTensors:
     )
     # rows spread over the scene, the room first and the lights last
     rows = torch.linspace(0, tensors.num_triangles - 1, workload.triangles).round().long()
-    return SceneTensors(
+    return dataclasses.replace(
+        tensors,
         triangles_T33=tensors.triangles_T33[rows],
         normals_T33=tensors.normals_T33[rows],
         material_TM=tensors.material_TM[rows],
-        c2w_V44=tensors.c2w_V44,
-        fov_deg_V=tensors.fov_deg_V,
     )
 
 
@@ -258,20 +247,12 @@ def drawn_batch(settings: TrainSettings, scenes: int) -> TrainingBatch:
     generator = torch.Generator().manual_seed(0)
     views = settings.views_per_scene
     px = settings.resolution
+    passed = [scene_of(each) for each in workloads(settings, scenes)]
     return TrainingBatch(
-        scenes=batch_scenes(
-            [_prepare(scene_of(each), settings.model, px) for each in workloads(settings, scenes)]
-        ),
+        scenes=batch_scenes([with_traced(each, px, settings.model) for each in passed]),
         target_BVRR3=0.3 * torch.rand(scenes, views, px, px, 3, generator=generator),
         noise_BV=torch.full((scenes, views), 1e-3),
     )
-
-
-def _prepare(tensors: SceneTensors, model: ModelConfig, px: int) -> SceneTensors:
-    """Return a scene with the inputs of its network, as the stream does."""
-    from model.hits.tracing import with_traced
-
-    return with_traced(tensors, px, model)
 
 
 def drawn_lpips(settings: TrainSettings, widths: tuple[int, ...] = VGG16_WIDTHS) -> Lpips | None:

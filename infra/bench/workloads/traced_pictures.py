@@ -17,6 +17,7 @@ figure does not depend on whether its reference was cached.
 
 import dataclasses
 import time
+from collections.abc import Callable, Mapping
 
 import numpy as np
 from numpy.typing import NDArray
@@ -111,14 +112,14 @@ def render_levels(
         sampler: plugin of Mitsuba.
     """
     camera = first_camera(scene, resolution)
-    _Plain(scene, sampler).radiance(camera, seed_for(seed, "plain warm-up"), levels_spp[0])
+    _plain_tracer(scene, sampler)(camera, seed_for(seed, "plain warm-up"), levels_spp[0])
     warm_up_denoiser(resolution)
-    plain = _Plain(scene, sampler)
+    radiance = _plain_tracer(scene, sampler)
     features, features_core_s = _features(scene, camera)
     levels = []
     for spp in levels_spp:
         started = time.process_time()
-        raw = plain.radiance(camera, seed_for(seed, "plain", spp), spp)
+        raw = radiance(camera, seed_for(seed, "plain", spp), spp)
         sampled_core_s = time.process_time() - started
         picture = denoise(raw, features, "high")
         core_s = features_core_s + time.process_time() - started
@@ -140,42 +141,43 @@ def _features(scene: Scene, camera: PixelCamera) -> tuple[Features, float]:
     return features, time.process_time() - started
 
 
-class _Plain:
-    """Mitsuba scene with its integrator."""
+def _plain_tracer(
+    scene: Scene, sampler: str
+) -> Callable[[PixelCamera, int, int], NDArray[np.float32]]:
+    """Return a function of camera, seed and samples: their mean by Mitsuba, [R, R, 3]."""
+    import mitsuba  # not before `activate`, which says where compiled kernels are kept
 
-    def __init__(self, scene: Scene, sampler: str) -> None:
-        import mitsuba  # not before `activate`, which says where compiled kernels are kept
+    from tests.oracle.plugin_scene import plugin_scene  # a checkout has it, as this package
+    from tests.oracle.plugin_tracer import stock_sensor
 
-        from tests.oracle.plugin_scene import plugin_scene  # a checkout has it, as this package
-        from tests.oracle.plugin_tracer import stock_sensor
+    loaded = plugin_scene(scene)
+    path = mitsuba.load_dict(
+        {
+            "type": "path",
+            "max_depth": RenderSettings.max_depth,
+            "rr_depth": _RR_DEPTH,
+            "hide_emitters": True,
+            "samples_per_pass": _PASS_SPP,
+        }
+    )
 
-        self._mi = mitsuba
-        self._sampler = sampler
-        self._scene = plugin_scene(scene)
-        self._sensor = stock_sensor
-        self._path = mitsuba.load_dict(
-            {
-                "type": "path",
-                "max_depth": RenderSettings.max_depth,
-                "rr_depth": _RR_DEPTH,
-                "hide_emitters": True,
-                "samples_per_pass": _PASS_SPP,
-            }
-        )
-
-    def radiance(self, camera: PixelCamera, seed: int, spp: int) -> NDArray[np.float32]:
-        """Return the mean of `spp` samples, [R, R, 3]."""
-        picture = self._mi.render(
-            self._scene,
-            sensor=self._sensor(camera, {"type": self._sampler, "sample_count": spp}),
-            integrator=self._path,
-            seed=self._mi.UInt32(seed),
+    def radiance(camera: PixelCamera, seed: int, spp: int) -> NDArray[np.float32]:
+        picture = mitsuba.render(
+            loaded,
+            sensor=stock_sensor(camera, {"type": sampler, "sample_count": spp}),
+            integrator=path,
+            seed=mitsuba.UInt32(seed),
             spp=spp,
         )
         return np.array(picture, np.float32)
 
+    return radiance
 
-_CURVES = {"log": log10_radiance, "linear": clamped_radiance, "object": log10_radiance}
+
+CURVES: Mapping[str, Curve] = {
+    "log": log10_radiance, "linear": clamped_radiance, "object": log10_radiance
+}  # fmt: skip
+"""Tone curve of each metric of stated errors, by its name."""
 
 
 def load_or_render_reference(
@@ -209,7 +211,7 @@ def figures(view: RenderedView, reference: RawReference) -> dict[str, float]:
         "spp": float(view.spp),
         "at_cap": float(view.at_cap),
     }
-    for name, curve in _CURVES.items():
+    for name, curve in CURVES.items():
         pixels = view.hits if name == "object" else None
         true_db, open_db = true_error_db(view.radiance_rgb, reference, curve, pixels)
         excess_db = stated_db[name] - true_db

@@ -14,19 +14,19 @@ import numpy as np
 import pytest
 import torch
 
+from infra.bench.context import write_copies
 from infra.bench.experiments import methods
 from infra.bench.experiments.calibration import LOOKS
 from infra.bench.experiments.cycles import agreement_figures
 from infra.bench.experiments.frontier import cost_at_error
 from infra.bench.experiments.growth import EXPERIMENT, WORK, measure_work, session_bytes
-from infra.bench.experiments.loader import read_figures
+from infra.bench.experiments.loader import LAYOUTS, read_figures, unpacking_figures
 from infra.bench.experiments.meshes import BUDGET_GROUP, CURVE, METHOD_GROUP
 from infra.bench.experiments.paired_training import SIDE_A, SIDE_B, scene_of, settings_of
 from infra.bench.gpu import steps
 from infra.bench.gpu.steps import NETWORKS, step_figures, step_settings, twin_figures
 from infra.bench.workloads import cycles as environment
 from infra.bench.workloads.cycles import installed_python
-from infra.bench.workloads.reading import LAYOUTS, unpacking_figures, write_copies
 from infra.bench.workloads.traced_pictures import load_or_render_reference
 from infra.bench_options import BenchOptions
 from infra.render.raw_references import RawReference, first_camera

@@ -169,13 +169,16 @@ def test_cards_are_those_of_this_machine_or_of_all_workers(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     monkeypatch.setenv("CUDA_VISIBLE_DEVICES", "0,1,2")
-    assert limits({}) == {DISK_LIMIT: 2, GPU_LIMIT: 3}
-    assert limits({"TRILIGHT_CARDS": "16"})[GPU_LIMIT] == 16
-    for wrong in ("0", "-1", "many", "", "100001"):
-        with pytest.raises(TrilightError, match=f"TRILIGHT_CARDS is '{wrong}'; expected a whole"):
-            limits({"TRILIGHT_CARDS": wrong})
+    monkeypatch.delenv("TRILIGHT_CARDS", raising=False)
+    assert limits() == {DISK_LIMIT: 2, GPU_LIMIT: 3}
     monkeypatch.setenv("CUDA_VISIBLE_DEVICES", "")
-    assert limits({})[GPU_LIMIT] == 1  # a limit of 0 would let nothing begin
+    assert limits()[GPU_LIMIT] == 1  # a limit of 0 would let nothing begin
+    monkeypatch.setenv("TRILIGHT_CARDS", "16")
+    assert limits()[GPU_LIMIT] == 16
+    for wrong in ("0", "-1", "many", "", "100001"):
+        monkeypatch.setenv("TRILIGHT_CARDS", wrong)
+        with pytest.raises(TrilightError, match=f"TRILIGHT_CARDS is '{wrong}'; expected a whole"):
+            limits()
 
 
 URL = "http://127.0.0.1:4321/api"
@@ -260,16 +263,16 @@ def test_the_password_is_no_argument_and_is_not_said(
     monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     """Arguments are seen by every user of the machine, and what is said gets into logs."""
-    launch, call = mock.Mock(), mock.Mock()
+    launch = mock.Mock()
+    launch.return_value.wait.return_value = 0
     monkeypatch.setattr(local, "_launch", launch)
     monkeypatch.setattr(local, "_require_free", lambda *_: None)
     monkeypatch.setattr(local, "wait_until_healthy", lambda *_: None)
-    monkeypatch.setattr(local, "_call", call)
     monkeypatch.setattr(local.shutil, "which", lambda name: name)
     monkeypatch.setenv("TRILIGHT_HOST", "my-host")
     local.main(["start"])
     password = tomllib.loads(settings_file().read_text())["api"]["auth_string"]
-    calls = [each.args[-2:] for each in (*launch.call_args_list, *call.call_args_list)]
+    calls = [each.args[-2:] for each in launch.call_args_list]
     told = [word for command, _ in calls for word in command]
     environments = [environment for _, environment in calls]
     assert [environment[PASSWORDS[1]] for environment in environments] == [password] * 3

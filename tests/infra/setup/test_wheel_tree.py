@@ -9,8 +9,14 @@ from pathlib import Path
 
 import pytest
 
-from infra.setup.build_backend import build_editable
-from infra.setup.wheel_tree import CHECKOUT_ONLY, FACE, PACKAGES, with_prefix, write_wheel_tree
+from infra.setup.build_backend import (
+    CHECKOUT_ONLY,
+    FACE,
+    PACKAGES,
+    build_editable,
+    with_prefix,
+    write_wheel_tree,
+)
 from tests.command_line import run_program
 from tests.conftest import ROOT
 from tests.for_each import case
