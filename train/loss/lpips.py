@@ -25,55 +25,6 @@ MIN_PX = 16
 """Minimum width of a picture: four poolings halve it, and the last block needs a pixel."""
 
 
-class Vgg16(nn.Module):
-    """VGG16 (Simonyan and Zisserman 2015, configuration D) up to relu5_3; never trained.
-
-    Maps pictures to the output of the last convolution of each block. The shapes in the state
-    dict, under torchvision's names, define the widths of the layers.
-    """
-
-    def __init__(self, state: Mapping[str, Tensor]) -> None:
-        """Load the weights `features.<n>.weight` and `.bias`; others are ignored.
-
-        Raises:
-            TrilightError: one is missing, or its shape does not fit the layer before it.
-        """
-        super().__init__()
-        self.convolutions = nn.ModuleList()
-        channels = 3
-        for number in (number for block in BLOCKS for number in block):
-            names = [f"features.{number}.{part}" for part in ("weight", "bias")]
-            if missing := [name for name in names if name not in state]:
-                raise TrilightError(
-                    f"VGG16: the file has no {missing[0]}; expected the state dict of "
-                    "torchvision's vgg16."
-                )
-            weight, bias = (state[name].float() for name in names)
-            if weight.shape[1:] != (channels, 3, 3) or bias.shape != weight.shape[:1]:
-                raise TrilightError(
-                    f"VGG16: {names[0]} has the shape {tuple(weight.shape)}; expected "
-                    f"(any, {channels}, 3, 3) and a bias for each. Use torchvision's vgg16 file."
-                )
-            convolution = nn.Conv2d(channels, len(weight), 3, padding=1)
-            convolution.load_state_dict({"weight": weight, "bias": bias})
-            self.convolutions.append(convolution)
-            channels = len(weight)
-        self.requires_grad_(False)
-
-    def forward(self, picture_M3RR: Tensor) -> list[Tensor]:
-        """Return the five tapped grids [M, C, R / 2^k, R / 2^k] of pictures, k = 0 ... 4."""
-        x = picture_M3RR
-        taps = []
-        layers = iter(self.convolutions)
-        for index, block in enumerate(BLOCKS):
-            if index:
-                x = nn.functional.max_pool2d(x, 2)
-            for _ in block:
-                x = torch.relu(next(layers)(x))
-            taps.append(x)
-        return taps
-
-
 SHIFT = (-0.030, -0.088, -0.188)
 SCALE = (0.458, 0.448, 0.450)
 """ImageNet's mean and spread per channel, for pictures in [-1, 1]."""
@@ -83,7 +34,11 @@ EPS = 1e-10
 
 
 class Lpips(nn.Module):
-    """Distance of pairs of pictures, 0 for equal ones."""
+    """Distance of pairs of pictures, 0 for equal ones.
+
+    It compares features of VGG16 (Simonyan and Zisserman 2015, configuration D) up to relu5_3,
+    which is never trained. The shapes in its state dict define the widths of the layers.
+    """
 
     shift_311: Tensor
     scale_311: Tensor
@@ -92,6 +47,7 @@ class Lpips(nn.Module):
         """Build the network.
 
         Args:
+            vgg16: `features.<n>.weight` and `.bias`, torchvision's names; others are ignored.
             linear: the published linear weights, `lin<k>.model.1.weight` [1, C, 1, 1] for the
                 block k.
 
@@ -99,11 +55,14 @@ class Lpips(nn.Module):
             TrilightError: a tensor is missing or has another shape.
         """
         super().__init__()
-        self.vgg16 = Vgg16(vgg16)
+        self.convolutions = nn.ModuleList()
         self.register_buffer("shift_311", torch.tensor(SHIFT).reshape(3, 1, 1))
         self.register_buffer("scale_311", torch.tensor(SCALE).reshape(3, 1, 1))
-        widths = [len(vgg16[f"features.{block[-1]}.weight"]) for block in BLOCKS]
-        for block, width in enumerate(widths):
+        width = 3
+        for block, numbers in enumerate(BLOCKS):
+            for number in numbers:
+                self.convolutions.append(_convolution(vgg16, number, width))
+                width = len(vgg16[f"features.{number}.weight"])
             name = f"lin{block}.model.1.weight"
             weight = linear.get(name)
             if weight is None or weight.shape != (1, width, 1, 1):
@@ -113,6 +72,7 @@ class Lpips(nn.Module):
                     "vgg.pth of version 0.1 of LPIPS."
                 )
             self.register_buffer(f"linear_{block}", weight.float())
+        self.requires_grad_(False)
 
     def forward(self, a_M3RR: Tensor, b_M3RR: Tensor) -> Tensor:
         """Return the distances [M] of pictures in [0, 1], at least 16 pixels across.
@@ -136,7 +96,35 @@ class Lpips(nn.Module):
         return distance_M
 
     def _features(self, picture_M3RR: Tensor) -> list[Tensor]:
-        return self.vgg16((2 * picture_M3RR - 1 - self.shift_311) / self.scale_311)
+        """Return the last grid of each block k, [M, C, R / 2^k, R / 2^k]."""
+        x = (2 * picture_M3RR - 1 - self.shift_311) / self.scale_311
+        grids = []
+        layers = iter(self.convolutions)
+        for index, block in enumerate(BLOCKS):
+            if index:
+                x = nn.functional.max_pool2d(x, 2)
+            for _ in block:
+                x = torch.relu(next(layers)(x))
+            grids.append(x)
+        return grids
+
+
+def _convolution(state: Mapping[str, Tensor], number: int, channels: int) -> nn.Conv2d:
+    """Return a convolution of VGG16 with its weights; raises as `Lpips`."""
+    names = [f"features.{number}.{part}" for part in ("weight", "bias")]
+    if missing := [name for name in names if name not in state]:
+        raise TrilightError(
+            f"VGG16: the file has no {missing[0]}; expected the state dict of torchvision's vgg16."
+        )
+    weight, bias = (state[name].float() for name in names)
+    if weight.shape[1:] != (channels, 3, 3) or bias.shape != weight.shape[:1]:
+        raise TrilightError(
+            f"VGG16: {names[0]} has the shape {tuple(weight.shape)}; expected (any, {channels}, 3, "
+            "3) and a bias for each. Use torchvision's vgg16 file."
+        )
+    convolution = nn.Conv2d(channels, len(weight), 3, padding=1)
+    convolution.load_state_dict({"weight": weight, "bias": bias})
+    return convolution
 
 
 def _unit(x_MCHW: Tensor) -> Tensor:
