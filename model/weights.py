@@ -17,6 +17,7 @@ from model.renderformer import RenderFormer
 from storage.errors import TrilightError, without_removed
 from storage.records.safe_read import (
     MAX_HEADER_BYTES,
+    name_unreadable,
     open_plain,
     read_safetensors,
     safetensors_header,
@@ -125,20 +126,16 @@ def read_tensors(path: Path) -> tuple[dict[str, Tensor], dict[str, str]]:
     """
     metadata = read_metadata(path)
     try:
-        return load_file(path), metadata
-    except OSError as error:
-        raise TrilightError(f"{path}: cannot be read ({error.strerror}).") from error
+        with name_unreadable(path):
+            return load_file(path), metadata
     except (SafetensorError, KeyError) as error:
         raise TrilightError(f"{path}: unreadable ({error}).") from error
 
 
 def read_metadata(path: Path) -> dict[str, str]:
     """Return the metadata of a safetensors file without its tensors; raises as `read_tensors`."""
-    try:
-        with open_plain(path) as file:
-            start = file.read(8 + MAX_HEADER_BYTES)
-    except OSError as error:
-        raise TrilightError(f"{path}: cannot be read ({error.strerror}).") from error
+    with name_unreadable(path), open_plain(path) as file:
+        start = file.read(8 + MAX_HEADER_BYTES)
     if start[:2] in (b"PK", b"\x80\x02", b"\x80\x04"):
         raise TrilightError(
             f"{path}: pickled code, which a checkpoint could run; expected safetensors. "

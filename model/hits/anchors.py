@@ -271,10 +271,7 @@ def _gather_light(scene: LitScene, points: Points, shift: Floats, gather_rays: i
 
 def _van_der_corput(count: int) -> Floats:
     """Return the first `count` numbers of the sequence of base 2 (van der Corput 1935)."""
-    number = np.arange(count)
-    total = np.zeros(count)
-    share = 0.5
-    while number.any():
-        total += share * (number & 1)
-        number, share = number >> 1, share / 2
-    return total.astype(np.float32)
+    bits = np.arange(count.bit_length())
+    digits = np.arange(count)[:, None] >> bits & 1
+    numbers: Floats = (digits * 0.5 ** (bits + 1)).sum(axis=1)
+    return numbers.astype(np.float32)

@@ -85,12 +85,8 @@ def traced_cameras(
 
     It is where the cameras are, and of their type.
     """
-    traced = [
-        traced_views(scene, c2w_V44, fov_deg_V, resolution, config)
-        for scene, c2w_V44, fov_deg_V in zip(
-            scenes, cameras.c2w_BV44, cameras.fov_deg_BV, strict=True
-        )
-    ]
+    views = zip(scenes, cameras.c2w_BV44, cameras.fov_deg_BV, strict=True)
+    traced = [traced_views(*each, resolution, config) for each in views]
     return map_tensors(stack_traced(traced), lambda each: like(each, cameras.fov_deg_BV))
 
 
@@ -133,12 +129,8 @@ def albedo_of_cameras(
     scenes: tuple[LitScene, ...], cameras: Cameras, resolution: int, rays_a_side: int
 ) -> Tensor:
     """Return the albedo [B, V, R, R, 6] that cameras see: where they are, and of their type."""
-    albedo = [
-        albedo_of_views(scene, c2w_V44, fov_deg_V, resolution, rays_a_side)
-        for scene, c2w_V44, fov_deg_V in zip(
-            scenes, cameras.c2w_BV44, cameras.fov_deg_BV, strict=True
-        )
-    ]
+    views = zip(scenes, cameras.c2w_BV44, cameras.fov_deg_BV, strict=True)
+    albedo = [albedo_of_views(*each, resolution, rays_a_side) for each in views]
     return like(torch.stack(albedo), cameras.fov_deg_BV)
 
 

@@ -255,16 +255,16 @@ def plot_excursions(path: Path, views: "Sequence[JudgedView]") -> int:
     Each axis has a plot: a dot is a view, the line the median at each value, the dashed line the
     median of the stated errors. Nothing is written if no view leaves the usual range.
     """
-    from matplotlib.figure import Figure
-
-    from train.evaluation.metrics import NETWORK
-
     axes: dict[str, list[JudgedView]] = {}
     for view in views:
         if view.excursion is not None:
             axes.setdefault(view.excursion[0], []).append(view)
     if not axes:
         return 0
+    from matplotlib.figure import Figure
+
+    from train.evaluation.metrics import NETWORK
+
     rows = -(-len(axes) // _COLUMNS)
     figure = Figure(figsize=(4.2 * _COLUMNS, 3.2 * rows), layout="constrained")
     grid = figure.subplots(rows, _COLUMNS, squeeze=False)
