@@ -104,27 +104,24 @@ def supports_packed(x: Tensor, head_width: int) -> bool:
     return device == "cuda" and reduced and head_width % 8 == 0 and head_width <= MOST_HEAD_WIDTH
 
 
-class _Repack(torch.autograd.Function):
-    """Packed tokens of padded ones, or padded ones of packed; the backward pass is the other."""
+class _Pack(torch.autograd.Function):
+    """Packed tokens of padded ones; the backward pass is a lookup too, and sums nothing."""
 
     @staticmethod
-    def forward(ctx: Any, x: Tensor, packs: bool, *maps: Tensor) -> Tensor:
-        ctx.save_for_backward(*maps)
-        ctx.packs = packs
-        index_P, back_M, exists_M = maps
-        if packs:
-            return x.index_select(0, index_P)
-        exists = exists_M.reshape(-1, *[1] * (x.ndim - 1))
-        return torch.where(exists, x.index_select(0, back_M), 0)
+    def forward(ctx: Any, x: Tensor, index_P: Tensor, *back: Tensor) -> Tensor:
+        ctx.save_for_backward(*back)
+        return x.index_select(0, index_P)
 
     @staticmethod
     def backward(ctx: Any, *grads: Tensor) -> tuple[Tensor | None, ...]:
-        return _Repack.apply(grads[0], not ctx.packs, *ctx.saved_tensors), None, None, None, None
+        back_M, exists_M = ctx.saved_tensors
+        exists = exists_M.reshape(-1, *[1] * (grads[0].ndim - 1))
+        return torch.where(exists, grads[0].index_select(0, back_M), 0), None, None, None
 
 
 def pack_tokens(x_SNK: Tensor, packing: Packing) -> Tensor:
     """Return the valid tokens: [S, N, ...] -> [P, ...]."""
-    return _Repack.apply(x_SNK.flatten(0, 1), True, *packing[:3])
+    return _Pack.apply(x_SNK.flatten(0, 1), *packing[:3])
 
 
 Keys = Tensor | Sequences | None

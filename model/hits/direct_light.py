@@ -158,7 +158,7 @@ def lamp_chances(scene: LitScene, points: Points, gloss: Gloss) -> Floats:
     """
     shape = len(scene.lamps), points.position.shape[1]
     power_at_points = np.zeros_like(gloss.alpha, shape=shape)
-    albedo = scene.diffuse.mean(axis=0)[points.triangle] * _INV_PI
+    albedo = scene.means.diffuse.mean(axis=0)[points.triangle] * _INV_PI
     color = gloss.color.mean(axis=0)
     lit_points = points.only(None)
     gloss = gloss.only(None)

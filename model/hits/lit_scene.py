@@ -232,12 +232,7 @@ class LitScene:
         across = np.cross(edges[0], edges[1], axis=0)
         self.area = 0.5 * np.sqrt(dot(across, across))
         self.plane = unit(across)
-        means = reflectance_of(materials_TM)
-        self.diffuse = means.diffuse
-        self.specular = means.specular
-        self.multiscatter = means.multiscatter
-        self.alpha = means.alpha
-        self.roughness = means.roughness
+        self.means = reflectance_of(materials_TM)
         self.textures: Any = textures  # on a GPU `DeviceTextures`
         self._materials_TM = materials_TM
         self.sky = sky
@@ -266,7 +261,7 @@ class LitScene:
 
     def on(self, place: DevicePlace, caster: Callable[..., RayCaster]) -> "LitScene":
         """Return the scene and its light on a device, where `caster` prepares its rays."""
-        moved = place.copy_here(self, but=("lamps", "sky", "_corner_rows"))
+        moved = place.copy_here(self, but=("lamps", "sky", "textures", "light", "_corner_rows"))
         moved.place = place
         moved.light = place.copy_here(self.light)
         if self.textures is not None:
@@ -309,10 +304,10 @@ class LitScene:
 
     def material_at(self, points: Points, name: MaterialName) -> Floats:
         """Return an entry of `Reflectance` at points: [3, P], or [P] of alpha and roughness."""
-        if points.reflectance is not None:
-            at_points: Floats = getattr(points.reflectance, name)
-            return at_points
-        return np.take(getattr(self, name), points.triangle, axis=-1)
+        if points.reflectance is None:
+            return np.take(getattr(self.means, name), points.triangle, axis=-1)
+        at_points: Floats = getattr(points.reflectance, name)
+        return at_points
 
     def points(self, triangle: NDArray[np.intp], uv: Floats, direction: Floats) -> Points:
         """Return the points at which rays along unit `direction` [3, P] meet triangles.

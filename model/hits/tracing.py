@@ -142,8 +142,8 @@ def albedo_of_views(
     Rays go to the first triangle that is no lamp. Each pixel is the mean over its rays_a_side^2
     rays; a miss counts as black.
     """
-    nothing = np.zeros((6, 1), np.float32)  # the last column, which a miss picks
-    table = np.concatenate([np.concatenate([scene.diffuse, scene.specular]), nothing], axis=1)
+    albedo = np.concatenate([scene.means.diffuse, scene.means.specular])
+    table = np.pad(albedo, ((0, 0), (0, 1)))  # the last column, black, is what a miss picks
     views = []
     for c2w_44, fov_deg in zip(c2w_V44.detach().cpu().numpy(), fov_deg_V, strict=True):
         rays = Rays(c2w_44, float(fov_deg), resolution, rays_a_side)

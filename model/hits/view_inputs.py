@@ -270,7 +270,7 @@ def _shading_points(
         is_one &= False
     sends_one = is_one
     if has_lobe_rays:
-        is_mirror = (scene.alpha < SMOOTH_ALPHA) & (brightest(scene.specular) > DIMMEST)
+        is_mirror = (scene.means.alpha < SMOOTH_ALPHA) & (brightest(scene.means.specular) > DIMMEST)
         sends_one = is_one & ~is_mirror[triangle[0]]
     stands = (triangle >= 0) & (alone | ~sends_one)
     ray_index, pixel = np.nonzero(stands)
