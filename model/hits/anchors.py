@@ -105,7 +105,7 @@ def _mirrored_radiance(
     mirror_points = points.only(rows)
     gloss = gloss_at(scene, mirror_points)
     onward, weight = sample_lobe(gloss, mirror_points, on_lamp)
-    beyond, is_hit = scene.meet(scene.everything, mirror_points.start(onward), onward)
+    beyond, is_hit = scene.meet(mirror_points.start(onward), onward)
     seen = outgoing_radiance(scene, beyond, u_lamp, on_lamp[::-1], is_sharp, mirrors=mirrors - 1)
     lit = np.flatnonzero(is_sharp & is_hit & scene.emits[beyond.triangle])
     if len(lit) and len(scene.lamps):  # on a GPU, `lit` are all rows
@@ -262,7 +262,7 @@ def _gather_light(scene: LitScene, points: Points, shift: Floats, gather_rays: i
     for part in blocks(scene, count * gather_rays):
         anchor_points = points.only(owner[part])
         direction = cosine_direction(u[:2, part], anchor_points.normal, anchor_points.edge)
-        beyond, is_hit = scene.meet(scene.everything, anchor_points.start(direction), direction)
+        beyond, is_hit = scene.meet(anchor_points.start(direction), direction)
         spreads = np.zeros_like(is_hit)
         radiance = outgoing_radiance(scene, beyond, u_lamp[part], u[2:, part], spreads)
         total[:, part] = np.where(is_hit, radiance, np.float32(0))

@@ -345,12 +345,12 @@ class LitScene:
         start = np.broadcast_to(origin, (direction.shape[1], 3))
         return self.seen.intersect(start.copy(), as_rows(direction))
 
-    def meet(self, among: RayCaster, start: Floats, direction: Floats) -> tuple[Points, NDArray]:
-        """Return the points that rays [3, P] meet first among triangles, and which rays do.
+    def meet(self, start: Floats, direction: Floats) -> tuple[Points, NDArray]:
+        """Return the points that rays [3, P] meet first, and which rays meet any.
 
         Of a ray that meets nothing, the point is one of the first triangle and means nothing.
         """
-        hits = among.intersect(as_rows(start), as_rows(direction))
+        hits = self.everything.intersect(as_rows(start), as_rows(direction))
         is_hit = hits.triangle >= 0
         return self.points(np.maximum(hits.triangle, 0), hits.uv, direction), is_hit
 

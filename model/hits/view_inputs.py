@@ -348,7 +348,7 @@ def _add_lobe_rays(
         return
     points = block.points.only(some)
     gloss = block.gloss.only(some)
-    beyond, is_hit = scene.meet(scene.everything, points.start(direction), direction)
+    beyond, is_hit = scene.meet(points.start(direction), direction)
     arrives = gloss.color * np.where(is_hit, weight, np.float32(0))
     lamps = np.flatnonzero(is_hit & scene.emits[beyond.triangle])
     if len(lamps):
