@@ -6,6 +6,7 @@ import json
 from collections.abc import Mapping
 from dataclasses import asdict, dataclass
 from pathlib import Path
+from typing import Any
 
 import torch
 from safetensors import SafetensorError
@@ -22,6 +23,7 @@ from storage.records.safe_read import (
     read_safetensors,
     safetensors_header,
 )
+from storage.settings.described import from_record
 from storage.typed_json import read_json
 
 RANGE_KEY = "trilight_trained_range"
@@ -203,18 +205,10 @@ def encode_config(config: ModelConfig) -> str:
 
 
 def decode_config(text: str, source: str = "network") -> ModelConfig:
-    """Return the configuration from its JSON; errors begin with `source`.
+    """Return the configuration from its JSON; refusals of the whole begin with `source`.
 
     Raises:
         TrilightError: the JSON is invalid, or uses removed settings.
     """
-    try:
-        fields = without_removed(json.loads(text), REMOVED, f"{source}: model")
-        lists = {name: tuple(value) for name, value in fields.items() if isinstance(value, list)}
-        return ModelConfig(**fields | lists)
-    except TrilightError:
-        raise
-    except (TypeError, ValueError, AttributeError, RecursionError) as error:
-        raise TrilightError(
-            f"{source}: its model configuration is not readable ({error})."
-        ) from error
+    fields = read_json(text, dict[str, Any], f"{source}: its model configuration")
+    return from_record(ModelConfig, without_removed(fields, REMOVED, f"{source}: model"))

@@ -52,8 +52,11 @@ MaterialName = Literal["diffuse", "specular", "alpha", "multiscatter", "roughnes
 class PerPoint:
     """Arrays [..., P] of P points, triangles or pixels, or None."""
 
-    def only(self, rows: Any) -> Self:
-        """Return some of them; of None, all with an axis before that of points."""
+    def only(self, rows: Any, *, but: str = "") -> Self:
+        """Return some of them; of None, all with an axis before that of points.
+
+        `but` names a field that stays as it is.
+        """
         some = {
             name: each.only(rows)
             if isinstance(each, PerPoint)
@@ -61,7 +64,7 @@ class PerPoint:
             if rows is None
             else at_rows(each, rows)
             for name, each in vars(self).items()
-            if each is not None
+            if each is not None and name != but
         }
         return replace(self, **some)
 

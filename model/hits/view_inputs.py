@@ -197,7 +197,7 @@ def _add_pixels(
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
-class _Block:
+class _Block(PerPoint):
     """Points that are shaded together, and where their light is added up."""
 
     points: Points
@@ -210,17 +210,6 @@ class _Block:
     """[P] number of its ray among those of the pixel."""
     weight: NDArray[np.float32]
     """[P] number of the pixel's rays that it stands for."""
-
-    def only(self, rows: NDArray[np.intp]) -> "_Block":
-        """Return some of the points."""
-        return replace(
-            self,
-            points=self.points.only(rows),
-            gloss=self.gloss.only(rows),
-            pixel=self.pixel[rows],
-            ray_index=self.ray_index[rows],
-            weight=self.weight[rows],
-        )
 
     def add(
         self, channel: slice, values: NDArray[np.float32], rows: NDArray[np.intp] | None = None
@@ -295,7 +284,7 @@ def _shading_points(
     each_alpha = np.float32(np.inf) if shades_each else SMOOTH_ALPHA
     shading = np.where(by_lobe.gloss.alpha < each_alpha, by_lobe.weight, chosen)
     if scene.place is None:
-        return lit.only(np.flatnonzero(weight)), by_lobe, shading
+        return lit.only(np.flatnonzero(weight), but="sums"), by_lobe, shading
     return lit, replace(by_lobe, sums=np.zeros_like(sums)), shading
 
 

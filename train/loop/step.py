@@ -188,18 +188,18 @@ class Stepper:
         self.activity.begin("forward")
         resolution = batch.target_BVRR3.shape[2]
         prediction = predict_log10(self._net, batch, resolution, self._settings.precision)
-        losses = self._objective(prediction, batch.target_BVRR3, batch.noise_BV)
+        total_BV, l1_BV = self._objective(prediction, batch.target_BVRR3, batch.noise_BV)
         self.activity.begin("backward")
         if last and self._dist_context.world_size > 1:
             prediction.register_hook(self._note_exchange)
         with fast_float32_products(
             self._dist_context.device, enabled=self._settings.precision == "bfloat16"
         ):
-            (losses.total_BV.sum() / num_views).backward()
+            (total_BV.sum() / num_views).backward()
         self.activity.begin("other")
         predicted_BV = prediction.detach().clamp(min=0).mean(dim=(2, 3, 4))
         target_BV = batch.target_BVRR3.mean(dim=(2, 3, 4))
-        parts = [losses.total_BV.detach(), losses.l1_BV, predicted_BV, target_BV]
+        parts = [total_BV.detach(), l1_BV, predicted_BV, target_BV]
         return torch.stack([part.sum() for part in parts]).double()
 
     def _note_exchange(self, _: Tensor) -> None:

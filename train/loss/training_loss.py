@@ -5,7 +5,6 @@ SSIM, structural similarity, is at one scale (Wang et al. 2004) and several (Wan
 
 import math
 from collections.abc import Callable
-from dataclasses import dataclass
 
 import torch
 from torch import Tensor, nn
@@ -89,16 +88,6 @@ def _blur(x_M3RR: Tensor) -> Tensor:
     return conv2d(rows, kernel.transpose(2, 3), groups=3)
 
 
-@dataclass(frozen=True, kw_only=True, eq=False)
-class ViewLosses:
-    """Losses of the views of a batch."""
-
-    total_BV: Tensor
-    """Weighted sum of all terms per view, which training minimizes."""
-    l1_BV: Tensor
-    """L1 term alone, unweighted and detached from the gradient."""
-
-
 class TrainingLoss(nn.Module):
     """Loss function of a run's settings."""
 
@@ -116,13 +105,17 @@ class TrainingLoss(nn.Module):
 
     def forward(
         self, prediction_BVRR3: Tensor, target_BVRR3: Tensor, noise_BV: Tensor
-    ) -> ViewLosses:
+    ) -> tuple[Tensor, Tensor]:
         """Return the losses of each view.
 
         Args:
             prediction_BVRR3: log10(1 + radiance) before the ELU, float32.
             target_BVRR3: log10(1 + radiance).
             noise_BV: root mean square noise of the targets in the same space.
+
+        Returns:
+            [B, V] weighted sums of all terms, which training minimizes, and the L1 terms alone,
+            unweighted and detached from the gradient.
         """
         # Zeng et al. 2025, section 4, first term, but before the ELU, whose slope is a thousandth
         # for negative values: a network that once predicts below 0 would hardly come back. Targets
@@ -139,7 +132,7 @@ class TrainingLoss(nn.Module):
         half = self.settings.noise_half
         if half:
             total_BV = total_BV * (half / (half + noise_BV))
-        return ViewLosses(total_BV=total_BV, l1_BV=l1_BV.detach())
+        return total_BV, l1_BV.detach()
 
 
 def _dissimilarity(
