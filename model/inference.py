@@ -286,7 +286,7 @@ class NeuralRenderer:
         views = prepared.views
         if resolution not in views:
             groups = prepared.groups
-            if any(scene.place is not None for scene in groups[0][0].surfaces):
+            if self.config.traces_hits and groups[0][0].surfaces[0].place is not None:
                 views[resolution] = _RecordedView(self._model, groups[0][0], resolution)
             else:
                 views[resolution] = functools.partial(

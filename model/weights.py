@@ -15,7 +15,7 @@ from torch import Tensor
 
 from model.config import REMOVED, ModelConfig
 from model.renderformer import RenderFormer
-from storage.errors import TrilightError, without_removed
+from storage.errors import TrilightError, prefix_errors, without_removed
 from storage.records.safe_read import (
     MAX_HEADER_BYTES,
     name_unreadable,
@@ -205,10 +205,12 @@ def encode_config(config: ModelConfig) -> str:
 
 
 def decode_config(text: str, source: str = "network") -> ModelConfig:
-    """Return the configuration from its JSON; refusals of the whole begin with `source`.
+    """Return the configuration from its JSON; errors begin with `source`.
 
     Raises:
         TrilightError: the JSON is invalid, or uses removed settings.
     """
     fields = read_json(text, dict[str, Any], f"{source}: its model configuration")
-    return from_record(ModelConfig, without_removed(fields, REMOVED, f"{source}: model"))
+    known = without_removed(fields, REMOVED, f"{source}: model")
+    with prefix_errors(f"{source}: model"):
+        return from_record(ModelConfig, known)
