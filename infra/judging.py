@@ -82,7 +82,7 @@ from train.evaluation.sheet import draw_sheet, write_picture
 from train.evaluation.validation import PictureSource, nearest_view
 from train.folder import pretty_json
 from train.loop.distributed import choose_device
-from train.loss.lpips import load_lpips
+from train.loss.training_loss import load_lpips
 
 FILTERS: tuple[Filter, ...] = ("fast", "high")
 

@@ -44,8 +44,7 @@ from train.loop.optimizer import choose_muon_precision
 from train.loop.recorder import Recorder, require_wandb
 from train.loop.train_state import TrainState, new_state
 from train.loop.trainer import Trainer, scene_flops
-from train.loss.lpips import load_lpips
-from train.loss.training_loss import TrainingLoss
+from train.loss.training_loss import TrainingLoss, load_lpips
 from train.progress import TrainProgress
 from train.resume import Event, ResumePlan, StartOptions, plan_resume
 from train.settings import TrainSettings, WatchSettings, stored_settings

@@ -49,7 +49,7 @@ from train.evaluation.metrics import (
 from train.evaluation.options import SceneCount, Width
 from train.evaluation.sheet import SheetView
 from train.evaluation.validation import Baselines, ValidationScene, predict, validation_scene
-from train.loss.lpips import Lpips
+from train.loss.training_loss import Lpips
 
 BASELINE_SCENES = 256
 """Number of training scenes for the baselines."""

@@ -26,8 +26,7 @@ from storage.records.material import ROUGHNESS
 from storage.records.sample import Sample, ViewRecord
 from storage.registry import Registry
 from storage.seeds import rng_for
-from train.loss.lpips import Lpips
-from train.loss.training_loss import ssim, tone_map
+from train.loss.training_loss import Lpips, ssim, tone_map
 
 VALIDATED = ("log_l1", "psnr_log_db", "psnr_linear_db", "object_psnr_log_db")
 """Metrics of the validations of a run."""

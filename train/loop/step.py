@@ -22,8 +22,7 @@ from train.data.buckets import TrainingBatch
 from train.loop.distributed import DistributedContext
 from train.loop.optimizer import Decision, defers_sync
 from train.loop.train_state import TrainState
-from train.loss.lpips import Lpips
-from train.loss.training_loss import TrainingLoss
+from train.loss.training_loss import Lpips, TrainingLoss
 from train.monitoring.process_monitor import Activity, LayerNorms
 from train.settings import Compile, Precision, TrainSettings
 

@@ -62,7 +62,7 @@ from train.evaluation.validation import (
     validation_scene,
 )
 from train.loop.train_state import new_state
-from train.loss.lpips import Lpips
+from train.loss.training_loss import Lpips
 
 
 @pytest.fixture(scope="module")

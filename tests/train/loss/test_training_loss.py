@@ -19,18 +19,22 @@ from storage.conventions import preview_srgb8, srgb8
 from storage.errors import TrilightError
 from storage.seeds import rng_for
 from tests.for_each import for_each
-from train.loss.lpips import (
+from train.loss.training_loss import (
     BLOCKS,
     LINEAR_FILE,
     LINEAR_URL,
     SCALE,
+    SCALE_WEIGHTS,
     SHIFT,
     VGG16_FILE,
     VGG16_URL,
     Lpips,
+    TrainingLoss,
     load_lpips,
+    ms_ssim,
+    ssim,
+    tone_map,
 )
-from train.loss.training_loss import SCALE_WEIGHTS, TrainingLoss, ms_ssim, ssim, tone_map
 from train.settings import LossSettings
 
 WIDTHS = (4, 5, 6, 7, 8)
