@@ -71,11 +71,10 @@ def light_groups(scene: Scene, most: int) -> list[LightGroup]:
     powers = [float(power_E[np.isin(lamp_E, lamps)].sum()) for lamps in groups]
     if len(groups) == 1 or not any(powers):
         return [(scene, 1.0)]
-    lit_groups = [
-        (lamps, power / sum(powers)) for lamps, power in zip(groups, powers, strict=True) if power
-    ]
     return [
-        _group(scene, emitting_E[~np.isin(lamp_E, lamps)], share) for lamps, share in lit_groups
+        _group(scene, emitting_E[~np.isin(lamp_E, lamps)], power / sum(powers))
+        for lamps, power in zip(groups, powers, strict=True)
+        if power
     ]
 
 

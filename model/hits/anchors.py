@@ -19,8 +19,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from model.hits.direct_light import chosen_lamp_light, lamp_chances, lobe_ray_weight
-from model.hits.lit_scene import LitScene, PerPoint, Points, gloss_at, lobe, sample_lobe
-from model.hits.vectors import Floats, at_rows, brightest, cosine_direction, dot, spread, unit
+from model.hits.lit_scene import LitScene, PerPoint, Points, gloss_at, sample_lobe
+from model.hits.vectors import Floats, at_rows, brightest, cosine_direction, spread, unit
 from storage.conventions import focal_px
 from storage.seeds import rng_for
 
@@ -109,13 +109,11 @@ def _mirrored_radiance(
     seen = outgoing_radiance(scene, beyond, u_lamp, on_lamp[::-1], is_sharp, mirrors=mirrors - 1)
     lit = np.flatnonzero(is_sharp & is_hit & scene.emits[beyond.triangle])
     if len(lit) and len(scene.lamps):  # on a GPU, `lit` are all rows
-        some = mirror_points.only(lit)
         lamp_points = beyond.only(lit)
-        along = at_rows(onward, lit)
-        _, density = lobe(gloss.only(lit), some, along, dot(some.normal, along))
         number = np.searchsorted(scene.lamps, lamp_points.triangle).clip(0, len(scene.lamps) - 1)
         chance = chances[number, rows[lit]]
-        mis_weight = lobe_ray_weight(scene, lamp_points, some.position, density, chance)
+        rays = gloss.only(lit), mirror_points.only(lit), at_rows(onward, lit)
+        mis_weight = lobe_ray_weight(scene, *rays, lamp_points, chance)
         seen[:, lit] += np.take(scene.emission, lamp_points.triangle, axis=1) * mis_weight
     arrives = np.where(is_hit, weight * seen, np.float32(0))
     if scene.sky is not None:

@@ -33,7 +33,7 @@ from model.hits.direct_light import (
     lobe_ray_weight,
     no_light,
 )
-from model.hits.lit_scene import Gloss, LitScene, PerPoint, Points, gloss_at, lobe, sample_lobe
+from model.hits.lit_scene import Gloss, LitScene, PerPoint, Points, gloss_at, sample_lobe
 from model.hits.vectors import Floats, at_rows, brightest, dot, spread
 from storage.seeds import rng_for
 
@@ -341,11 +341,9 @@ def _add_lobe_rays(
     arrives = gloss.color * np.where(is_hit, weight, np.float32(0))
     lamps = np.flatnonzero(is_hit & scene.emits[beyond.triangle])
     if len(lamps):
-        glossy_points = points.only(lamps)
         lamp_points = beyond.only(lamps)
-        along = at_rows(direction, lamps)
-        _, density = lobe(gloss.only(lamps), glossy_points, along, dot(glossy_points.normal, along))
-        mis_weight = lobe_ray_weight(scene, lamp_points, glossy_points.position, density)
+        rays = gloss.only(lamps), points.only(lamps), at_rows(direction, lamps)
+        mis_weight = lobe_ray_weight(scene, *rays, lamp_points)
         emission = np.take(scene.emission, lamp_points.triangle, axis=1)
         emitted = at_rows(arrives, lamps) * emission * mis_weight
         block.add(Channel.DIRECT_SPECULAR, emitted, some[lamps])

@@ -335,10 +335,8 @@ def time_scene(renderer: Renderer, scene: Scene, name: str, rounds: int = 1) -> 
 
 def median_price(prices: Sequence[Price]) -> Price:
     """Return the medians of prices."""
-    return Price(
-        first_s=float(np.median([price.first_s for price in prices])),
-        further_s=float(np.median([price.further_s for price in prices])),
-    )
+    first_s, further_s = np.median([dataclasses.astuple(price) for price in prices], axis=0)
+    return Price(first_s=float(first_s), further_s=float(further_s))
 
 
 TRACER = "path tracer, same time"
