@@ -53,13 +53,12 @@ from train.evaluation.evaluate import (
     equal_time,
     judge_views,
     make_baselines,
+    rows_of_sheets,
     sheet_views,
     spread_text,
     spread_views,
     stored_resolution,
     time_both,
-    worst_and_median,
-    worst_of_each_excursion,
 )
 from train.evaluation.leaderboard import (
     Board,
@@ -82,7 +81,7 @@ from train.evaluation.sheet import draw_sheet, write_picture
 from train.evaluation.validation import PictureSource, nearest_view
 from train.folder import pretty_json
 from train.loop.distributed import choose_device
-from train.loss.lpips import load_lpips
+from train.loss.training_loss import load_lpips
 
 FILTERS: tuple[Filter, ...] = ("fast", "high")
 
@@ -221,10 +220,8 @@ def write_judgement(judgement: Judgement, out: str | Path) -> Path:
     write_atomically(folder / "evaluation.md", evaluation_page(evaluation).encode())
     contest = judgement.contest
     views = list(judgement.views)
-    chosen = worst_and_median(views)
-    if excursions := worst_of_each_excursion(views):
-        chosen["worst of each axis"] = excursions
-        plot_excursions(folder / "excursions.png", views)
+    chosen = rows_of_sheets(views)
+    plot_excursions(folder / "excursions.png", views)
     with contextlib.ExitStack() as stack:
         if preview := evaluation["path tracer"]["preview"]:
             level = (preview["samples"], preview["denoiser"])

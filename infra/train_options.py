@@ -1,9 +1,8 @@
 """Options of a training run, for the command line and Prefect's form."""
 
-import os
 import sys
 from collections.abc import Mapping
-from dataclasses import field, fields
+from dataclasses import field
 from typing import Annotated, Any, Literal
 
 from storage.errors import TrilightError
@@ -15,13 +14,10 @@ from train.presets import override_training_preset
 from train.resume import StartOptions
 from train.settings import TrainSettings
 
-RESTARTS = "TORCHELASTIC_RESTART_COUNT"
-"""Environment variable in which torchrun counts the restarts of its processes."""
-
 
 @checked()
-class TrainOptions:
-    """Training run, data and start."""
+class _RunOptions:
+    """First options of a training run."""
 
     run: str = "smoke"
     """Training preset, such as tiny or pretrain; `trilight presets` lists them."""
@@ -30,23 +26,12 @@ class TrainOptions:
     data_weights; a pattern is such as s3://b/{train-000000,validation-000002}.tar."""
     out: str | None = None
     """Folder for the run, on the machine that trains; by default runs/PRESET."""
-    resume: bool = False
-    """Continue from the newest checkpoint, with the settings of the start. Settings of execution
-    may differ."""
-    restartable: bool = False
-    """Resume if the folder has a checkpoint, else begin. A scheduler may then start the same
-    command repeatedly; a restart by torchrun always resumes."""
-    branch: str | None = None
-    """Checkpoint, or folder of a run, to continue in a new folder; by default none."""
-    decisions: Mapping[str, Any] = field(default_factory=dict)
-    """Recorded changes with --resume or --branch, such as num_steps=20000; by default none. They
-    apply from the checkpoint on."""
-    begin_with: str | None = None
-    """Run folder or checkpoint with the initial weights of a finetune run; by default random
-    weights."""
-    lpips: str | None = None
-    """Folder of vgg16-397923af.pth and vgg.pth (LPIPS), or hub; by default the value of
-    TRILIGHT_LPIPS."""
+
+
+@checked()
+class TrainOptions(StartOptions, _RunOptions):
+    """Training run, data and start."""
+
     device: Literal["cpu", "cuda"] | None = None
     """Device to compute on; by default cuda if there is one, else cpu."""
     steps: Annotated[int | None, Within(1, 10**9, unit="steps")] = None
@@ -81,14 +66,8 @@ class TrainOptions:
         settings = override_training_preset(
             self.run, self.changes, steps=self.steps, most_unusable=self.most_unusable
         )
-        self.start().check(settings)
+        self.check(settings)
         return settings
-
-    def start(self) -> StartOptions:
-        """Return the start options of the run."""
-        values = {each.name: getattr(self, each.name) for each in fields(StartOptions)}
-        restarts = int(os.environ.get(RESTARTS, "0")) > 0
-        return StartOptions(**values | {"restartable": self.restartable or restarts})
 
     def command(self) -> list[str]:
         """Return the command line that trains."""

@@ -18,7 +18,6 @@ there and masks wrapped neighbors; without the roll, the same windows are smalle
 need no mask. Windows of equal size are computed together.
 """
 
-import itertools
 from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import lru_cache
@@ -104,27 +103,24 @@ def supports_packed(x: Tensor, head_width: int) -> bool:
     return device == "cuda" and reduced and head_width % 8 == 0 and head_width <= MOST_HEAD_WIDTH
 
 
-class _Repack(torch.autograd.Function):
-    """Packed tokens of padded ones, or padded ones of packed; the backward pass is the other."""
+class _Pack(torch.autograd.Function):
+    """Packed tokens of padded ones; the backward pass is a lookup too, and sums nothing."""
 
     @staticmethod
-    def forward(ctx: Any, x: Tensor, packs: bool, *maps: Tensor) -> Tensor:
-        ctx.save_for_backward(*maps)
-        ctx.packs = packs
-        index_P, back_M, exists_M = maps
-        if packs:
-            return x.index_select(0, index_P)
-        exists = exists_M.reshape(-1, *[1] * (x.ndim - 1))
-        return torch.where(exists, x.index_select(0, back_M), 0)
+    def forward(ctx: Any, x: Tensor, index_P: Tensor, *back: Tensor) -> Tensor:
+        ctx.save_for_backward(*back)
+        return x.index_select(0, index_P)
 
     @staticmethod
     def backward(ctx: Any, *grads: Tensor) -> tuple[Tensor | None, ...]:
-        return _Repack.apply(grads[0], not ctx.packs, *ctx.saved_tensors), None, None, None, None
+        back_M, exists_M = ctx.saved_tensors
+        exists = exists_M.reshape(-1, *[1] * (grads[0].ndim - 1))
+        return torch.where(exists, grads[0].index_select(0, back_M), 0), None, None, None
 
 
 def pack_tokens(x_SNK: Tensor, packing: Packing) -> Tensor:
     """Return the valid tokens: [S, N, ...] -> [P, ...]."""
-    return _Repack.apply(x_SNK.flatten(0, 1), True, *packing[:3])
+    return _Pack.apply(x_SNK.flatten(0, 1), *packing[:3])
 
 
 Keys = Tensor | Sequences | None
@@ -147,6 +143,8 @@ def attend(q_BHQD: Tensor, k_BHND: Tensor, v_BHND: Tensor, keys: Keys) -> Tensor
 
 
 def _attend_sequences(q_BHQD: Tensor, k_BHND: Tensor, v_BHND: Tensor, keys: Sequences) -> Tensor:
+    from torch.nn.attention.varlen import varlen_attn  # of GPUs alone
+
     q, k, v = (x.transpose(1, 2) for x in (q_BHQD, k_BHND, v_BHND))
     shape = q.shape[:2]
     queries = keys
@@ -154,18 +152,9 @@ def _attend_sequences(q_BHQD: Tensor, k_BHND: Tensor, v_BHND: Tensor, keys: Sequ
         starts_B1 = torch.arange(shape[0] + 1, dtype=torch.int32, device=q.device) * shape[1]
         queries = Sequences(starts_B1, shape[1])
     q, k, v = (x.flatten(0, 1) for x in (q, k, v))
-    if q.device.type == "cuda":
-        from torch.nn.attention.varlen import varlen_attn
-
-        starts = queries.starts_S1, keys.starts_S1
-        attended: Any = varlen_attn(q, k, v, *starts, queries.longest, keys.longest)
-        return attended.unflatten(0, shape).transpose(1, 2)  # one tensor, as nothing else is asked
-    parts = []
-    spans = zip(*(itertools.pairwise(s.starts_S1.tolist()) for s in (queries, keys)), strict=True)
-    for (first, end), (low, high) in spans:
-        q1, k1, v1 = (x.transpose(0, 1)[None] for x in (q[first:end], k[low:high], v[low:high]))
-        parts.append(scaled_dot_product_attention(q1, k1, v1)[0].transpose(0, 1))
-    return torch.cat(parts).unflatten(0, shape).transpose(1, 2)
+    starts = queries.starts_S1, keys.starts_S1
+    attended: Any = varlen_attn(q, k, v, *starts, queries.longest, keys.longest)
+    return attended.unflatten(0, shape).transpose(1, 2)  # one tensor, as nothing else is asked
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)

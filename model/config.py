@@ -253,8 +253,7 @@ ModelConfig.PRESETS = SIZES
 
 def _check_columns(names: tuple[str, ...]) -> None:
     declared = column_places()
-    known = isinstance(names, tuple) and all(name in declared for name in names)
-    if not names or not known or len(set(names)) != len(names):
+    if not names or not declared.keys() >= set(names) or len(set(names)) != len(names):
         _wrong(
             f"material_columns {names!r}",
             f"some of {', '.join(declared)}, each once; a column that is not among them has to be "

@@ -3,7 +3,7 @@
 renderer = NeuralRenderer.load("runs/smoke/model.safetensors")
 picture = renderer.render(read_scene_file("scene.safetensors"), resolution=512)
 
-All of the network that is used here is in `_encode` and `_decode`.
+All of the network that is used here is in `_encode`, `_predict_picture` and `_RecordedView`.
 
 A network trained on few lights renders many, one group after the other. Light is linear: the
 picture of a scene is the sum of its pictures by each group of lights alone. A group's scene has no
@@ -71,11 +71,10 @@ def light_groups(scene: Scene, most: int) -> list[LightGroup]:
     powers = [float(power_E[np.isin(lamp_E, lamps)].sum()) for lamps in groups]
     if len(groups) == 1 or not any(powers):
         return [(scene, 1.0)]
-    lit_groups = [
-        (lamps, power / sum(powers)) for lamps, power in zip(groups, powers, strict=True) if power
-    ]
     return [
-        _group(scene, emitting_E[~np.isin(lamp_E, lamps)], share) for lamps, share in lit_groups
+        _group(scene, emitting_E[~np.isin(lamp_E, lamps)], power / sum(powers))
+        for lamps, power in zip(groups, powers, strict=True)
+        if power
     ]
 
 
@@ -285,12 +284,12 @@ class NeuralRenderer:
         angle = torch.tensor(fov_deg, dtype=torch.float32, device=self.device)
         views = prepared.views
         if resolution not in views:
-            if self.config.traces_hits:
-                ((encoded, _),) = prepared.groups
-                views[resolution] = _TracedView(self._model, encoded, resolution)
+            groups = prepared.groups
+            if self.config.traces_hits and groups[0][0].surfaces[0].place is not None:
+                views[resolution] = _RecordedView(self._model, groups[0][0], resolution)
             else:
                 views[resolution] = functools.partial(
-                    _predict_picture, self._model, prepared.groups, resolution
+                    _predict_picture, self._model, groups, resolution
                 )
         picture: NDArray[np.float32] = views[resolution](c2w_44, angle).cpu().numpy()
         return picture
@@ -369,8 +368,8 @@ def _predict_picture(
     return total.float()
 
 
-class _TracedView:
-    """Pictures of one scene by a network of hits; a GPU repeats its rays and the network as graphs.
+class _RecordedView:
+    """Pictures of one scene by a network of hits, whose rays and layers a GPU repeats as graphs.
 
     Between them is the denoiser, which no graph holds.
     """
@@ -379,9 +378,8 @@ class _TracedView:
         self._model = model
         self._encoded = encoded
         self._resolution = resolution
-        is_recorded = any(scene.place is not None for scene in encoded.surfaces)
-        self._trace = Replayed(self._tensors) if is_recorded else self._tensors
-        self._decode = Replayed(self._picture) if is_recorded else self._picture
+        self._trace = Replayed(self._tensors)
+        self._decode = Replayed(self._picture)
 
     def __call__(self, c2w_44: Tensor, fov_deg: Tensor) -> Tensor:
         """Return linear radiance [R, R, 3] of at least 0."""

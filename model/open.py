@@ -199,17 +199,13 @@ def save_published(model: RenderFormer, folder: Path) -> None:
 def _read_config(path: Path) -> PublishedConfig:
     try:
         with open_plain(path) as file:
-            fields = json.loads(file.read(MAX_CONFIG_BYTES))
+            text = file.read(MAX_CONFIG_BYTES)
     except OSError as error:
         raise TrilightError(
             f"{path}: cannot be read ({error.strerror}); weights that carry no configuration of "
             "ours need the published one beside them."
         ) from error
-    except (ValueError, RecursionError) as error:
-        raise TrilightError(f"{path}: not JSON ({error}).") from error
-    if not isinstance(fields, dict):
-        raise TrilightError(f"{path}: expected a JSON object.")
-    return decode_published_config(fields)
+    return decode_published_config(read_json(text, dict[str, Any], str(path)))
 
 
 def _download(name: str) -> Path:

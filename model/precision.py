@@ -13,7 +13,7 @@ in a separate kernel, and its gradient in another one: hundreds of launches with
 layer's weights are rounded together; every number is exactly that of autocast.
 """
 
-from collections.abc import Iterable, Iterator, Mapping
+from collections.abc import Iterable, Iterator
 from contextlib import AbstractContextManager, contextmanager, nullcontext
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
@@ -156,13 +156,10 @@ def rounded_weights(
         if weight.dtype == torch.float32
         and (weight.ndim > 1 if parts is None else id(weight) in inside)
     }
-    return _round_together(torch.get_autocast_dtype(kind), rounded)
-
-
-def _round_together(to: torch.dtype, weights: Mapping[str, Tensor]) -> dict[str, Tensor]:
-    if not weights:
+    if not rounded:
         return {}
-    return dict(zip(weights, _RoundTogether.apply(to, *weights.values()), strict=True))
+    values = _RoundTogether.apply(torch.get_autocast_dtype(kind), *rounded.values())
+    return dict(zip(rounded, values, strict=True))
 
 
 class _RoundTogether(torch.autograd.Function):

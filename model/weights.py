@@ -6,6 +6,7 @@ import json
 from collections.abc import Mapping
 from dataclasses import asdict, dataclass
 from pathlib import Path
+from typing import Any
 
 import torch
 from safetensors import SafetensorError
@@ -14,13 +15,15 @@ from torch import Tensor
 
 from model.config import REMOVED, ModelConfig
 from model.renderformer import RenderFormer
-from storage.errors import TrilightError, without_removed
+from storage.errors import TrilightError, prefix_errors, without_removed
 from storage.records.safe_read import (
     MAX_HEADER_BYTES,
+    name_unreadable,
     open_plain,
     read_safetensors,
     safetensors_header,
 )
+from storage.settings.described import from_record
 from storage.typed_json import read_json
 
 RANGE_KEY = "trilight_trained_range"
@@ -125,20 +128,16 @@ def read_tensors(path: Path) -> tuple[dict[str, Tensor], dict[str, str]]:
     """
     metadata = read_metadata(path)
     try:
-        return load_file(path), metadata
-    except OSError as error:
-        raise TrilightError(f"{path}: cannot be read ({error.strerror}).") from error
+        with name_unreadable(path):
+            return load_file(path), metadata
     except (SafetensorError, KeyError) as error:
         raise TrilightError(f"{path}: unreadable ({error}).") from error
 
 
 def read_metadata(path: Path) -> dict[str, str]:
     """Return the metadata of a safetensors file without its tensors; raises as `read_tensors`."""
-    try:
-        with open_plain(path) as file:
-            start = file.read(8 + MAX_HEADER_BYTES)
-    except OSError as error:
-        raise TrilightError(f"{path}: cannot be read ({error.strerror}).") from error
+    with name_unreadable(path), open_plain(path) as file:
+        start = file.read(8 + MAX_HEADER_BYTES)
     if start[:2] in (b"PK", b"\x80\x02", b"\x80\x04"):
         raise TrilightError(
             f"{path}: pickled code, which a checkpoint could run; expected safetensors. "
@@ -211,13 +210,7 @@ def decode_config(text: str, source: str = "network") -> ModelConfig:
     Raises:
         TrilightError: the JSON is invalid, or uses removed settings.
     """
-    try:
-        fields = without_removed(json.loads(text), REMOVED, f"{source}: model")
-        lists = {name: tuple(value) for name, value in fields.items() if isinstance(value, list)}
-        return ModelConfig(**fields | lists)
-    except TrilightError:
-        raise
-    except (TypeError, ValueError, AttributeError, RecursionError) as error:
-        raise TrilightError(
-            f"{source}: its model configuration is not readable ({error})."
-        ) from error
+    fields = read_json(text, dict[str, Any], f"{source}: its model configuration")
+    known = without_removed(fields, REMOVED, f"{source}: model")
+    with prefix_errors(f"{source}: model"):
+        return from_record(ModelConfig, known)

@@ -313,16 +313,14 @@ def scale_intervals(run: TrainSettings, steps: int, stated: Mapping[str, Any]) -
     if not 0 < steps < run.num_steps:
         return {}
     # other values are refused, by name, when the settings are made
-    intervals = {name: value for name in _INTERVALS if isinstance(value := stated.get(name), int)}
-    intervals = {name: value for name, value in intervals.items() if value > 0}
+    known = {name: value for name, value in stated.items() if isinstance(value, int)}
+    intervals = {name: known[name] for name in _INTERVALS if known.get(name, 0) > 0}
 
     def shorter(name: str, unit: int) -> int:
         exact = getattr(run, name) * steps / run.num_steps
         return int(intervals.get(name, max(round(exact / unit), 1) * unit))
 
-    on_rows = [
-        intervals[name] for name in ("validate_every", "checkpoint_every") if name in intervals
-    ]
+    on_rows = (intervals.get(name, 0) for name in ("validate_every", "checkpoint_every"))
     row = math.gcd(shorter("log_every", 1), *on_rows)
     scaled_steps = {
         "warmup_steps": round(run.warmup_steps * steps / run.num_steps),

@@ -11,7 +11,7 @@ from dataclasses import dataclass, field
 from typing import Any, Literal
 
 from storage.errors import TrilightError
-from storage.settings.described import from_record, settings_record
+from storage.settings.described import checked, from_record, settings_record
 from storage.settings.fields import describe_fields
 from storage.settings.overrides import apply_overrides
 from train.settings import TrainSettings, decay_start_step, known_settings
@@ -31,25 +31,32 @@ _HOW = "--set from_weights"
 _EXECUTION = frozenset(field.name for field in describe_fields(TrainSettings) if field.is_execution)
 
 
-@dataclass(frozen=True, kw_only=True)
+@checked()
 class StartOptions:
-    """Options of how a run starts or resumes."""
+    """How a run starts or resumes.
+
+    On the CPU, with the same number of threads and processes, a resumed run has exactly the weights
+    of an uninterrupted one. A finished run is judged again. A run that resumes has branched already
+    and ignores `branch`.
+    """
 
     resume: bool = False
-    """Resume from the folder's newest checkpoint. On the CPU, with the same number of threads and
-    processes, the weights are exactly those of an uninterrupted run. A finished run is judged
-    again."""
+    """Continue from the newest checkpoint, with the settings of the start. Settings of execution
+    may differ."""
     restartable: bool = False
-    """Resume if the folder has a checkpoint, else start: one command serves every restart."""
+    """Resume if the folder has a checkpoint, else begin. A scheduler may then start the same
+    command repeatedly; a restart by torchrun always resumes."""
     branch: str | None = None
-    """Checkpoint or run folder whose state a new folder continues: steps, optimizer state and
-    position in the data. A run that resumes has branched already and ignores it."""
+    """Checkpoint, or folder of a run, to continue in a new folder; by default none."""
     decisions: Mapping[str, Any] = field(default_factory=dict)
-    """Settings by dotted name that change from the checkpoint on; the run records them."""
+    """Recorded changes with --resume or --branch, such as num_steps=20000; by default none. They
+    apply from the checkpoint on."""
     begin_with: str | None = None
-    """Path or name of the network whose weights a run with `from_weights` starts with."""
+    """Run folder or checkpoint with the initial weights of a finetune run; by default random
+    weights."""
     lpips: str | None = None
-    """Source of the LPIPS weights (train.loss.lpips.load_lpips)."""
+    """Folder of vgg16-397923af.pth and vgg.pth (LPIPS), or hub; by default the value of
+    TRILIGHT_LPIPS."""
 
     @property
     def continues_run(self) -> bool:

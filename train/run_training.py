@@ -1,6 +1,7 @@
 """One training run, started or resumed, from a dataset to weights, scores and a sheet."""
 
 import dataclasses
+import os
 import platform
 import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
@@ -43,8 +44,7 @@ from train.loop.optimizer import choose_muon_precision
 from train.loop.recorder import Recorder, require_wandb
 from train.loop.train_state import TrainState, new_state
 from train.loop.trainer import Trainer, scene_flops
-from train.loss.lpips import load_lpips
-from train.loss.training_loss import TrainingLoss
+from train.loss.training_loss import TrainingLoss, load_lpips
 from train.progress import TrainProgress
 from train.resume import Event, ResumePlan, StartOptions, plan_resume
 from train.settings import TrainSettings, WatchSettings, stored_settings
@@ -130,6 +130,9 @@ MEDIAN_SCENES = 256
 
 VALIDATION = "validation"
 """Split of the scenes that a run is evaluated on and never trained on."""
+
+RESTARTS = "TORCHELASTIC_RESTART_COUNT"
+"""Environment variable in which torchrun counts the restarts of its processes."""
 
 UNJUDGED = (
     "the data has no validation split, so the network is not judged on scenes that it has never "
@@ -311,7 +314,8 @@ def plan_start(
     """
     # alike in all processes: torchrun counts restarts for each machine separately, and a network
     # file system shows a new file to one machine before another
-    has_checkpoint = dist_context.any(start.restartable and bool(saved_steps(folder.checkpoints)))
+    restarts = start.restartable or int(os.environ.get(RESTARTS, "0")) > 0
+    has_checkpoint = dist_context.any(restarts and bool(saved_steps(folder.checkpoints)))
     start = dataclasses.replace(start, resume=start.resume or has_checkpoint, restartable=False)
     if not start.resume and saved_steps(folder.checkpoints):
         raise TrilightError(

@@ -131,7 +131,7 @@ def _run_training(
                 settings,
                 data=list(options.data),
                 out=Path(options.place),
-                start=options.start(),
+                start=options,
                 workers=options.workers,
                 watched=watched,
                 dist_context=crew,
@@ -148,7 +148,7 @@ def _run_training(
 
 def _announce(options: TrainOptions, settings: TrainSettings) -> None:
     """Print the start or the continuation of a run, before torch is imported."""
-    if options.start().continues_run:  # how, the checkpoint says
+    if options.continues_run:  # how, the checkpoint says
         console.print(f"Run {settings.run} goes on. Loading torch and the checkpoint ...")
         return
     if (steps := options.steps) is not None:

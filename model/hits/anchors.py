@@ -19,8 +19,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from model.hits.direct_light import chosen_lamp_light, lamp_chances, lobe_ray_weight
-from model.hits.lit_scene import LitScene, PerPoint, Points, gloss_at, lobe, sample_lobe
-from model.hits.vectors import Floats, at_rows, brightest, cosine_direction, dot, spread, unit
+from model.hits.lit_scene import LitScene, PerPoint, Points, gloss_at, sample_lobe
+from model.hits.vectors import Floats, at_rows, brightest, cosine_direction, spread, unit
 from storage.conventions import focal_px
 from storage.seeds import rng_for
 
@@ -105,17 +105,15 @@ def _mirrored_radiance(
     mirror_points = points.only(rows)
     gloss = gloss_at(scene, mirror_points)
     onward, weight = sample_lobe(gloss, mirror_points, on_lamp)
-    beyond, is_hit = scene.meet(scene.everything, mirror_points.start(onward), onward)
+    beyond, is_hit = scene.meet(mirror_points.start(onward), onward)
     seen = outgoing_radiance(scene, beyond, u_lamp, on_lamp[::-1], is_sharp, mirrors=mirrors - 1)
     lit = np.flatnonzero(is_sharp & is_hit & scene.emits[beyond.triangle])
     if len(lit) and len(scene.lamps):  # on a GPU, `lit` are all rows
-        some = mirror_points.only(lit)
         lamp_points = beyond.only(lit)
-        along = at_rows(onward, lit)
-        _, density = lobe(gloss.only(lit), some, along, dot(some.normal, along))
         number = np.searchsorted(scene.lamps, lamp_points.triangle).clip(0, len(scene.lamps) - 1)
         chance = chances[number, rows[lit]]
-        mis_weight = lobe_ray_weight(scene, lamp_points, some.position, density, chance)
+        rays = gloss.only(lit), mirror_points.only(lit), at_rows(onward, lit)
+        mis_weight = lobe_ray_weight(scene, *rays, lamp_points, chance)
         seen[:, lit] += np.take(scene.emission, lamp_points.triangle, axis=1) * mis_weight
     arrives = np.where(is_hit, weight * seen, np.float32(0))
     if scene.sky is not None:
@@ -262,7 +260,7 @@ def _gather_light(scene: LitScene, points: Points, shift: Floats, gather_rays: i
     for part in blocks(scene, count * gather_rays):
         anchor_points = points.only(owner[part])
         direction = cosine_direction(u[:2, part], anchor_points.normal, anchor_points.edge)
-        beyond, is_hit = scene.meet(scene.everything, anchor_points.start(direction), direction)
+        beyond, is_hit = scene.meet(anchor_points.start(direction), direction)
         spreads = np.zeros_like(is_hit)
         radiance = outgoing_radiance(scene, beyond, u_lamp[part], u[2:, part], spreads)
         total[:, part] = np.where(is_hit, radiance, np.float32(0))
@@ -271,10 +269,7 @@ def _gather_light(scene: LitScene, points: Points, shift: Floats, gather_rays: i
 
 def _van_der_corput(count: int) -> Floats:
     """Return the first `count` numbers of the sequence of base 2 (van der Corput 1935)."""
-    number = np.arange(count)
-    total = np.zeros(count)
-    share = 0.5
-    while number.any():
-        total += share * (number & 1)
-        number, share = number >> 1, share / 2
-    return total.astype(np.float32)
+    bits = np.arange(count.bit_length())
+    digits = np.arange(count)[:, None] >> bits & 1
+    numbers: Floats = (digits * 0.5 ** (bits + 1)).sum(axis=1)
+    return numbers.astype(np.float32)

@@ -10,6 +10,7 @@ import copy
 import operator
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
+from dataclasses import is_dataclass
 from typing import Any
 
 import numpy as np
@@ -19,7 +20,6 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from storage.digests import sha256_hex
-from storage.records.environment import Environment
 
 _TYPES = {
     np.dtype(np.float32): torch.float32,
@@ -50,11 +50,11 @@ class DevicePlace:
 
         Args:
             holder: not changed.
-            but: names of arrays that stay on the host.
+            but: names of what stays on the host.
         """
         moved = copy.copy(holder)
         for name, each in vars(holder).items():
-            if name not in but and isinstance(each, np.ndarray | Environment):
+            if name not in but and (isinstance(each, np.ndarray) or is_dataclass(each)):
                 new = self.array(each) if isinstance(each, np.ndarray) else self.copy_here(each)
                 object.__setattr__(moved, name, new)  # of a frozen record too
         return moved

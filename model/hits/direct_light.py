@@ -124,9 +124,10 @@ def _total(of_lamps: Floats) -> Floats:
 
 def lobe_ray_weight(
     scene: LitScene,
+    gloss: Gloss,
+    points: Points,
+    along: Floats,
     hit_points: Points,
-    start: Floats,
-    density: Floats,
     chance: Floats | float = 1.0,
 ) -> Floats:
     """Return the share [P] of a lamp's emission that a ray drawn by the lobe has to bring.
@@ -134,12 +135,13 @@ def lobe_ray_weight(
     The rest is what `direct_light` brings, or `chosen_lamp_light`.
 
     Args:
-        hit_points: what the rays hit, lamps or not.
-        start: [3, P] where they began.
-        density: [P] of the lobe along the rays.
+        gloss, points: where the rays began.
+        along: [3, P] their directions.
+        hit_points: what they hit, lamps or not.
         chance: [P] with which the lamp would have been chosen there; of `direct_light`, 1.
     """
-    to_hit = hit_points.position - start
+    _, density = lobe(gloss, points, along, dot(points.normal, along))
+    to_hit = hit_points.position - points.position
     facing = np.abs(dot(at_rows(scene.plane, hit_points.triangle), hit_points.to_viewer))
     square = np.maximum(dot(to_hit, to_hit), np.float32(1e-12))
     solid = (
@@ -158,7 +160,7 @@ def lamp_chances(scene: LitScene, points: Points, gloss: Gloss) -> Floats:
     """
     shape = len(scene.lamps), points.position.shape[1]
     power_at_points = np.zeros_like(gloss.alpha, shape=shape)
-    albedo = scene.diffuse.mean(axis=0)[points.triangle] * _INV_PI
+    albedo = scene.means.diffuse.mean(axis=0)[points.triangle] * _INV_PI
     color = gloss.color.mean(axis=0)
     lit_points = points.only(None)
     gloss = gloss.only(None)

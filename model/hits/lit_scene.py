@@ -52,8 +52,11 @@ MaterialName = Literal["diffuse", "specular", "alpha", "multiscatter", "roughnes
 class PerPoint:
     """Arrays [..., P] of P points, triangles or pixels, or None."""
 
-    def only(self, rows: Any) -> Self:
-        """Return some of them; of None, all with an axis before that of points."""
+    def only(self, rows: Any, *, but: str = "") -> Self:
+        """Return some of them; of None, all with an axis before that of points.
+
+        `but` names a field that stays as it is.
+        """
         some = {
             name: each.only(rows)
             if isinstance(each, PerPoint)
@@ -61,7 +64,7 @@ class PerPoint:
             if rows is None
             else at_rows(each, rows)
             for name, each in vars(self).items()
-            if each is not None
+            if each is not None and name != but
         }
         return replace(self, **some)
 
@@ -232,12 +235,7 @@ class LitScene:
         across = np.cross(edges[0], edges[1], axis=0)
         self.area = 0.5 * np.sqrt(dot(across, across))
         self.plane = unit(across)
-        means = reflectance_of(materials_TM)
-        self.diffuse = means.diffuse
-        self.specular = means.specular
-        self.multiscatter = means.multiscatter
-        self.alpha = means.alpha
-        self.roughness = means.roughness
+        self.means = reflectance_of(materials_TM)
         self.textures: Any = textures  # on a GPU `DeviceTextures`
         self._materials_TM = materials_TM
         self.sky = sky
@@ -266,7 +264,7 @@ class LitScene:
 
     def on(self, place: DevicePlace, caster: Callable[..., RayCaster]) -> "LitScene":
         """Return the scene and its light on a device, where `caster` prepares its rays."""
-        moved = place.copy_here(self, but=("lamps", "sky", "_corner_rows"))
+        moved = place.copy_here(self, but=("lamps", "sky", "textures", "light", "_corner_rows"))
         moved.place = place
         moved.light = place.copy_here(self.light)
         if self.textures is not None:
@@ -309,10 +307,10 @@ class LitScene:
 
     def material_at(self, points: Points, name: MaterialName) -> Floats:
         """Return an entry of `Reflectance` at points: [3, P], or [P] of alpha and roughness."""
-        if points.reflectance is not None:
-            at_points: Floats = getattr(points.reflectance, name)
-            return at_points
-        return np.take(getattr(self, name), points.triangle, axis=-1)
+        if points.reflectance is None:
+            return np.take(getattr(self.means, name), points.triangle, axis=-1)
+        at_points: Floats = getattr(points.reflectance, name)
+        return at_points
 
     def points(self, triangle: NDArray[np.intp], uv: Floats, direction: Floats) -> Points:
         """Return the points at which rays along unit `direction` [3, P] meet triangles.
@@ -350,12 +348,12 @@ class LitScene:
         start = np.broadcast_to(origin, (direction.shape[1], 3))
         return self.seen.intersect(start.copy(), as_rows(direction))
 
-    def meet(self, among: RayCaster, start: Floats, direction: Floats) -> tuple[Points, NDArray]:
-        """Return the points that rays [3, P] meet first among triangles, and which rays do.
+    def meet(self, start: Floats, direction: Floats) -> tuple[Points, NDArray]:
+        """Return the points that rays [3, P] meet first, and which rays meet any.
 
         Of a ray that meets nothing, the point is one of the first triangle and means nothing.
         """
-        hits = among.intersect(as_rows(start), as_rows(direction))
+        hits = self.everything.intersect(as_rows(start), as_rows(direction))
         is_hit = hits.triangle >= 0
         return self.points(np.maximum(hits.triangle, 0), hits.uv, direction), is_hit
 

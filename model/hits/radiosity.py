@@ -140,10 +140,10 @@ def _bounce_light(scene: LitScene, direct_2T3: Floats, rng: np.random.Generator)
     for trial in range(RAYS):
         points = _points(scene, rows, spread(on_triangle, trial))
         direction = cosine_direction(spread(towards, trial), points.normal, points.edge)
-        hits, is_hit = scene.meet(scene.everything, points.start(direction), direction)
+        hits, is_hit = scene.meet(points.start(direction), direction)
         side = hits.triangle + scene.num_triangles * hits.back
         faced[trial] = np.where(is_hit, side, len(rows))
-    reflects = np.tile((scene.diffuse + scene.specular).T, (2, 1))
+    reflects = np.tile((scene.means.diffuse + scene.means.specular).T, (2, 1))
     received = direct_2T3.reshape(-1, 3)
     arrived = np.zeros_like(received)
     for _ in range(BOUNCES):

@@ -58,17 +58,6 @@ class Traced:
         return replace(self, pixels_VRRC=pixels, gathered_VA3=gathered, given_VI=available)
 
 
-def with_others_tokens(traced: Traced, other: Traced | None) -> Traced:
-    """Return the views of a scene with what the triangles of another one receive.
-
-    It is scaled to the unit of `traced`, so that the other scene is neither brighter nor darker.
-    """
-    if other is None:
-        return traced
-    sides_T12 = other.sides_T12 * (traced.unit_3 / other.unit_3).repeat(4)
-    return replace(traced, sides_T12=sides_T12)
-
-
 def stack_traced(scenes: Sequence[Traced]) -> Traced:
     """Return the batch of scenes, their triangles padded with zeros."""
     names = [each.name for each in fields(Traced) if each.name != "sides_T12"]

@@ -85,12 +85,8 @@ def traced_cameras(
 
     It is where the cameras are, and of their type.
     """
-    traced = [
-        traced_views(scene, c2w_V44, fov_deg_V, resolution, config)
-        for scene, c2w_V44, fov_deg_V in zip(
-            scenes, cameras.c2w_BV44, cameras.fov_deg_BV, strict=True
-        )
-    ]
+    views = zip(scenes, cameras.c2w_BV44, cameras.fov_deg_BV, strict=True)
+    traced = [traced_views(*each, resolution, config) for each in views]
     return map_tensors(stack_traced(traced), lambda each: like(each, cameras.fov_deg_BV))
 
 
@@ -133,12 +129,8 @@ def albedo_of_cameras(
     scenes: tuple[LitScene, ...], cameras: Cameras, resolution: int, rays_a_side: int
 ) -> Tensor:
     """Return the albedo [B, V, R, R, 6] that cameras see: where they are, and of their type."""
-    albedo = [
-        albedo_of_views(scene, c2w_V44, fov_deg_V, resolution, rays_a_side)
-        for scene, c2w_V44, fov_deg_V in zip(
-            scenes, cameras.c2w_BV44, cameras.fov_deg_BV, strict=True
-        )
-    ]
+    views = zip(scenes, cameras.c2w_BV44, cameras.fov_deg_BV, strict=True)
+    albedo = [albedo_of_views(*each, resolution, rays_a_side) for each in views]
     return like(torch.stack(albedo), cameras.fov_deg_BV)
 
 
@@ -150,8 +142,8 @@ def albedo_of_views(
     Rays go to the first triangle that is no lamp. Each pixel is the mean over its rays_a_side^2
     rays; a miss counts as black.
     """
-    nothing = np.zeros((6, 1), np.float32)  # the last column, which a miss picks
-    table = np.concatenate([np.concatenate([scene.diffuse, scene.specular]), nothing], axis=1)
+    albedo = np.concatenate([scene.means.diffuse, scene.means.specular])
+    table = np.pad(albedo, ((0, 0), (0, 1)))  # the last column, black, is what a miss picks
     views = []
     for c2w_44, fov_deg in zip(c2w_V44.detach().cpu().numpy(), fov_deg_V, strict=True):
         rays = Rays(c2w_44, float(fov_deg), resolution, rays_a_side)

@@ -33,7 +33,7 @@ from model.hits.direct_light import (
     lobe_ray_weight,
     no_light,
 )
-from model.hits.lit_scene import Gloss, LitScene, PerPoint, Points, gloss_at, lobe, sample_lobe
+from model.hits.lit_scene import Gloss, LitScene, PerPoint, Points, gloss_at, sample_lobe
 from model.hits.vectors import Floats, at_rows, brightest, dot, spread
 from storage.seeds import rng_for
 
@@ -197,7 +197,7 @@ def _add_pixels(
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
-class _Block:
+class _Block(PerPoint):
     """Points that are shaded together, and where their light is added up."""
 
     points: Points
@@ -210,17 +210,6 @@ class _Block:
     """[P] number of its ray among those of the pixel."""
     weight: NDArray[np.float32]
     """[P] number of the pixel's rays that it stands for."""
-
-    def only(self, rows: NDArray[np.intp]) -> "_Block":
-        """Return some of the points."""
-        return replace(
-            self,
-            points=self.points.only(rows),
-            gloss=self.gloss.only(rows),
-            pixel=self.pixel[rows],
-            ray_index=self.ray_index[rows],
-            weight=self.weight[rows],
-        )
 
     def add(
         self, channel: slice, values: NDArray[np.float32], rows: NDArray[np.intp] | None = None
@@ -270,7 +259,7 @@ def _shading_points(
         is_one &= False
     sends_one = is_one
     if has_lobe_rays:
-        is_mirror = (scene.alpha < SMOOTH_ALPHA) & (brightest(scene.specular) > DIMMEST)
+        is_mirror = (scene.means.alpha < SMOOTH_ALPHA) & (brightest(scene.means.specular) > DIMMEST)
         sends_one = is_one & ~is_mirror[triangle[0]]
     stands = (triangle >= 0) & (alone | ~sends_one)
     ray_index, pixel = np.nonzero(stands)
@@ -295,7 +284,7 @@ def _shading_points(
     each_alpha = np.float32(np.inf) if shades_each else SMOOTH_ALPHA
     shading = np.where(by_lobe.gloss.alpha < each_alpha, by_lobe.weight, chosen)
     if scene.place is None:
-        return lit.only(np.flatnonzero(weight)), by_lobe, shading
+        return lit.only(np.flatnonzero(weight), but="sums"), by_lobe, shading
     return lit, replace(by_lobe, sums=np.zeros_like(sums)), shading
 
 
@@ -348,15 +337,13 @@ def _add_lobe_rays(
         return
     points = block.points.only(some)
     gloss = block.gloss.only(some)
-    beyond, is_hit = scene.meet(scene.everything, points.start(direction), direction)
+    beyond, is_hit = scene.meet(points.start(direction), direction)
     arrives = gloss.color * np.where(is_hit, weight, np.float32(0))
     lamps = np.flatnonzero(is_hit & scene.emits[beyond.triangle])
     if len(lamps):
-        glossy_points = points.only(lamps)
         lamp_points = beyond.only(lamps)
-        along = at_rows(direction, lamps)
-        _, density = lobe(gloss.only(lamps), glossy_points, along, dot(glossy_points.normal, along))
-        mis_weight = lobe_ray_weight(scene, lamp_points, glossy_points.position, density)
+        rays = gloss.only(lamps), points.only(lamps), at_rows(direction, lamps)
+        mis_weight = lobe_ray_weight(scene, *rays, lamp_points)
         emission = np.take(scene.emission, lamp_points.triangle, axis=1)
         emitted = at_rows(arrives, lamps) * emission * mis_weight
         block.add(Channel.DIRECT_SPECULAR, emitted, some[lamps])

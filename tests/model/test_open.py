@@ -98,7 +98,7 @@ def test_removed_settings_are_refused_where_they_are_used_and_no_configuration_a
             decode_weights(stating(**{name: value}))
     with pytest.raises(TrilightError, match="the file has no trilight_model entry"):
         decode_weights(save(load(data)))
-    with pytest.raises(TrilightError, match="width is missing"):
+    with pytest.raises(TrilightError, match="^network: model: setting 'width' is missing"):
         decode_weights(save(load(data), metadata={CONFIG_KEY: "{}"}))
 
 

@@ -57,7 +57,7 @@ from train.evaluation.metrics import NETWORK, summarize_views
 from train.evaluation.validation import MEDIAN, NEAREST, predict
 from train.loop.distributed import DistributedContext
 from train.loop.train_state import TrainState, new_state
-from train.loss.lpips import LINEAR_FILE, VGG16_FILE, load_lpips
+from train.loss.training_loss import LINEAR_FILE, VGG16_FILE, load_lpips
 from train.presets import override_training_preset
 from train.resume import StartOptions
 from train.run_training import run_training

@@ -68,6 +68,14 @@ class BadSampleCounter:
                 f"{text}"
             ) from error
 
+    def add_shard(self, shards: ShardSet, number: int, error: TrilightError) -> None:
+        """Count all samples of a damaged shard as `add`; 1 if its index is damaged too."""
+        try:
+            num_samples = shards.num_samples(number)
+        except TrilightError:
+            num_samples = 1
+        self.add(shards.names[number], num_samples, error)
+
 
 def first_samples(
     shards: ShardSet, limit: int, unusable: BadSampleCounter | None = None
@@ -89,7 +97,7 @@ def first_samples(
             try:
                 shard = shards.open(number)
             except TrilightError as error:
-                unusable.add(shards.names[number], count_lost_samples(shards, number), error)
+                unusable.add_shard(shards, number, error)
                 continue
             with closing(shard):
                 for row, key in enumerate(shard.keys[:remaining]):
@@ -100,11 +108,3 @@ def first_samples(
                         continue
                     yield sample
                     remaining -= 1
-
-
-def count_lost_samples(shards: ShardSet, number: int) -> int:
-    """Return the number of samples of a damaged shard; 1 if its index is damaged too."""
-    try:
-        return shards.num_samples(number)
-    except TrilightError:
-        return 1

@@ -10,7 +10,7 @@ import itertools
 import os
 import threading
 from collections import Counter, deque
-from collections.abc import Callable, Generator, Iterable, Iterator, Sequence
+from collections.abc import Callable, Generator, Iterable, Iterator
 from concurrent.futures import Future, ThreadPoolExecutor
 from contextlib import closing, nullcontext
 from functools import partial
@@ -27,7 +27,7 @@ from storage.machine import allowed_cores, free_memory
 from storage.records.sample import StoredSample
 from storage.seeds import rng_for
 from train.data.augment import augment_scene, withhold_inputs
-from train.data.bad_samples import BadSampleCounter, count_lost_samples
+from train.data.bad_samples import BadSampleCounter
 from train.data.order import (
     Mixture,
     RankSlice,
@@ -80,8 +80,6 @@ def load_batches(
     mixture = mixture or single_dataset("", settings.scenes_per_step)
     with OpenShards(shards) as opened, ThreadPoolExecutor(max(workers, 1), "decode") as decoders:
         maker = _SceneMaker(shards, opened, settings, unusable)
-        counts = [partial(_count_samples, shards, unusable, part) for part in shards.parts]
-        plan = _plan_batches(shards, counts, settings, mixture, first, rank_slice, opened)
         waiting: deque[tuple[list[Visit], list[Callable[[], TrainingScene]]]] = deque()
 
         def begin(visit: Visit) -> Callable[[], TrainingScene]:
@@ -90,8 +88,9 @@ def load_batches(
 
         ahead = -(-PREFETCHED_SCENES * rank_slice.world_size // settings.scenes_per_step)
         depth = ahead if workers else 0
+        plan = maker.plan_batches(mixture, first, rank_slice)
         try:
-            with closing(prefetch(plan, _plan_ahead(shards, counts, settings, mixture))) as batches:
+            with closing(prefetch(plan, maker.batches_ahead(mixture))) as batches:
                 for mine in batches:
                     waiting.append((mine, [begin(visit) for visit in mine]))
                     if len(waiting) > depth:
@@ -156,58 +155,8 @@ def _close(future: Future[ShardReader]) -> None:
         future.result().close()
 
 
-def _count_samples(shards: ShardSet, unusable: BadSampleCounter, part: range, number: int) -> int:
-    """Return the size of a dataset's shard; an unusable one counts as empty."""
-    number += part.start
-    try:
-        return shards.num_samples(number)
-    except TrilightError as error:
-        unusable.add(shards.names[number], 1, error)
-        return 0
-
-
-def _plan_batches(
-    shards: ShardSet,
-    counts: Sequence[Callable[[int], int]],
-    settings: "TrainSettings",
-    mixture: Mixture,
-    first: int,
-    rank_slice: RankSlice,
-    opened: OpenShards,
-) -> Iterator[list[Visit]]:
-    """Yield this process's visits batch by batch, and start to open their shards."""
-    position = first * settings.scenes_per_step
-    begin = mixture.counts_before(position)
-    streams = [
-        visits_from(len(part), count, start, seed=settings.seed, window=settings.shuffle_shards)
-        for part, count, start in zip(shards.parts, counts, begin, strict=True)
-    ]
-    visits = mix_visits(mixture, streams, shards.parts, position)
-    while True:
-        mine = rank_slice.of_batch(tuple(itertools.islice(visits, settings.scenes_per_step)))
-        opened.plan(visit.shard for visit in mine)
-        yield mine
-
-
-def _plan_ahead(
-    shards: ShardSet,
-    counts: Sequence[Callable[[int], int]],
-    settings: "TrainSettings",
-    mixture: Mixture,
-) -> int:
-    """Return the number of batches to plan ahead: about a window, to open its shards in time.
-
-    With several datasets it is the window that ends first.
-    """
-    ahead = []
-    for part, count, weight in zip(shards.parts, counts, mixture.weights, strict=True):
-        window = count(shuffled_shards(len(part), settings.seed, 0)[0]) * settings.shuffle_shards
-        ahead.append(int(window * sum(mixture.weights) / weight) // settings.scenes_per_step)
-    return max(min(ahead), 1)
-
-
 class _SceneMaker:
-    """Makes the scene of a visit; called in several threads."""
+    """Plans the visits of a stream, and makes the scene of each in several threads."""
 
     def __init__(
         self,
@@ -221,6 +170,47 @@ class _SceneMaker:
         self._settings = settings
         self._unusable = unusable
         self._given_up: set[int] = set()
+
+    def plan_batches(
+        self, mixture: Mixture, first: int, rank_slice: RankSlice
+    ) -> Iterator[list[Visit]]:
+        """Yield this process's visits batch by batch, and start to open their shards."""
+        batch_size = self._settings.scenes_per_step
+        seed = self._settings.seed
+        window = self._settings.shuffle_shards
+        parts = self._shards.parts
+        position = first * batch_size
+        streams = [
+            visits_from(len(part), partial(self._count, part), start, seed=seed, window=window)
+            for part, start in zip(parts, mixture.counts_before(position), strict=True)
+        ]
+        visits = mix_visits(mixture, streams, parts, position)
+        while True:
+            mine = rank_slice.of_batch(tuple(itertools.islice(visits, batch_size)))
+            self._opened.plan(visit.shard for visit in mine)
+            yield mine
+
+    def batches_ahead(self, mixture: Mixture) -> int:
+        """Return the number of batches to plan ahead: about a window, to open its shards in time.
+
+        With several datasets it is the window that ends first.
+        """
+        settings = self._settings
+        ahead = []
+        for part, weight in zip(self._shards.parts, mixture.weights, strict=True):
+            first = shuffled_shards(len(part), settings.seed, 0)[0]
+            window = self._count(part, first) * settings.shuffle_shards
+            ahead.append(int(window * sum(mixture.weights) / weight) // settings.scenes_per_step)
+        return max(min(ahead), 1)
+
+    def _count(self, part: range, number: int) -> int:
+        """Return the size of a dataset's shard; an unusable one counts as empty."""
+        number += part.start
+        try:
+            return self._shards.num_samples(number)
+        except TrilightError as error:
+            self._unusable.add_shard(self._shards, number, error)
+            return 0
 
     def scene(self, visit: Visit) -> TrainingScene:
         """Return the augmented scene of a visit."""
@@ -246,8 +236,7 @@ class _SceneMaker:
             try:
                 shard = self._opened.read(number) if planned else self._shards.open(number)
             except TrilightError as error:
-                lost = count_lost_samples(self._shards, number)
-                self._unusable.add(self._shards.names[number], lost, error)
+                self._unusable.add_shard(self._shards, number, error)
                 continue
             with nullcontext() if planned else closing(shard):
                 usable = self._first_usable(shard, visit)

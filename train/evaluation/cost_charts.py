@@ -158,13 +158,20 @@ def _place_labels(
     ]
     frame = axes.get_window_extent()
     for name, at in names:
-        labels = [_label(axes, name, at, place) for place in _PLACES]
+        labels = []
+        for right, up, across, along in _PLACES:
+            label = axes.annotate(
+                name, at, xytext=(right, up), textcoords="offset points", fontsize=_FONT,
+                horizontalalignment=across, verticalalignment=along,
+            )  # fmt: skip
+            label.set_in_layout(False)  # else the axes made room for it, and positions changed
+            labels.append(label)
         boxes = [label.get_window_extent().padded(2) for label in labels]
         free = [
             row
             for row, box in enumerate(boxes)
-            if frame.x0 <= box.x0 and frame.y0 <= box.y0 and box.x1 <= frame.x1
-            and box.y1 <= frame.y1 and not any(box.overlaps(other) for other in taken)
+            if (frame.min <= box.min).all() and (box.max <= frame.max).all()
+            and not box.count_overlaps(taken)
         ]  # fmt: skip
         clear = [
             row
@@ -177,16 +184,6 @@ def _place_labels(
                 taken.append(boxes[row])
             else:
                 label.remove()
-
-
-def _label(axes: Any, name: str, at: tuple[float, float], place: tuple[int, int, str, str]) -> Any:
-    right, up, across, along = place
-    label = axes.annotate(
-        name, at, xytext=(right, up), textcoords="offset points", fontsize=_FONT,
-        horizontalalignment=across, verticalalignment=along,
-    )  # fmt: skip
-    label.set_in_layout(False)  # else the axes would make room for it, and positions would change
-    return label
 
 
 def plain_log(axis: Any) -> None:
@@ -255,16 +252,16 @@ def plot_excursions(path: Path, views: "Sequence[JudgedView]") -> int:
     Each axis has a plot: a dot is a view, the line the median at each value, the dashed line the
     median of the stated errors. Nothing is written if no view leaves the usual range.
     """
-    from matplotlib.figure import Figure
-
-    from train.evaluation.metrics import NETWORK
-
     axes: dict[str, list[JudgedView]] = {}
     for view in views:
         if view.excursion is not None:
             axes.setdefault(view.excursion[0], []).append(view)
     if not axes:
         return 0
+    from matplotlib.figure import Figure
+
+    from train.evaluation.metrics import NETWORK
+
     rows = -(-len(axes) // _COLUMNS)
     figure = Figure(figsize=(4.2 * _COLUMNS, 3.2 * rows), layout="constrained")
     grid = figure.subplots(rows, _COLUMNS, squeeze=False)

@@ -19,7 +19,7 @@ import torch
 from numpy.typing import NDArray
 from pydantic import SkipValidation
 
-from model.hits.traced import INPUTS, with_others_tokens
+from model.hits.traced import INPUTS
 from model.hits.tracing import with_traced
 from model.inference import NeuralRenderer, light_groups
 from model.renderformer import RenderFormer
@@ -49,7 +49,7 @@ from train.evaluation.metrics import (
 from train.evaluation.options import SceneCount, Width
 from train.evaluation.sheet import SheetView
 from train.evaluation.validation import Baselines, ValidationScene, predict, validation_scene
-from train.loss.lpips import Lpips
+from train.loss.training_loss import Lpips
 
 BASELINE_SCENES = 256
 """Number of training scenes for the baselines."""
@@ -195,8 +195,11 @@ def _add_swapped_scores(
     seen = dataclasses.replace(  # its albedo, which other cameras have seen, is traced again
         other, c2w_V44=cameras.c2w_V44, fov_deg_V=cameras.fov_deg_V, albedo_VRR6=None
     )
-    if cameras.traced is not None:
-        seen = dataclasses.replace(seen, traced=with_others_tokens(cameras.traced, other.traced))
+    if cameras.traced is not None and other.traced is not None:
+        # in the unit of these views, so that the other scene is neither brighter nor darker
+        ratio_12 = (cameras.traced.unit_3 / other.traced.unit_3).repeat(4)
+        traced = dataclasses.replace(cameras.traced, sides_T12=other.traced.sides_T12 * ratio_12)
+        seen = dataclasses.replace(seen, traced=traced)
     pictures_VRR3 = predict(config.network, seen, config.resolution)
     return [
         dataclasses.replace(row, swapped_psnr_log_db=psnr_log_db(picture, target))
@@ -220,20 +223,21 @@ def sheet_views(config: EvalConfig, chosen: Sequence[JudgedView]) -> list[SheetV
     return [sheet_of_view[row.key, row.view] for row in chosen]
 
 
-def worst_and_median(rows: Sequence[JudgedView]) -> dict[str, list[JudgedView]]:
-    """Return the rows with the lowest and with the median psnr_log_db, worst first."""
+def rows_of_sheets(rows: Sequence[JudgedView]) -> dict[str, list[JudgedView]]:
+    """Return the rows of each sheet, by psnr_log_db: the worst ones, and those around the median.
+
+    If any scene is outside the usual range, also the worst row of each axis, sorted by axis.
+    """
     ranked = sorted(rows, key=lambda row: row.scores[NETWORK]["psnr_log_db"] or 0.0)
     start = max((len(ranked) - SHEET_VIEWS) // 2, 0)
-    return {"worst": ranked[:SHEET_VIEWS], "median": ranked[start : start + SHEET_VIEWS]}
-
-
-def worst_of_each_excursion(rows: Sequence[JudgedView]) -> list[JudgedView]:
-    """Return the worst row of each axis outside the usual range, sorted by axis."""
     worst: dict[str, JudgedView] = {}
-    for row in sorted(rows, key=lambda row: row.scores[NETWORK]["psnr_log_db"] or 0.0):
+    for row in ranked:
         if row.excursion is not None:
             worst.setdefault(row.excursion[0], row)
-    return [worst[axis] for axis in sorted(worst)]
+    sheets = {"worst": ranked[:SHEET_VIEWS], "median": ranked[start : start + SHEET_VIEWS]}
+    return sheets | (
+        {"worst of each axis": [worst[axis] for axis in sorted(worst)]} if worst else {}
+    )
 
 
 def _sheet_view(row: JudgedView, scene: TrainingScene, picture: NDArray[np.float64]) -> SheetView:
@@ -331,10 +335,8 @@ def time_scene(renderer: Renderer, scene: Scene, name: str, rounds: int = 1) -> 
 
 def median_price(prices: Sequence[Price]) -> Price:
     """Return the medians of prices."""
-    return Price(
-        first_s=float(np.median([price.first_s for price in prices])),
-        further_s=float(np.median([price.further_s for price in prices])),
-    )
+    first_s, further_s = np.median([dataclasses.astuple(price) for price in prices], axis=0)
+    return Price(first_s=float(first_s), further_s=float(further_s))
 
 
 TRACER = "path tracer, same time"

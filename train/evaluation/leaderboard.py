@@ -41,7 +41,7 @@ from train.evaluation.metrics import (
     summarize_views,
 )
 from train.evaluation.validation import PictureSource, ValidationScene, validation_scene
-from train.loss.lpips import Lpips
+from train.loss.training_loss import Lpips
 
 UNKNOWN_MACHINE = "a machine that is not named"
 """Machine of old rows, which do not name theirs."""

@@ -26,8 +26,7 @@ from storage.records.material import ROUGHNESS
 from storage.records.sample import Sample, ViewRecord
 from storage.registry import Registry
 from storage.seeds import rng_for
-from train.loss.lpips import Lpips
-from train.loss.training_loss import ssim, tone_map
+from train.loss.training_loss import Lpips, ssim, tone_map
 
 VALIDATED = ("log_l1", "psnr_log_db", "psnr_linear_db", "object_psnr_log_db")
 """Metrics of the validations of a run."""
@@ -348,13 +347,13 @@ SPLITS: Mapping[str, Callable[[JudgedView], str]] = {
 
 def by_group(views: Sequence[JudgedView]) -> dict[str, dict[str, dict[str, Any]]]:
     """Return the network's summary by grouping and group, in the order of the groups."""
-    groups: dict[str, dict[str, dict[str, Any]]] = {}
-    for name, part_of in SPLITS.items():
-        groups[name] = {
+    return {
+        name: {
             part: summarize_views([view for view in views if part_of(view) == part])
             for part in sorted(set(map(part_of, views)), key=_order)
         }
-    return groups
+        for name, part_of in SPLITS.items()
+    }
 
 
 def summarize_views(views: Sequence[JudgedView], contestant: str = NETWORK) -> dict[str, Any]:

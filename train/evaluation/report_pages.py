@@ -335,9 +335,8 @@ def _lead_cells(lead: PairedLead | None) -> dict[str, float | None]:
 def _csv(rows: Iterable[Mapping[str, object]]) -> bytes:
     """Return rows with the same columns as CSV; None is an empty cell."""
     stream = io.StringIO(newline="")
-    for number, row in enumerate(rows):
-        writer = csv.DictWriter(stream, list(row), lineterminator="\n")
-        if number == 0:
-            writer.writeheader()
-        writer.writerow(row)
+    if each := list(rows):
+        writer = csv.DictWriter(stream, each[0], lineterminator="\n")
+        writer.writeheader()
+        writer.writerows(each)
     return stream.getvalue().encode(errors="replace")

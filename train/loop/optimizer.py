@@ -171,23 +171,17 @@ class StackedMuon(torch.optim.Muon):
         """
         super().__init__(matrices, weight_decay=weight_decay, adjust_lr_fn="match_rms_adamw")
         self._products = PRECISIONS[precision].dtype
-        cut = {id(weight) for weight in thirds}
-        self._thirds = [
-            [id(weight) in cut for weight in group["params"]] for group in self.param_groups
-        ]
+        self._thirds = set(thirds)
 
     @torch.no_grad()
     def step(self, closure: None = None) -> None:  # type: ignore[override]
         """Update every matrix that has a gradient."""
-        for group, thirds in zip(self.param_groups, self._thirds, strict=True):
-            weight_cuts = zip(group["params"], thirds, strict=True)
-            held = [
-                (weight, 3 if cut else 1) for weight, cut in weight_cuts if weight.grad is not None
-            ]
-            moved = [weight for weight, _ in held]
+        for group in self.param_groups:
+            moved = [weight for weight in group["params"] if weight.grad is not None]
             by_shape = defaultdict[torch.Size, list[tuple[Tensor, Tensor]]](list)
             directions = self._momentum_directions(moved, group["momentum"])
-            for (weight, parts), direction in zip(held, directions, strict=True):
+            for weight, direction in zip(moved, directions, strict=True):
+                parts = 3 if weight in self._thirds else 1
                 for pair in zip(weight.chunk(parts), direction.chunk(parts), strict=True):
                     by_shape[pair[0].shape].append(pair)
             for pairs in by_shape.values():

@@ -2,7 +2,7 @@
 
 `Stepper.launch` enqueues a step and returns its statistics on the device; `Stepper.sync` waits for
 them. On a CPU a step is synced at once, on a GPU once per window (loop.trainer), so that the host
-keeps the GPU's queue full.
+keeps the GPU's queue full. Torch fuses the modules of a step into fewer kernels (`compile_parts`).
 """
 
 import contextlib
@@ -14,16 +14,17 @@ import torch
 from torch import Tensor, nn
 from torch.nn.parallel import DistributedDataParallel
 
+from model.hits.decoder import HitDecoder
 from model.precision import fast_float32_products
+from model.renderformer import RenderFormer
 from storage.errors import TrilightError
 from train.data.buckets import TrainingBatch
-from train.loop.compiled import compile_parts, is_compiler_error, undo_compiling
 from train.loop.distributed import DistributedContext
 from train.loop.optimizer import Decision, defers_sync
 from train.loop.train_state import TrainState
-from train.loss.training_loss import TrainingLoss
+from train.loss.training_loss import Lpips, TrainingLoss
 from train.monitoring.process_monitor import Activity, LayerNorms
-from train.settings import Precision, TrainSettings
+from train.settings import Compile, Precision, TrainSettings
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -186,18 +187,18 @@ class Stepper:
         self.activity.begin("forward")
         resolution = batch.target_BVRR3.shape[2]
         prediction = predict_log10(self._net, batch, resolution, self._settings.precision)
-        losses = self._objective(prediction, batch.target_BVRR3, batch.noise_BV)
+        total_BV, l1_BV = self._objective(prediction, batch.target_BVRR3, batch.noise_BV)
         self.activity.begin("backward")
         if last and self._dist_context.world_size > 1:
             prediction.register_hook(self._note_exchange)
         with fast_float32_products(
             self._dist_context.device, enabled=self._settings.precision == "bfloat16"
         ):
-            (losses.total_BV.sum() / num_views).backward()
+            (total_BV.sum() / num_views).backward()
         self.activity.begin("other")
         predicted_BV = prediction.detach().clamp(min=0).mean(dim=(2, 3, 4))
         target_BV = batch.target_BVRR3.mean(dim=(2, 3, 4))
-        parts = [losses.total_BV.detach(), losses.l1_BV, predicted_BV, target_BV]
+        parts = [total_BV.detach(), l1_BV, predicted_BV, target_BV]
         return torch.stack([part.sum() for part in parts]).double()
 
     def _note_exchange(self, _: Tensor) -> None:
@@ -257,3 +258,84 @@ def explain_out_of_memory(settings: TrainSettings, step: int) -> Iterator[None]:
             f"training: too little memory in step {step + 1}; the newest checkpoint is safe. "
             f"{advice}"
         ) from error
+
+
+MAX_GRAPHS = 32
+"""Maximum number of variants of one function before torch stops compiling it; its default is eight.
+Lengths and numbers of scenes are dynamic; separate variants are compiled for one or several scenes,
+with or without a mask, and for training and evaluation. Windows, which are cut in two ways, double
+them. CUDA graphs are not used: a step's kernels take longer than their launches (study S88)."""
+
+
+def compile_parts(
+    model: RenderFormer, objective: TrainingLoss, mode: Compile, device: torch.device
+) -> bool:
+    """Enable compilation in place, at first use; return whether it is enabled.
+
+    Layers are compiled one by one, not the whole network: the layers of a stage share their code,
+    which is compiled once for all of them. Names and values of weights do not change, so that
+    checkpoints stay valid.
+
+    Raises:
+        TrilightError: `mode` is yes and this torch cannot compile.
+    """
+    if mode == "no" or (mode == "auto" and not _is_worthwhile(device)):
+        return False
+    if device.type == "cuda" and not _has_triton():
+        raise TrilightError(
+            "compile is yes, but torch finds no Triton, which it needs on a GPU; expected the "
+            "package triton. Install it, or --set compile=no."
+        )
+    torch._dynamo.config.recompile_limit = max(MAX_GRAPHS, torch._dynamo.config.recompile_limit)
+    if device.type == "cuda":
+        import torch._inductor.config as inductor
+
+        # It fails on dynamic lengths: on an H200, torch 2.11 failed there with an assertion in the
+        # backward pass of `smoke` and `pretrain` (pytorch/pytorch issues 181563 and 197077); the
+        # second is open in later versions too.
+        inductor.triton.coalesce_tiling_analysis = False
+    for module, method in compiled_parts(model, objective):
+        if method == "forward":
+            module.compile(dynamic=True)
+        else:
+            setattr(module, method, torch.compile(getattr(module, method), dynamic=True))
+    return True
+
+
+def undo_compiling(model: RenderFormer, objective: TrainingLoss) -> None:
+    """Disable the compilation that `compile_parts` enabled."""
+    for module, method in compiled_parts(model, objective):
+        if method == "forward":
+            module._compiled_call_impl = None
+        elif method in vars(module):
+            delattr(module, method)
+
+
+def is_compiler_error(error: Exception) -> bool:
+    """Return whether an error comes from torch's compiler and not from the step."""
+    from torch._dynamo.exc import TorchDynamoException
+    from torch._inductor.exc import InductorError
+
+    return isinstance(error, TorchDynamoException | InductorError)
+
+
+def compiled_parts(model: RenderFormer, objective: TrainingLoss) -> Iterator[tuple[nn.Module, str]]:
+    """Yield what is compiled: the module, and the method that is called."""
+    if model.encoder is not None:
+        yield from ((layer, "forward") for layer in model.encoder.layers)
+        yield model.decoder, "keys_values"
+    yield from ((layer, "forward") for layer in model.decoder.layers)
+    if isinstance(model.decoder, HitDecoder) and model.decoder.filter is not None:
+        yield model.decoder.filter, "mix_level"
+    yield model.decoder.head, "forward"
+    yield from ((each, "forward") for each in objective.modules() if isinstance(each, Lpips))
+
+
+def _is_worthwhile(device: torch.device) -> bool:
+    return device.type == "cuda" and _has_triton()
+
+
+def _has_triton() -> bool:
+    from torch.utils._triton import has_triton
+
+    return has_triton()

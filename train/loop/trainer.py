@@ -29,12 +29,12 @@ from train.monitoring.process_monitor import (
     Spike,
     SpikeDetector,
     StepProfiler,
+    Watchdog,
     memory_mb,
     merge_spikes,
     own_seconds,
     slowest_rank,
 )
-from train.monitoring.watchdog import Watchdog
 from train.progress import TrainProgress
 from train.settings import TrainSettings, WatchSettings, decay_start_step, learning_rate
 

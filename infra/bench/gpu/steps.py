@@ -39,8 +39,7 @@ from train.data.buckets import TrainingBatch
 from train.loop.distributed import DistributedContext
 from train.loop.step import Stepper
 from train.loop.train_state import new_state
-from train.loss.lpips import BLOCKS, Lpips
-from train.loss.training_loss import TrainingLoss
+from train.loss.training_loss import BLOCKS, Lpips, TrainingLoss
 from train.presets import training_preset
 from train.settings import TrainSettings
 

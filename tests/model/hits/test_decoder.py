@@ -406,8 +406,8 @@ def test_a_ray_towards_a_triangle_meets_it_and_others_meet_nothing() -> None:
     scene = lit_scene(join(parts, eye=(0, -3, 1), sky=constant(1.0)))
     towards = -scene.plane
     start = scene.corners.mean(axis=0) - np.float32(1e-3) * towards
-    points, met = scene.meet(scene.everything, start, towards)
+    points, met = scene.meet(start, towards)
     assert met.all() and points.triangle.tolist() == list(range(scene.num_triangles))
     up = np.zeros_like(start) + np.array([[0], [0], [1]], np.float32)
-    _, met = scene.meet(scene.everything, start, up)
+    _, met = scene.meet(start, up)
     assert not met.any()

@@ -39,8 +39,7 @@ from train.evaluation.evaluate import (
     grouped_pictures,
     judge_views,
     make_baselines,
-    worst_and_median,
-    worst_of_each_excursion,
+    rows_of_sheets,
 )
 from train.evaluation.metrics import (
     METRICS,
@@ -63,7 +62,7 @@ from train.evaluation.validation import (
     validation_scene,
 )
 from train.loop.train_state import new_state
-from train.loss.lpips import Lpips
+from train.loss.training_loss import Lpips
 
 
 @pytest.fixture(scope="module")
@@ -210,10 +209,11 @@ def test_another_scenes_triangles_and_what_swapping_costs_are_told(dataset: Data
 def test_worst_median_and_excursions_are_found_and_plotted(tmp_path: Path) -> None:
     rows = [row(number, excursion=("lights", 16.0 + number % 3)) for number in range(30)]
     rows.append(row(40, excursion=("fov_deg", 90.0)))
-    chosen = worst_and_median(rows)
+    chosen = rows_of_sheets(rows)
     assert [view.key for view in chosen["worst"]] == [f"{number:09d}" for number in range(8)]
     assert f"{15:09d}" in [view.key for view in chosen["median"]]
-    assert [view.key for view in worst_of_each_excursion(rows)] == [f"{40:09d}", f"{0:09d}"]
+    assert [view.key for view in chosen["worst of each axis"]] == [f"{40:09d}", f"{0:09d}"]
+    assert [*rows_of_sheets([row(0)])] == ["worst", "median"]
     assert plot_excursions(tmp_path / "none.png", [row(0)]) == 0
     assert not (tmp_path / "none.png").exists()
     rows = [row(k, excursion=(axis, 10.0**k)) for axis in ("a", "b", "c", "d") for k in range(3)]
@@ -272,7 +272,7 @@ def test_no_report_takes_the_place_of_another_networks(
 ) -> None:
     """And that of a run is beside it."""
     monkeypatch.setattr(judging, "evaluation_page", str)
-    for name in ("worst_and_median", "worst_of_each_excursion", "sheet_views"):
+    for name in ("rows_of_sheets", "sheet_views"):
         monkeypatch.setattr(judging, name, lambda *more: {})
 
     def written(digest: str) -> str:

@@ -67,7 +67,7 @@ from train.evaluation.sheet import (
     write_picture,
 )
 from train.evaluation.validation import median_picture
-from train.loss.lpips import Lpips
+from train.loss.training_loss import Lpips
 
 
 def view_score(log_l1: float, db: float = 0.0) -> Scores:

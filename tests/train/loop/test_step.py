@@ -32,12 +32,11 @@ from tests.train.toy import toy_sample, write_toy_dataset
 from train.data.buckets import TrainingBatch, bucket_scenes, collate_batch
 from train.data.scenes import training_scene
 from train.folder import RunFolder, read_rows
-from train.loop import compiled, optimizer
+from train.loop import optimizer
 from train.loop import step as step_module
 from train.loop.checkpoints import read_checkpoint
-from train.loop.compiled import compile_parts, compiled_parts
 from train.loop.optimizer import Decision, Optimizer, move_along, move_towards
-from train.loop.step import Stepper, StepReport, predict_log10
+from train.loop.step import Stepper, StepReport, compile_parts, compiled_parts, predict_log10
 from train.loop.train_state import TrainState, ema_step, new_state
 from train.loss.training_loss import TrainingLoss
 from train.settings import Compile, LossSettings, Precision
@@ -417,11 +416,11 @@ def test_what_is_compiled_where(monkeypatch: pytest.MonkeyPatch) -> None:
     assert len(list(compiled_parts(model, objective))) == layers + 2
     assert not compile_parts(model, objective, "auto", CPU)
     assert not compile_parts(model, objective, "no", card)
-    monkeypatch.setattr(compiled, "_has_triton", lambda: False)
+    monkeypatch.setattr(step_module, "_has_triton", lambda: False)
     assert not compile_parts(model, objective, "auto", card)
     with pytest.raises(TrilightError, match="triton"):
         compile_parts(model, objective, "yes", card)
-    monkeypatch.setattr(compiled, "_has_triton", lambda: True)
+    monkeypatch.setattr(step_module, "_has_triton", lambda: True)
     assert compile_parts(model, objective, "auto", card)
 
 
@@ -431,7 +430,7 @@ def _fails_to_compile(graph: object, inputs: object) -> object:
 
 def _uncompilable(monkeypatch: pytest.MonkeyPatch, compile: Compile) -> Stepper:
     """Return a stepper on the processor whose compiler, as on some card, fails."""
-    monkeypatch.setattr(compiled, "_is_worthwhile", lambda _: True)
+    monkeypatch.setattr(step_module, "_is_worthwhile", lambda _: True)
     _compile_by(monkeypatch, _fails_to_compile)
     run = tiny_run(compile=compile)
     return stepper(new_state(run))

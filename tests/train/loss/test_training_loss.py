@@ -19,18 +19,22 @@ from storage.conventions import preview_srgb8, srgb8
 from storage.errors import TrilightError
 from storage.seeds import rng_for
 from tests.for_each import for_each
-from train.loss.lpips import (
+from train.loss.training_loss import (
     BLOCKS,
     LINEAR_FILE,
     LINEAR_URL,
     SCALE,
+    SCALE_WEIGHTS,
     SHIFT,
     VGG16_FILE,
     VGG16_URL,
     Lpips,
+    TrainingLoss,
     load_lpips,
+    ms_ssim,
+    ssim,
+    tone_map,
 )
-from train.loss.training_loss import SCALE_WEIGHTS, TrainingLoss, ms_ssim, ssim, tone_map
 from train.settings import LossSettings
 
 WIDTHS = (4, 5, 6, 7, 8)
@@ -234,23 +238,23 @@ def test_the_loss_adds_up_its_terms(term: str) -> None:
     lpips = Lpips(*small_weights())
     settings = LossSettings(perceptual=term, perceptual_weight=0.05)  # type: ignore[arg-type]
     prediction, target = log10_pictures("p"), log10_pictures("t").abs()
-    losses = TrainingLoss(settings, lpips)(prediction, target, torch.zeros(2, 3))
-    assert torch.equal(losses.l1_BV, (prediction - target).abs().mean(dim=(2, 3, 4)))
+    total, l1 = TrainingLoss(settings, lpips)(prediction, target, torch.zeros(2, 3))
+    assert torch.equal(l1, (prediction - target).abs().mean(dim=(2, 3, 4)))
     for scene in range(2):
         for view in range(3):
             x, y = (tone_map(p[scene, view]).permute(2, 0, 1)[None] for p in (prediction, target))
             unlike = {"lpips": lpips(x, y), "ms_ssim": 1 - ms_ssim(x, y), "none": torch.zeros(1)}
-            expected = losses.l1_BV[scene, view] + 0.05 * unlike[term].item()
+            expected = l1[scene, view] + 0.05 * unlike[term].item()
             # float32: one view alone and six together are convolved in another order
-            assert losses.total_BV[scene, view].item() == pytest.approx(expected.item(), rel=1e-5)
+            assert total[scene, view].item() == pytest.approx(expected.item(), rel=1e-5)
 
 
 def test_a_view_as_noisy_as_the_setting_counts_half() -> None:
     settings = LossSettings(perceptual="none", noise_half=0.02)
     noise = torch.tensor([[0.0, 0.02, 0.06]]).expand(2, 3)
     prediction, target = log10_pictures("p"), log10_pictures("t")
-    losses = TrainingLoss(settings, None)(prediction, target, noise)
-    shares = losses.total_BV / losses.l1_BV
+    total, l1 = TrainingLoss(settings, None)(prediction, target, noise)
+    shares = total / l1
     torch.testing.assert_close(shares, torch.tensor([[1.0, 0.5, 0.25]]).expand(2, 3))
 
 

@@ -39,7 +39,7 @@ from train.loop.distributed import DistributedContext, join_processes
 from train.loop.recorder import require_wandb, scalars
 from train.loop.step import StepReport
 from train.loop.train_state import new_state
-from train.monitoring import process_monitor, watchdog
+from train.monitoring import process_monitor
 from train.monitoring.process_monitor import (
     LEAST_REMEMBERED,
     OWN_PHASES,
@@ -48,12 +48,12 @@ from train.monitoring.process_monitor import (
     LayerNorms,
     SpikeDetector,
     StepProfiler,
+    Watchdog,
     layer_of,
     own_seconds,
     slowest_rank,
     spike_bound,
 )
-from train.monitoring.watchdog import Watchdog
 from train.progress import TrainProgress
 from train.run_training import run_training
 from train.settings import WatchSettings
@@ -92,14 +92,14 @@ def test_a_loader_that_sleeps_is_named_with_its_stack(tmp_path: Path) -> None:
     (path,) = (tmp_path / "watching").iterdir()
     assert path.name == "hang-step-000000005-rank-0.txt" and str(path) in first
     text = path.read_text()
-    assert "sleeping_loader" in text and "watchdog" in text, "stacks of all threads"
+    assert "sleeping_loader" in text and "process_monitor" in text, "stacks of all threads"
     assert text.count("process 0 of 1") == 2
 
 
 def test_words_of_other_processes_are_passed_on_and_the_run_stops_if_asked(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(watchdog, "GRACE_S", 0.3)
+    monkeypatch.setattr(process_monitor, "GRACE_S", 0.3)
     said: list[str] = []
     ended: list[str] = []
     settings = WatchSettings(hang_after_s=0.1, on_hang="stop")
