@@ -216,9 +216,7 @@ def _check_arrays(scene: Scene) -> None:
         values = getattr(scene, field.name)
         if field.within is None or values is None:
             continue
-        holds = field.within.holds(values)
-        if not holds.all():  # what was expected is put into words only then
-            require_law(holds, field.name, values, str(field.within))
+        require_law(field.within.holds(values), field.name, values, str(field.within))
     for name, other in _EQUALLY_LONG:
         got = len(getattr(scene, name))
         expected = len(getattr(scene, other))
@@ -242,8 +240,7 @@ def _check_columns(scene: Scene) -> None:
     for column, part in laid_out():
         holds = np.ones(got, np.bool_)
         holds[:, part] = column.within.holds(scene.materials[:, part])
-        if not holds.all():
-            require_law(holds, "materials", scene.materials, f"{column.name} {column.within}")
+        require_law(holds, "materials", scene.materials, f"{column.name} {column.within}")
 
 
 def _check_geometry(scene: Scene) -> None:

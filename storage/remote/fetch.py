@@ -8,14 +8,7 @@ from collections.abc import Mapping
 from typing import Any, BinaryIO
 
 from storage.errors import Unreadable
-from storage.remote.retries import (
-    PATIENCE,
-    Interrupted,
-    Pace,
-    TransferFailed,
-    is_missing,
-    with_tries,
-)
+from storage.remote.retries import PATIENCE, Interrupted, Pace, TransferFailed, with_tries
 from storage.remote.url import RemoteUrl, shared_driver, transfer_timeout
 
 PIECE_BYTES = 8 << 20
@@ -167,22 +160,6 @@ def _start_over(stream: BinaryIO, why: str = "") -> None:
 
 
 _CHANGED = "the file changed while it was read"
-
-
-def fetch_if_there(url: RemoteUrl, stream: BinaryIO, *, max_bytes: int) -> bool:
-    """Write a file to an open one as `download`, and return True; False where there is none.
-
-    Raises:
-        Unreadable: it cannot be read.
-        TrilightError: as `download`.
-    """
-    try:
-        download(url, stream, num_bytes=None, max_bytes=max_bytes)
-    except TransferFailed as error:
-        if error.__cause__ is not None and is_missing(error.__cause__):
-            return False
-        raise unreadable(url, error) from error
-    return True
 
 
 def unreadable(url: RemoteUrl, error: TransferFailed) -> Unreadable:

@@ -85,7 +85,8 @@ def with_tries(function: Callable[[], Result], *, pace: "Pace | None" = None) ->
 
 def root_error(error: BaseException) -> BaseException:
     """Return the cause: the HTTP driver reports every error of a request as a missing file."""
-    while isinstance(error, FileNotFoundError | Interrupted) and error.__cause__ is not None:
+    wrappers = (FileNotFoundError, Interrupted, TransferFailed)
+    while isinstance(error, wrappers) and error.__cause__ is not None:
         error = error.__cause__
     return error
 
