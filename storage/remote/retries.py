@@ -1,11 +1,11 @@
 """Retries of remote requests, the least rate of a transfer, and error messages without secrets."""
 
 import errno
-import os
+import secrets
 import time
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import TypeVar
+from typing import Any, TypeVar
 
 from storage.errors import EnvironmentFailure, TrilightError
 from storage.remote.safe_url import printable, safe_text
@@ -51,12 +51,13 @@ def with_tries(function: Callable[[], Result], *, pace: "Pace | None" = None) ->
     It raises TransferFailed, and TrilightError, as the function; `download_failed` for any other
     exception, or a file that comes too slowly; an EnvironmentFailure where the disk is full.
     """
-    from tenacity import Retrying, retry_if_exception, stop_after_attempt  # slow to import
+    from tenacity import Retrying  # slow to import
 
     number = 0
 
-    def is_worth_a_try(error: BaseException) -> bool:
+    def is_worth_a_try(state: Any) -> bool:
         nonlocal number
+        error = state.outcome.exception()
         if isinstance(error, TransferFailed | TrilightError) or not isinstance(error, Exception):
             return False
         cause = root_error(error)
@@ -70,17 +71,15 @@ def with_tries(function: Callable[[], Result], *, pace: "Pace | None" = None) ->
             raise TransferFailed("download_failed", describe(cause)) from error
         if pace is not None:
             pace.require()
+        if state.attempt_number == _MOST_TRIES:
+            raise TransferFailed("download_failed", f"it was interrupted {_MOST_TRIES} times")
         return True
 
-    def give_up(state: object) -> Result:
-        raise TransferFailed("download_failed", f"it was interrupted {_MOST_TRIES} times")
+    def pause_s(state: object) -> float:
+        chance = secrets.randbelow(1000) / 1000  # no two processes share it
+        return min(PAUSE_S * 2 ** (number - 1), MAX_PAUSE_S) * (0.5 + chance)
 
-    return Retrying(
-        retry=retry_if_exception(is_worth_a_try),
-        wait=lambda state: min(PAUSE_S * 2 ** (number - 1), MAX_PAUSE_S) * (0.5 + _chance()),
-        stop=stop_after_attempt(_MOST_TRIES),
-        retry_error_callback=give_up,
-    )(function)
+    return Retrying(retry=is_worth_a_try, wait=pause_s)(function)
 
 
 def root_error(error: BaseException) -> BaseException:
@@ -141,11 +140,6 @@ def _status(error: BaseException | None) -> int | None:
             if isinstance(status, int) and 300 <= status < 600:
                 return status
     return None
-
-
-def _chance() -> float:
-    """Return a number in [0, 1) that no two processes share; it decides nothing but a pause."""
-    return int.from_bytes(os.urandom(4), "little") / 2**32
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -481,7 +481,7 @@ def test_files_of_plain_scenes_have_no_coordinates_and_no_nan() -> None:
         )
         found = decode_passes_exr(packed, RESOLUTION)
         assert set(found) == {"coverage", "shading_normal"} | there
-        raw = decode_channels(packed, sorted(channels), lambda header: None, separate=True)
+        raw = decode_channels(packed, sorted(channels), separate=True)
         assert not any(np.isnan(plane).any() for plane in raw.values())
         again = picture_passes(scene, names, view=0, resolution=RESOLUTION, stored=packed)
         plain = picture_passes(scene, names, view=0, resolution=RESOLUTION)
