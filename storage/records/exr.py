@@ -194,8 +194,7 @@ def decode_channels(
     """
     with _readable():
         header = read_header(data) if header is None else header
-        stored_size = window_size(header)
-        if size is not None and stored_size != size:
+        if size is not None and (stored_size := window_size(header)) != size:
             raise TrilightError(f"{what}: {list(stored_size)} pixels; expected {list(size)}.")
         _check_pixels(header, names)
         file = OpenEXR.File(io.BytesIO(data), num_threads=0, separate_channels=separate)

@@ -10,6 +10,7 @@ no textures. Or it is a normal map, which stands in the place of no column.
 """
 
 import dataclasses
+from collections import Counter
 from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Annotated, Any, Literal
@@ -260,11 +261,9 @@ def _check_materials(scene: Scene) -> None:
 
 
 def _check_objects(scene: Scene) -> None:
-    names = set[str]()
-    for entry in scene.objects:  # a set: a scene may hold 65536 of them
-        if entry.name in names:
-            broken_law(f"objects holds the name {entry.name!r} twice", "unique names")
-        names.add(entry.name)
+    for name, count in Counter(entry.name for entry in scene.objects).items():
+        if count > 1:
+            broken_law(f"objects holds the name {name!r} twice", "unique names")
     is_emitter = np.array([entry.kind == "emitter" for entry in scene.objects])
     agrees = is_emitter[scene.object_index] == scene.triangle_emits
     require_law(

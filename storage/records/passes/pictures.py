@@ -85,7 +85,12 @@ def view_passes(
     origin = scene.c2w[view, :3, 3].astype(np.float64)
     seen = SeenFrom(scene, origin, surfaces)
     blocks = [
-        _block(chosen, centre, spread, rays_a_side)
+        {
+            each.name: each.at(centre)
+            if each.averaging == "centre ray"
+            else _means(each.at(spread), rays_a_side, each.nothing)
+            for each in chosen
+        }
         for centre, spread in _blocks(seen, view, resolution, rays_a_side, later)
     ]
     return {each.name: np.concatenate([block[each.name] for block in blocks]) for each in chosen}
@@ -114,18 +119,6 @@ def _blocks(
         last = min(first + rows, resolution)
         centre = rays(first, last, 1)
         yield centre, centre if a_side == 1 else rays(first, last, a_side)
-
-
-def _block(
-    passes: Sequence[Pass], centre: PassRays, spread: PassRays, a_side: int
-) -> dict[str, NDArray]:
-    """Return the pixels of some rows, [rows, R] or [rows, R, channels]."""
-    return {
-        each.name: each.at(centre)
-        if each.averaging == "centre ray"
-        else _means(each.at(spread), a_side, each.nothing)
-        for each in passes
-    }
 
 
 def _means(values: NDArray, a_side: int, nothing: float) -> NDArray:
