@@ -113,14 +113,13 @@ class FieldDescription:
 def describe_fields(kind: type) -> tuple[FieldDescription, ...]:
     """Return the descriptions of the fields of a dataclass, in their order."""
     hints = typing.get_type_hints(kind, include_extras=True)
-    descriptions = []
-    for field in dataclasses.fields(kind):
-        hint = hints[field.name]
-        bare, notes = unwrap(hint)
-        descriptions.append(
-            FieldDescription(owner=kind, name=field.name, hint=hint, bare=bare, notes=notes)
+    return tuple(
+        FieldDescription(
+            owner=kind, name=field.name, hint=hints[field.name], bare=bare, notes=notes
         )
-    return tuple(descriptions)
+        for field in dataclasses.fields(kind)
+        for bare, notes in [unwrap(hints[field.name])]
+    )
 
 
 @functools.cache

@@ -17,8 +17,7 @@ from numpy.typing import NDArray
 
 from storage.conventions import camera_rays
 from storage.errors import TrilightError
-from storage.raycast.caster import FirstHitCaster
-from storage.raycast.first_hits import SeenFrom, require_row
+from storage.raycast import FirstHitCaster, SeenFrom, require_row
 from storage.records.exr import channel_names, decode_channels, encode_channels
 from storage.records.passes.declared import (
     MOTION,

@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from storage.conventions import camera_rays, in_camera, look_at_c2w, pixel_places
 from storage.dataset.settings import StorageSettings
 from storage.errors import TrilightError
-from storage.raycast.first_hits import first_hits
+from storage.raycast import first_hits
 from storage.records.exr import channel_names, decode_channels, encode_channels
 from storage.records.lookup import texture_values
 from storage.records.material import default_rows
