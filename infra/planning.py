@@ -236,8 +236,8 @@ def _scene_bytes(folder: DatasetFolder, shard: str, scene: int) -> int:
             members = opened.samples.get(sample_key(scene), {})
         sizes = [member.num_bytes for member in members.values()]
     else:
-        staged = read_staged_scene(folder.staged_shard(shard), scene)
-        sizes = [len(member) for member in staged.members.values()]
+        staged, _ = read_staged_scene(folder.staged_shard(shard), scene)
+        sizes = [len(member) for member in staged.values()]
     return sum(512 + -(-num_bytes // 512) * 512 for num_bytes in sizes)
 
 

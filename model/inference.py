@@ -35,7 +35,7 @@ from model.scene_tensors import Cameras, batch_scenes, map_tensors, scene_tensor
 from model.weights import MAX_LIGHTS, TrainedRange, network_digest
 from storage.errors import TrilightError
 from storage.machine import free_memory
-from storage.records.material import EMISSION, unread_columns
+from storage.records.material import EMISSION, columns_in_use
 from storage.records.scene import Scene
 
 LightGroup = tuple[Scene, float]
@@ -319,7 +319,7 @@ class NeuralRenderer:
                 f"the {int(scene.triangle_emits.sum())} emitting triangles are rendered in "
                 f"{num_groups} groups, whose pictures are added"
             )
-        if unread := unread_columns(scene.materials, self.config.material_columns):
+        if unread := columns_in_use(scene.materials, self.config.material_columns):
             notes.append(
                 f"the network does not read {', '.join(unread)}, which materials of the scene have"
             )

@@ -18,7 +18,6 @@ from numpy.typing import NDArray
 
 Quality = Literal["high", "fast"]
 
-_QUALITIES = {"high": "OIDN_QUALITY_HIGH", "fast": "OIDN_QUALITY_FAST"}
 INPUTS = ("color", "albedo", "normal")
 
 DenoiserDevice = Literal["CPU", "CUDA"]
@@ -101,7 +100,7 @@ class Filter:
         self._memory: dict[str, Any] = {}
         self._filter.set_bool("hdr", True)
         self._filter.set_bool("cleanAux", True)
-        self._filter.set_quality(getattr(oidn, _QUALITIES[quality]))
+        self._filter.set_quality(getattr(oidn, f"OIDN_QUALITY_{quality.upper()}"))
 
     def run(self, inputs: dict[str, NDArray[np.float32]]) -> NDArray[np.float32]:
         """Return the filtered picture of inputs [R, R, 3] by name."""

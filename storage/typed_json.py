@@ -6,6 +6,7 @@ The type is a dataclass, or made of dataclasses; ranges and spellings are notes 
 (`Within`, `Spelled`, `FINITE`). Numbers of 5,000 digits, depth and unknown fields are refused too.
 """
 
+import contextlib
 import json
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
@@ -95,18 +96,13 @@ def read_versioned(data: bytes | str, kind: type[T], source: str, versions: Sequ
     try:
         value = read_json(data, kind, source)
     except TrilightError:
-        require_readable(_stated_version(data, versions[0]), source, versions)
+        version = versions[0]  # unless the text states one, whatever else it is
+        with contextlib.suppress(ValueError, LookupError, TypeError, RecursionError):
+            version = json.loads(data)["schema_version"]
+        require_readable(version, source, versions)
         raise
     require_readable(vars(value)["schema_version"], source, versions)
     return value
-
-
-def _stated_version(data: bytes | str, default: int) -> object:
-    """Return the version that a text of unknown form states; `default` where it states none."""
-    try:
-        return json.loads(data)["schema_version"]
-    except (ValueError, LookupError, TypeError, RecursionError):
-        return default
 
 
 def read_json_lines(data: bytes, kind: type[T], source: str, *, torn_end: bool = False) -> list[T]:

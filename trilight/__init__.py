@@ -33,8 +33,8 @@ if TYPE_CHECKING:
     from storage.dataset.statistics import Statistics as Statistics
     from storage.dataset.statistics import dataset_statistics as dataset_statistics
     from storage.errors import TrilightError as TrilightError
-    from storage.raycast.first_hits import FirstHits as FirstHits
-    from storage.raycast.first_hits import first_hits as first_hits
+    from storage.raycast import FirstHits as FirstHits
+    from storage.raycast import first_hits as first_hits
     from storage.records.passes.declared import Pass as Pass
     from storage.records.passes.declared import declared_passes as declared_passes
     from storage.records.passes.pictures import view_passes as view_passes

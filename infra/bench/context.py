@@ -119,7 +119,7 @@ class BenchContext:
         )
         measure_scenes(options, _RENDERED, folder.root, lambda: None)
         staged = folder.staged_shard(shard_name(0, splits))
-        return [read_staged_scene(staged, row).members for row in range(_RENDERED)]
+        return [read_staged_scene(staged, row)[0] for row in range(_RENDERED)]
 
     @functools.cached_property
     def data(self) -> TrainingData:

@@ -8,7 +8,7 @@ from typing import Annotated
 from infra.cli.console import first_words, print_result
 from infra.cli.options import command
 from pipeline.renders.mitsuba_variant import Device, activate, choose_gpu
-from storage.raycast.caster import FirstHitCaster, Surfaces
+from storage.raycast import FirstHitCaster, Surfaces
 from storage.records.exr import MAX_RESOLUTION
 from storage.records.passes.declared import pass_names
 from storage.records.passes.pictures import MOST_A_SIDE

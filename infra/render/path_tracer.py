@@ -22,7 +22,7 @@ from pipeline.renders.settings import FIRST_SPP, RenderSettings
 from storage.errors import Rejected, Unrenderable
 from storage.machine import available_cores
 from storage.records.lights import Parts
-from storage.records.material import PUBLISHED_COLUMNS, unread_columns
+from storage.records.material import PUBLISHED_COLUMNS, columns_in_use
 from storage.records.scene import Scene
 from storage.renderer import Camera, Fact, Image, OnProgress, Sampling, ignore_progress
 from storage.settings.described import settings_record
@@ -133,7 +133,7 @@ class SceneInChild:
         self._seed = tracer.seed
         self._arguments = (next(_numbers), scene, tracer.settings, tracer.shows_looks)
         self._name = name
-        unread = ", ".join(unread_columns(scene.materials, PUBLISHED_COLUMNS))
+        unread = ", ".join(columns_in_use(scene.materials, PUBLISHED_COLUMNS))
         self.notes = (f"the path tracer does not read {unread}",) if unread else ()
         self._child.call(name, lambda each: each.call_method(RenderWorker.wait))
         began = time.perf_counter()

@@ -16,7 +16,7 @@ import torch
 from numpy.typing import NDArray
 
 from model.hits.device_arrays import DeviceArray, DevicePlace
-from storage.raycast.caster import MISS, RayHits
+from storage.raycast import MISS, RayHits
 
 LEAF = 4
 """Most triangles of a leaf; at most 7, as a leaf's number has three bits for them."""

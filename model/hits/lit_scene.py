@@ -25,7 +25,7 @@ from storage.optics.multiscatter import (
     albedo_table,
     scattered_again,
 )
-from storage.raycast.caster import RayCaster, RayHits, Triangles
+from storage.raycast import RayCaster, RayHits, Triangles
 from storage.records.environment import Environment, row_solid_angles, texel_means
 from storage.records.lookup import environment_values
 from storage.records.material import EMISSION, ROUGHNESS

@@ -17,7 +17,7 @@ from PIL import Image
 
 from pipeline.documents.pages import Figure, png_uri, render_page
 from storage.conventions import preview_gain, preview_srgb8, srgb8
-from storage.raycast.caster import MISS
+from storage.raycast import MISS
 from storage.records.environment import Environment
 from storage.records.material import DIFFUSE
 from storage.records.objects import Failure

@@ -11,8 +11,7 @@ from storage.atomic import write_atomically
 from storage.conventions import SPLITS
 from storage.dataset.dataset import Dataset, open_dataset
 from storage.errors import TrilightError
-from storage.raycast.caster import FirstHitCaster, Surfaces
-from storage.raycast.first_hits import require_row
+from storage.raycast import FirstHitCaster, Surfaces, require_row
 from storage.records.passes.pictures import passes_exr
 from storage.records.sample import Sample, sample_key
 from storage.records.scene import Scene

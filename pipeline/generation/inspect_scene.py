@@ -20,7 +20,7 @@ from storage.atomic import write_atomically
 from storage.conventions import look_at_c2w, preview_srgb8
 from storage.errors import Rejected, TrilightError
 from storage.records.lights import num_lights
-from storage.records.material import EMISSION, PUBLISHED_COLUMNS, unread_columns
+from storage.records.material import EMISSION, PUBLISHED_COLUMNS, columns_in_use
 from storage.records.scene import Scene
 from storage.records.scene_file import scene_digest
 
@@ -75,7 +75,7 @@ def _facts(scene: Scene) -> dict[str, Any]:
     high = scene.vertex_positions.max(axis=0)
     kinds = Counter(entry.kind for entry in scene.objects)
     licences = Counter(scene.licences)
-    added = unread_columns(scene.materials, PUBLISHED_COLUMNS)
+    added = columns_in_use(scene.materials, PUBLISHED_COLUMNS)
     maps: dict[str, str] = {}
     if scene.textures:
         sizes = (

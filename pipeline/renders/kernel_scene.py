@@ -16,7 +16,7 @@ from pipeline.renders.guide_table import GuideTable
 from pipeline.renders.sky_table import SkyTable, sky_share
 from pipeline.renders.surface_table import Hit, SurfacePoint, SurfaceTable
 from pipeline.renders.tracer import split_triangles
-from storage.raycast.caster import MISS, RayHits
+from storage.raycast import MISS, RayHits
 from storage.records.lights import part_names, shining_sky
 from storage.records.scene import Scene
 

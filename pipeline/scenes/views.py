@@ -6,7 +6,7 @@ in another process.
 
 `Visibility` estimates what a camera sees, by ray casting on a coarse grid. A grid of 32 x 32 rays
 costs about a millisecond, and decides only if a picture is worth rendering: it may miss anything
-smaller than a grid cell. Everything is computed in the single precision of storage.raycast.caster:
+smaller than a grid cell. Everything is computed in the single precision of storage.raycast:
 the cameras of a dataset depend on each bit of it.
 """
 
@@ -21,7 +21,7 @@ from scene_templates.settings import SceneSettings, ViewLaws
 from scene_templates.templates import TEMPLATES
 from storage.conventions import camera_rays, latlong_direction
 from storage.errors import Rejected, TrilightError
-from storage.raycast.caster import MISS, MetSurfaces, Surfaces
+from storage.raycast import MISS, MetSurfaces, Surfaces
 from storage.records.scene import Scene
 from storage.seeds import rng_for
 

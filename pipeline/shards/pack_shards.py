@@ -118,12 +118,12 @@ def _pack(folder: DatasetFolder, name: str, scene_indices: range, *, grows: bool
     samples: list[tuple[str, dict[str, bytes]]] = []
     maps: dict[str, bytes] = {}
     for index in scene_indices:
-        staged = read_staged_scene(staged_folder, index)
-        failures.extend(staged.failures)
-        if staged.members:
-            for member in filter(MAP_NAME.fullmatch, staged.members):  # equal maps share memory
-                staged.members[member] = maps.setdefault(member, staged.members[member])
-            samples.append((sample_key(index), staged.members))
+        members, rejected = read_staged_scene(staged_folder, index)
+        failures.extend(rejected)
+        if members:
+            for member in filter(MAP_NAME.fullmatch, members):  # equal maps share memory
+                members[member] = maps.setdefault(member, members[member])
+            samples.append((sample_key(index), members))
     path = folder.shard(name)
     rejections = rejections_of_shard(folder, name)
     write_failures(rejections, failures)

@@ -10,12 +10,14 @@ return the members of a sample together with those of its maps; writers take the
 """
 
 import io
+import itertools
 import os
 import re
 import tarfile
 from collections.abc import Callable, Iterable, Iterator, Mapping
 from contextlib import AbstractContextManager
 from dataclasses import dataclass
+from operator import attrgetter
 from pathlib import Path
 from typing import BinaryIO
 
@@ -128,25 +130,18 @@ def scan_samples(
         TrilightError: as `scan_members`, or a member, a map or a key occurs twice.
     """
     maps = {} if maps is None else maps
-    seen: set[str] = set()
-    current: str | None = None
-    members: dict[str, Member] = {}
-    for member in scan_members(stream, name):
-        if member.key != current:
-            if current:
-                yield current, members
-            if member.key in seen:
-                raise TrilightError(f"{name}: sample {member.key} occurs twice.")
-            current = member.key
-            members = {}
-            if current:
-                seen.add(current)
-        known = members if current else maps
-        if member.suffix in known:
-            raise TrilightError(f"{name}: member {member.name} occurs twice.")
-        known[member.suffix] = member
-    if current:
-        yield current, members
+    seen = set[str]()
+    for key, group in itertools.groupby(scan_members(stream, name), attrgetter("key")):
+        if key in seen:
+            raise TrilightError(f"{name}: sample {key} occurs twice.")
+        members: dict[str, Member] = {} if key else maps
+        for member in group:
+            if member.suffix in members:
+                raise TrilightError(f"{name}: member {member.name} occurs twice.")
+            members[member.suffix] = member
+        if key:
+            seen.add(key)
+            yield key, members
 
 
 class ShardReader(AbstractContextManager["ShardReader"]):
@@ -214,13 +209,13 @@ class ShardReader(AbstractContextManager["ShardReader"]):
             raise TrilightError(
                 f"{self.name}: no sample {key}; expected one of its {len(self.keys)}: {held}."
             )
-        selected = {name: member for name, member in self.samples[key].items() if accepts(name)}
-        members = {name: self.read(member) for name, member in selected.items()}
+        stored = self.samples[key]
+        members = {name: self.read(member) for name, member in stored.items() if accepts(name)}
         digests = re.findall("[0-9a-f]{64}", members.get("json", b"").decode(errors="replace"))
         maps = {name: self.maps[name] for name in map(map_member, digests) if name in self.maps}
-        start = min(member.offset for member in self.samples[key].values())
-        before = {name: map_ for name, map_ in maps.items() if map_.offset < start}
-        return members | {name: self.read(map_) for name, map_ in before.items()}
+        start = min(member.offset for member in stored.values())
+        before = {name: self.read(map_) for name, map_ in maps.items() if map_.offset < start}
+        return members | before
 
     def read(self, member: Member) -> bytes:
         """Return the bytes of a member; raises TrilightError where the shard became shorter."""

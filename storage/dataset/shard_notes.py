@@ -136,11 +136,10 @@ def with_unlisted(dataset: Dataset) -> Dataset:
     unlisted = _notes(dataset)
     if not unlisted:
         return dataset
-    notes = {note.shard.name: note for note in unlisted}
-    shards = {shard.name: shard for shard in dataset.manifest.shards}
-    shards |= {name: note.shard for name, note in notes.items()}
+    noted = [note.shard for note in unlisted]
+    shards = {shard.name: shard for shard in (*dataset.manifest.shards, *noted)}
     every = tuple(sorted(shards.values(), key=number_of_shard))
-    failures = [failure for note in notes.values() for failure in note.failures]
+    failures = [failure for note in unlisted for failure in note.failures]
     manifest = dataclasses.replace(dataset.manifest, shards=every)
     return Dataset(dataset.store, manifest, dataset.num_listed, failures)
 

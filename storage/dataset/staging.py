@@ -5,7 +5,6 @@ were rejected on the way. A scene that no attempt could save has failures only.
 """
 
 import io
-from dataclasses import dataclass
 from pathlib import Path
 
 from storage.atomic import write_atomically
@@ -15,15 +14,6 @@ from storage.records.objects import Failure, decode_failures, encode_failures
 from storage.records.sample import sample_key
 
 _FAILURES = "failures"
-
-
-@dataclass(frozen=True, kw_only=True)
-class StagedScene:
-    """Result of one scene: its sample, or its failures."""
-
-    members: dict[str, bytes]
-    """The members of its sample; empty where the scene was given up."""
-    failures: list[Failure]
 
 
 def stage_members(
@@ -45,12 +35,16 @@ def is_staged(folder: Path, scene_index: int) -> bool:
     return _path(folder, scene_index).exists()
 
 
-def read_staged_scene(folder: Path, scene_index: int) -> StagedScene:
-    """Return what became of a finished scene; raises ShardMissing where it is not staged."""
+def read_staged_scene(folder: Path, scene_index: int) -> tuple[dict[str, bytes], list[Failure]]:
+    """Return the members of a finished scene's sample, none where it was given up, and failures.
+
+    Raises:
+        ShardMissing: it is not staged.
+    """
     with open_shard(_path(folder, scene_index)) as opened:
         ((_, members),) = opened
     failures = decode_failures(members.pop(_FAILURES))
-    return StagedScene(members=members, failures=failures)
+    return members, failures
 
 
 def _path(folder: Path, scene_index: int) -> Path:

@@ -173,11 +173,9 @@ def _read_scenes(
                 raise TrilightError(f"{num_bytes} bytes; expected {shard.num_bytes}")
             opened = ShardReader(stream, shard.name)
             for key, members in opened.samples.items():
-                packed = {
-                    name: opened.read(members[name]) for name in {PLAIN, PACKED} & members.keys()
-                }
                 text = opened.read(members["json"])
                 record = read_scene_record(text, SampleJson, f"member {key}.json")
+                packed = opened.members(key, {PLAIN, PACKED}.__contains__)
                 yield key, sha256_hex(unpack_arrays(packed)), record
 
 

@@ -1,8 +1,9 @@
 """Checks a dataset against its manifest: each checksum, each member, the laws of every sample."""
 
+import itertools
 from collections import Counter, deque
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from concurrent.futures import Future, ThreadPoolExecutor
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, field
 from pathlib import Path
 from tempfile import TemporaryFile
@@ -133,13 +134,11 @@ def _ahead(
     shards: Sequence[ShardEntry],
 ) -> Iterator[tuple[ShardEntry, _ShardFindings]]:
     """Yield shards in order with what was found, a few of them being checked ahead."""
-    running: deque[Future[_ShardFindings]] = deque(
-        pool.submit(check, shard) for shard in shards[:_AHEAD]
-    )
-    for row, shard in enumerate(shards):
+    submitted = (pool.submit(check, shard) for shard in shards)
+    running = deque(itertools.islice(submitted, _AHEAD))
+    for shard in shards:
         yield shard, running.popleft().result()
-        if row + _AHEAD < len(shards):
-            running.append(pool.submit(check, shards[row + _AHEAD]))
+        running.extend(itertools.islice(submitted, 1))
 
 
 def _check_lock(lock: bytes | None, dataset: Dataset) -> Iterator[str]:

@@ -7,7 +7,7 @@ The file itself says how it is packed, so a reader need not be told. Which codec
 import contextlib
 import io
 import math
-from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
 from typing import Any
 
 import numpy as np
@@ -155,8 +155,8 @@ def decode_stored(data: bytes) -> Stored:
     Raises:
         TrilightError: as `decode_exr`.
     """
-    header: dict[str, Any] = {}
-    pixels = decode_channels(data, "RGB", header.update)["RGB"]
+    header = read_header(data)
+    pixels = decode_channels(data, "RGB", header)["RGB"]
     lossy = header["compression"] in _LOSSY
     if pixels.dtype != np.float16:  # other tools write float32
         return np.asarray(np.maximum(pixels, 0) if lossy else pixels, np.float32)
@@ -169,7 +169,7 @@ def decode_stored(data: bytes) -> Stored:
 def decode_channels(
     data: bytes,
     names: Collection[str],
-    check: Callable[[Header], None] = lambda header: None,
+    header: Header | None = None,
     *,
     size: tuple[int, int] | None = None,
     what: str = "picture",
@@ -183,20 +183,18 @@ def decode_channels(
     Args:
         data: the file.
         names: of the channels that it must have.
-        check: called with the header before any pixel is read; raises TrilightError.
+        header: that of `read_header`, where it is known.
         size: height and width as they must be; None for any.
         what: the file in messages about its size.
         separate: keep R, G and B apart.
 
     Raises:
         TrilightError: not an EXR file, truncated, of several parts, with other channels, larger
-            than MAX_RESOLUTION, of more than 3 GiB, of another size, or refused by `check`.
+            than MAX_RESOLUTION, of more than 3 GiB, or of another size.
     """
     with _readable():
-        header = read_header(data)
-        check(header)
-        stored_size = window_size(header)
-        if size is not None and stored_size != size:
+        header = read_header(data) if header is None else header
+        if size is not None and (stored_size := window_size(header)) != size:
             raise TrilightError(f"{what}: {list(stored_size)} pixels; expected {list(size)}.")
         _check_pixels(header, names)
         file = OpenEXR.File(io.BytesIO(data), num_threads=0, separate_channels=separate)

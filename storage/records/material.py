@@ -139,23 +139,18 @@ def default_rows(count: int) -> NDArray[np.float32]:
     return np.tile(row.astype(np.float32), (count, 1))
 
 
-def columns_in_use(materials: NDArray[np.float32]) -> tuple[str, ...]:
-    """Return the names of the columns that are not at their default in some row."""
+def columns_in_use(materials: NDArray[np.float32], but: Sequence[str] = ()) -> tuple[str, ...]:
+    """Return the names of the columns that are not at their default in some row, without `but`."""
     return tuple(
         column.name
         for column, part in laid_out()
-        if (materials[:, part] != np.float32(column.default)).any()
+        if column.name not in but and (materials[:, part] != np.float32(column.default)).any()
     )
-
-
-def unread_columns(materials: NDArray[np.float32], read: Sequence[str]) -> tuple[str, ...]:
-    """Return the columns in use that a reader of the columns `read` ignores."""
-    return tuple(name for name in columns_in_use(materials) if name not in read)
 
 
 def stored_columns(materials: NDArray[np.float32]) -> tuple[str, ...]:
     """Return the columns that a file of these rows holds: the published ones, and others in use."""
-    return (*PUBLISHED_COLUMNS, *unread_columns(materials, PUBLISHED_COLUMNS))
+    return (*PUBLISHED_COLUMNS, *columns_in_use(materials, PUBLISHED_COLUMNS))
 
 
 def column_places() -> dict[str, slice]:

@@ -46,13 +46,6 @@ def name_unreadable(name: object) -> Iterator[None]:
         raise TrilightError(f"{name}: cannot be read ({error.strerror}).") from error
 
 
-def open_if_there(path: Path) -> BinaryIO | None:
-    """Open as `open_plain`; None for no file, and TrilightError for one that cannot be read."""
-    with name_unreadable(path), contextlib.suppress(FileNotFoundError, NotADirectoryError):
-        return open_plain(path)
-    return None
-
-
 def read_plain(path: Path) -> bytes:
     """Return the bytes of a regular file; raises OSError as `open_plain`."""
     with open_plain(path) as stream:

@@ -25,7 +25,7 @@ from numpy.typing import NDArray
 
 from storage.digests import canonical_json
 from storage.errors import TrilightError
-from storage.raycast.first_hits import require_row
+from storage.raycast import require_row
 from storage.records.exr import FIRST_ILLEGAL, Stored, decode_exr, decode_stored, to_float32
 from storage.records.lights import (
     ALL_LIGHT,
@@ -337,18 +337,15 @@ def check_radiance(
         radiance_rgb: pictures [C, R, R, 3], or [C, L, R, R, 3] of lights apart.
         first_view: number of the first of them.
     """
-    if radiance_rgb.ndim == 5:
-        for light, pictures in enumerate(np.moveaxis(radiance_rgb, 1, 0)):
-            check_radiance(key, f" light {light}{which}", pictures, first_view=first_view)
-        return
     if radiance_rgb.min() >= 0 and radiance_rgb.max() < math.inf:  # NaN is neither
         return
-    wrong = np.argwhere(~(np.isfinite(radiance_rgb) & (radiance_rgb >= 0)))
-    view, row, column, channel = (int(index) for index in wrong[0])
-    value = radiance_rgb[view, row, column, channel]
+    wrong = np.argwhere(~(np.isfinite(radiance_rgb) & (radiance_rgb >= 0)))[0].tolist()
+    view, *lights, row, column, _ = wrong
+    light = f" light {lights[0]}" if lights else ""
     raise TrilightError(
-        f"sample {key}: view {first_view + view}{which} has radiance {value} at pixel ({row}, "
-        f"{column}); expected finite values from 0. Run `trilight verify` on the dataset."
+        f"sample {key}: view {first_view + view}{light}{which} has radiance "
+        f"{radiance_rgb[tuple(wrong)]} at pixel ({row}, {column}); expected finite values from 0. "
+        "Run `trilight verify` on the dataset."
     )
 
 

@@ -10,6 +10,7 @@ no textures. Or it is a normal map, which stands in the place of no column.
 """
 
 import dataclasses
+from collections import Counter
 from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Annotated, Any, Literal
@@ -216,9 +217,7 @@ def _check_arrays(scene: Scene) -> None:
         values = getattr(scene, field.name)
         if field.within is None or values is None:
             continue
-        holds = field.within.holds(values)
-        if not holds.all():  # what was expected is put into words only then
-            require_law(holds, field.name, values, str(field.within))
+        require_law(field.within.holds(values), field.name, values, str(field.within))
     for name, other in _EQUALLY_LONG:
         got = len(getattr(scene, name))
         expected = len(getattr(scene, other))
@@ -242,8 +241,7 @@ def _check_columns(scene: Scene) -> None:
     for column, part in laid_out():
         holds = np.ones(got, np.bool_)
         holds[:, part] = column.within.holds(scene.materials[:, part])
-        if not holds.all():
-            require_law(holds, "materials", scene.materials, f"{column.name} {column.within}")
+        require_law(holds, "materials", scene.materials, f"{column.name} {column.within}")
 
 
 def _check_geometry(scene: Scene) -> None:
@@ -263,11 +261,9 @@ def _check_materials(scene: Scene) -> None:
 
 
 def _check_objects(scene: Scene) -> None:
-    names = set[str]()
-    for entry in scene.objects:  # a set: a scene may hold 65536 of them
-        if entry.name in names:
-            broken_law(f"objects holds the name {entry.name!r} twice", "unique names")
-        names.add(entry.name)
+    for name, count in Counter(entry.name for entry in scene.objects).items():
+        if count > 1:
+            broken_law(f"objects holds the name {name!r} twice", "unique names")
     is_emitter = np.array([entry.kind == "emitter" for entry in scene.objects])
     agrees = is_emitter[scene.object_index] == scene.triangle_emits
     require_law(

@@ -73,8 +73,7 @@ def encode_arrays(scene: Scene) -> bytes:
     the metadata name all of them.
     """
     scene = without_constant_textures(scene)
-    stated = stored_names(stored_columns(scene.materials))
-    arrays = _arrays(scene)
+    arrays, stated = _arrays(scene)
     if (maps := maps_of(scene)) is not None:
         arrays[_MAPS_DIGEST] = maps.digest
     return save(arrays, None if stated is None else {_COLUMNS: stated})
@@ -118,9 +117,9 @@ def encode_scene(scene: Scene) -> bytes:
     scene.check()
     scene = without_constant_textures(scene)
     record = scene_record(scene)
-    if stated := stored_names(stored_columns(scene.materials)):
+    arrays, stated = _arrays(scene)
+    if stated is not None:
         record[_COLUMNS] = stated
-    arrays = _arrays(scene)
     if scene.textures:
         record["is_srgb"] = [texture.is_srgb for texture in scene.textures]
     for row, texture in enumerate(scene.textures):
@@ -286,13 +285,13 @@ def _as_stored(checked: Any, raw: Any) -> Any:
     return raw
 
 
-def _arrays(scene: Scene) -> dict[str, NDArray]:
-    arrays = {name: np.ascontiguousarray(getattr(scene, name)) for name in ARRAY_FIELDS}
-    for name in MAP_ARRAYS:
-        if (array := getattr(scene, name)) is not None:
-            arrays[name] = np.ascontiguousarray(array)
+def _arrays(scene: Scene) -> tuple[dict[str, NDArray], str | None]:
+    """Return the arrays of a scene, and what a file says of their material columns."""
+    fields = {name: getattr(scene, name) for name in (*ARRAY_FIELDS, *MAP_ARRAYS)}
     columns = stored_columns(scene.materials)
-    return arrays | {"materials": chosen_columns(scene.materials, columns)}
+    fields["materials"] = chosen_columns(scene.materials, columns)
+    arrays = {name: np.ascontiguousarray(each) for name, each in fields.items() if each is not None}
+    return arrays, stored_names(columns)
 
 
 def _maps(record: SceneJson, arrays: Mapping[str, NDArray]) -> dict[str, Any]:

@@ -9,11 +9,11 @@ from typing import Any, BinaryIO
 
 from storage.errors import Unreadable
 from storage.remote.retries import (
-    PATIENCE,
+    LEAST_BYTES_PER_S,
+    WINDOW_S,
     Interrupted,
     Pace,
     TransferFailed,
-    is_missing,
     with_tries,
 )
 from storage.remote.url import RemoteUrl, shared_driver, transfer_timeout
@@ -95,11 +95,6 @@ class _Expected:
         self.version = dict(version)
         return before in (None, self.version)
 
-    def require_pace(self, reached: int, total: int | None) -> None:
-        """Give up a file that comes too slowly; one that has come whole is not given up."""
-        if reached != total:
-            self.pace.require()
-
 
 def _fill_bucket(driver: Any, url: RemoteUrl, stream: BinaryIO, expected: _Expected) -> None:
     """Ask for piece after piece; buckets always know the size and always give ranges."""
@@ -109,7 +104,7 @@ def _fill_bucket(driver: Any, url: RemoteUrl, stream: BinaryIO, expected: _Expec
     if not expected.is_same(version_of(facts)):
         _start_over(stream)
     # Drivers that are asynchronous take a limit for the whole answer; the others have one a read.
-    most_s = PATIENCE.window_s + PIECE_BYTES / PATIENCE.least_bytes_per_s
+    most_s = WINDOW_S + PIECE_BYTES / LEAST_BYTES_PER_S
     limit = {"timeout": most_s} if driver.async_impl else {}
     while stream.tell() < num_bytes:
         start = stream.tell()
@@ -118,7 +113,8 @@ def _fill_bucket(driver: Any, url: RemoteUrl, stream: BinaryIO, expected: _Expec
         if len(piece) != end - start:
             raise Interrupted from EOFError(f"got {len(piece)} of {end - start} bytes")
         stream.write(piece)
-        expected.require_pace(stream.tell(), num_bytes)
+        if stream.tell() != num_bytes:  # a file that has come whole is not given up
+            expected.pace.require()
     if num_bytes > PIECE_BYTES and not expected.is_same(version_of(_fresh_info(driver, url))):
         _start_over(stream, _CHANGED)
 
@@ -153,7 +149,8 @@ async def _stream_http(driver: Any, url: RemoteUrl, stream: BinaryIO, expected: 
         async for chunk in answer.content.iter_chunked(_CHUNK_BYTES):
             expected.require(stream.tell() + len(chunk), is_all=False)
             stream.write(chunk)
-            expected.require_pace(stream.tell(), total)
+            if stream.tell() != total:
+                expected.pace.require()
     if expected.exact not in (None, stream.tell()):
         raise Interrupted from EOFError(f"got {stream.tell()} of {expected.exact} bytes")
 
@@ -167,22 +164,6 @@ def _start_over(stream: BinaryIO, why: str = "") -> None:
 
 
 _CHANGED = "the file changed while it was read"
-
-
-def fetch_if_there(url: RemoteUrl, stream: BinaryIO, *, max_bytes: int) -> bool:
-    """Write a file to an open one as `download`, and return True; False where there is none.
-
-    Raises:
-        Unreadable: it cannot be read.
-        TrilightError: as `download`.
-    """
-    try:
-        download(url, stream, num_bytes=None, max_bytes=max_bytes)
-    except TransferFailed as error:
-        if error.__cause__ is not None and is_missing(error.__cause__):
-            return False
-        raise unreadable(url, error) from error
-    return True
 
 
 def unreadable(url: RemoteUrl, error: TransferFailed) -> Unreadable:

@@ -1,11 +1,10 @@
 """Retries of remote requests, the least rate of a transfer, and error messages without secrets."""
 
 import errno
-import os
+import secrets
 import time
 from collections.abc import Callable
-from dataclasses import dataclass
-from typing import TypeVar
+from typing import Any, TypeVar
 
 from storage.errors import EnvironmentFailure, TrilightError
 from storage.remote.safe_url import printable, safe_text
@@ -13,10 +12,18 @@ from storage.remote.safe_url import printable, safe_text
 Result = TypeVar("Result")
 
 TRIES = 5
-"""Number of tries in a row without progress at the least rate (`Patience`)."""
+"""Number of tries in a row without progress at LEAST_BYTES_PER_S."""
 PAUSE_S = 0.5
 """Pause before the second try; doubled before each further one, up to MAX_PAUSE_S."""
 MAX_PAUSE_S = 20.0
+LEAST_BYTES_PER_S = 10_000.0
+"""Mean rate below which a transfer ends: a shard of 100 MB would take three hours. The slowest
+links that people work over, mobile ones at the edge of a cell, give twice that."""
+WINDOW_S = 300.0
+"""Seconds over which the mean is taken; a link may be gone for nearly as long."""
+FILE_S = 86_400.0
+"""Seconds for all of one file, tries and restarts included: a day, in which the least
+rate brings 864 MB."""
 _MOST_TRIES = 1000
 """Maximum number of tries of a transfer that progresses a little each time."""
 _MAX_MESSAGE = 200
@@ -51,12 +58,13 @@ def with_tries(function: Callable[[], Result], *, pace: "Pace | None" = None) ->
     It raises TransferFailed, and TrilightError, as the function; `download_failed` for any other
     exception, or a file that comes too slowly; an EnvironmentFailure where the disk is full.
     """
-    from tenacity import Retrying, retry_if_exception, stop_after_attempt  # slow to import
+    from tenacity import Retrying  # slow to import
 
     number = 0
 
-    def is_worth_a_try(error: BaseException) -> bool:
+    def is_worth_a_try(state: Any) -> bool:
         nonlocal number
+        error = state.outcome.exception()
         if isinstance(error, TransferFailed | TrilightError) or not isinstance(error, Exception):
             return False
         cause = root_error(error)
@@ -70,22 +78,21 @@ def with_tries(function: Callable[[], Result], *, pace: "Pace | None" = None) ->
             raise TransferFailed("download_failed", describe(cause)) from error
         if pace is not None:
             pace.require()
+        if state.attempt_number == _MOST_TRIES:
+            raise TransferFailed("download_failed", f"it was interrupted {_MOST_TRIES} times")
         return True
 
-    def give_up(state: object) -> Result:
-        raise TransferFailed("download_failed", f"it was interrupted {_MOST_TRIES} times")
+    def pause_s(state: object) -> float:
+        chance = secrets.randbelow(1000) / 1000  # no two processes share it
+        return min(PAUSE_S * 2 ** (number - 1), MAX_PAUSE_S) * (0.5 + chance)
 
-    return Retrying(
-        retry=retry_if_exception(is_worth_a_try),
-        wait=lambda state: min(PAUSE_S * 2 ** (number - 1), MAX_PAUSE_S) * (0.5 + _chance()),
-        stop=stop_after_attempt(_MOST_TRIES),
-        retry_error_callback=give_up,
-    )(function)
+    return Retrying(retry=is_worth_a_try, wait=pause_s)(function)
 
 
 def root_error(error: BaseException) -> BaseException:
     """Return the cause: the HTTP driver reports every error of a request as a missing file."""
-    while isinstance(error, FileNotFoundError | Interrupted) and error.__cause__ is not None:
+    wrappers = (FileNotFoundError, Interrupted, TransferFailed)
+    while isinstance(error, wrappers) and error.__cause__ is not None:
         error = error.__cause__
     return error
 
@@ -142,28 +149,6 @@ def _status(error: BaseException | None) -> int | None:
     return None
 
 
-def _chance() -> float:
-    """Return a number in [0, 1) that no two processes share; it decides nothing but a pause."""
-    return int.from_bytes(os.urandom(4), "little") / 2**32
-
-
-@dataclass(frozen=True, kw_only=True)
-class Patience:
-    """Time limits of a download."""
-
-    least_bytes_per_s: float = 10_000.0
-    """Mean rate below which a transfer ends: a shard of 100 MB would take three hours. The slowest
-    links that people work over, mobile ones at the edge of a cell, give twice that."""
-    window_s: float = 300.0
-    """Seconds over which the mean is taken; a link may be gone for nearly as long."""
-    file_s: float = 86_400.0
-    """Seconds for all of one file, tries and restarts included: a day, in which the least
-    rate brings 864 MB."""
-
-
-PATIENCE = Patience()
-
-
 class Pace:
     """Watches one file on its way, over all tries."""
 
@@ -178,7 +163,6 @@ class Pace:
         """
         self._position = position
         self._clock = clock
-        self._patience = PATIENCE
         self._begun = self._window = self._tried = (clock(), position())
 
     def require(self) -> None:
@@ -188,18 +172,18 @@ class Pace:
         """
         now_s = self._clock()
         reached = self._position()
-        if now_s - self._begun[0] > self._patience.file_s:
-            message = f"it did not come within {self._patience.file_s:.0f} s"
+        if now_s - self._begun[0] > FILE_S:
+            message = f"it did not come within {FILE_S:.0f} s"
             raise TransferFailed("download_failed", message)
         passed_s = now_s - self._window[0]
         moved = reached - self._window[1]
-        if passed_s < self._patience.window_s:
+        if passed_s < WINDOW_S:
             return
-        if moved < self._patience.least_bytes_per_s * passed_s:
+        if moved < LEAST_BYTES_PER_S * passed_s:
             raise TransferFailed(
                 "download_failed",
                 f"it is too slow, {max(moved, 0)} bytes in {passed_s:.0f} s; expected at least "
-                f"{self._patience.least_bytes_per_s:.0f} a second",
+                f"{LEAST_BYTES_PER_S:.0f} a second",
             )
         self._window = (now_s, reached)
 
@@ -207,5 +191,5 @@ class Pace:
         """Return whether the file came at the least rate since this was asked last."""
         before_s, before = self._tried
         self._tried = now_s, reached = self._clock(), self._position()
-        least = self._patience.least_bytes_per_s * (now_s - before_s)
+        least = LEAST_BYTES_PER_S * (now_s - before_s)
         return reached - before > max(least, 0)

@@ -26,7 +26,7 @@ from storage.atomic import atomic_writer, write_atomically
 from storage.digests import sha256_of_stream
 from storage.errors import EnvironmentFailure, ShardMissing, TrilightError, Unreadable
 from storage.file_locks import hold_lock
-from storage.remote.fetch import facts_of, fetch_if_there, unreadable
+from storage.remote.fetch import download, facts_of, unreadable
 from storage.remote.retries import TransferFailed, is_missing, is_taken, may_pass, with_tries
 from storage.remote.shard_cache import shard_cache
 from storage.remote.url import RemoteUrl, shared_driver
@@ -64,13 +64,14 @@ class LocalStore:
         Raises:
             TrilightError: it cannot be read (an EnvironmentFailure where that may pass).
         """
-        from storage.records.safe_read import open_if_there  # slow, and most names need no file
+        # slow, and most names need no file
+        from storage.records.safe_read import name_unreadable, open_plain
 
-        stream = open_if_there(self.root / name)
-        if stream is None:
-            return None
-        with stream:
-            return stream.read(-1 if num_bytes is None else num_bytes)
+        path = self.root / name
+        with name_unreadable(path), contextlib.suppress(FileNotFoundError, NotADirectoryError):
+            with open_plain(path) as stream:
+                return stream.read(-1 if num_bytes is None else num_bytes)
+        return None
 
     def put(self, name: str, content: Path | bytes) -> None:
         """Write a file, or replace it; one that stands at its place in a folder stays.
@@ -202,8 +203,13 @@ class RemoteStore:
         url = self.url.child(name)
         if num_bytes is None:
             stream = io.BytesIO()
-            is_there = fetch_if_there(url, stream, max_bytes=MAX_FILE_BYTES)
-            return stream.getvalue() if is_there else None
+            try:
+                download(url, stream, num_bytes=None, max_bytes=MAX_FILE_BYTES)
+            except TransferFailed as error:
+                if is_missing(error):
+                    return None
+                raise unreadable(url, error) from error
+            return stream.getvalue()
 
         def read() -> bytes | None:
             with contextlib.suppress(FileNotFoundError):
@@ -304,7 +310,7 @@ class RemoteStore:
         try:
             return facts_of(url).get("size")
         except TransferFailed as error:
-            if error.__cause__ is not None and is_missing(error.__cause__):
+            if is_missing(error):
                 raise ShardMissing(f"{url.display_url}: the shard is missing.") from error
             raise unreadable(url, error) from error
 

@@ -113,14 +113,13 @@ class FieldDescription:
 def describe_fields(kind: type) -> tuple[FieldDescription, ...]:
     """Return the descriptions of the fields of a dataclass, in their order."""
     hints = typing.get_type_hints(kind, include_extras=True)
-    descriptions = []
-    for field in dataclasses.fields(kind):
-        hint = hints[field.name]
-        bare, notes = unwrap(hint)
-        descriptions.append(
-            FieldDescription(owner=kind, name=field.name, hint=hint, bare=bare, notes=notes)
+    return tuple(
+        FieldDescription(
+            owner=kind, name=field.name, hint=hints[field.name], bare=bare, notes=notes
         )
-    return tuple(descriptions)
+        for field in dataclasses.fields(kind)
+        for bare, notes in [unwrap(hints[field.name])]
+    )
 
 
 @functools.cache
@@ -145,18 +144,14 @@ def field_sentences(kind: type) -> Mapping[str, str]:
 
 def unwrap(hint: Any) -> tuple[Any, list[Any]]:
     """Return a type without its notes and without None, and the notes."""
-    notes: list[Any] = []
-    while True:
-        if get_origin(hint) is Annotated:
-            hint, *more = get_args(hint)
-            notes += more
-        elif get_origin(hint) in (typing.Union, types.UnionType):
-            kinds = [kind for kind in get_args(hint) if kind is not types.NoneType]
-            if len(kinds) == len(get_args(hint)):
-                return hint, notes
-            hint = typing.Union[tuple(kinds)]  # noqa: UP007
-        else:
-            return hint, notes
+    args = get_args(hint)
+    if get_origin(hint) is Annotated:
+        bare, inner_notes = unwrap(args[0])
+        return bare, [*args[1:], *inner_notes]
+    if get_origin(hint) in (typing.Union, types.UnionType) and types.NoneType in args:
+        kinds = tuple(kind for kind in args if kind is not types.NoneType)
+        return unwrap(typing.Union[kinds])  # noqa: UP007
+    return hint, []
 
 
 def parts_of(hint: Any) -> Iterator[Any]:

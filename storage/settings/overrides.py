@@ -155,12 +155,11 @@ def _without_presets(new: Any, old: Any, name: str) -> Any:
         if isinstance(each, str) and each in presets:
             with mistakes_of_entry(f"{name} {each!r}"):
                 each = settings_record(presets[each]())
-        records.append(each)
-    for each in records:
-        if not isinstance(each, Mapping):
+        elif not isinstance(each, Mapping):
             known = f"{expected_one_of(str(each), presets)}, {OF_EXTENSION}, or"
             choices = known if presets else "expected"
             raise _no_group(new, name, first, choices)
+        records.append(each)
     return records if many else records[0]
 
 

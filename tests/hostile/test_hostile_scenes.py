@@ -21,7 +21,7 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from infra.judging import _bytes_of
+from infra.judging import _read_picture
 from model.weights import read_metadata, read_tensors
 from pipeline.assets.prepare import prepare_asset
 from pipeline.assets.settings import AssetSettings, OwnMaterialSettings
@@ -299,8 +299,9 @@ def test_no_handler_cites_what_a_library_raised() -> None:
 
 
 READERS: list[Callable[[Path], object]] = [
-    *(_bytes_of, file_text, index_shard, read_checkpoint, read_failures, read_head),
-    *(read_manifest, read_metadata, read_objects_lock, read_rows, read_scene_file, read_tensors),
+    *(lambda path: _read_picture(path, [4]), file_text, index_shard, read_checkpoint),
+    *(read_failures, read_head, read_manifest, read_metadata, read_objects_lock, read_rows),
+    *(read_scene_file, read_tensors),
 ]
 
 

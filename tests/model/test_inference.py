@@ -28,7 +28,7 @@ from model.view_decoder import BilinearUpsample, Fusion, compose_radiance
 from model.weights import RANGE_KEY, TrainedRange, encode_weights, trained_range
 from storage.conventions import look_at_c2w
 from storage.errors import TrilightError
-from storage.raycast.first_hits import first_hits
+from storage.raycast import first_hits
 from storage.records.material import DIFFUSE, EMISSION, SPECULAR
 from storage.records.scene import Scene
 from tests.for_each import for_each

@@ -18,7 +18,7 @@ from model.renderformer import RenderFormer, radiance
 from model.scene_tensors import SceneTensors, batch_scenes, map_tensors
 from storage.conventions import log10_radiance, radiance_from_log10
 from storage.errors import TrilightError
-from storage.raycast.first_hits import first_hits
+from storage.raycast import first_hits
 from storage.records.sample import Sample
 from storage.renderer import fingerprint
 from train.data.scenes import TrainingScene, block_mean, training_scene

@@ -28,7 +28,7 @@ from pipeline.objects.generated import BENCHMARK
 from pipeline.renders.mitsuba_variant import choose_variant
 from pipeline.renders.noise_floor import clamped_radiance
 from storage.conventions import log10_radiance
-from storage.raycast.first_hits import first_hits
+from storage.raycast import first_hits
 from storage.records.scene import Scene
 from storage.renderer import Renderer
 

@@ -19,7 +19,7 @@ from pipeline.assets.quality.measure import unit_normals
 from pipeline.foreign.material import Slot, SourceMaterial, TexturedMesh, source_columns
 from pipeline.foreign.mesh import TriangleMesh
 from storage.errors import Rejected
-from storage.raycast.caster import MISS, Triangles
+from storage.raycast import MISS, Triangles
 from storage.records.lookup import LEAST_Z, u_directions, unit_or_zero
 
 _BEHIND = 1e-4

@@ -10,8 +10,7 @@ from numpy.typing import NDArray
 
 from storage.conventions import in_camera, pixel_places
 from storage.errors import TrilightError, expected_one_of
-from storage.raycast.caster import MISS
-from storage.raycast.first_hits import FirstHits, corner_table
+from storage.raycast import MISS, FirstHits, corner_table
 from storage.records.material import laid_out
 from storage.records.scene import Scene
 

@@ -10,15 +10,14 @@ holds 0 instead of NaN, since filters of other programs would spread NaN over it
 readers restore it. For the same reason a scene without textures has no channels of the pass `uv`.
 """
 
-from collections.abc import Collection, Iterator, Mapping, Sequence
+from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
 
 import numpy as np
 from numpy.typing import NDArray
 
 from storage.conventions import camera_rays
 from storage.errors import TrilightError
-from storage.raycast.caster import FirstHitCaster
-from storage.raycast.first_hits import SeenFrom, require_row
+from storage.raycast import FirstHitCaster, SeenFrom, require_row
 from storage.records.exr import channel_names, decode_channels, encode_channels
 from storage.records.passes.declared import (
     MOTION,
@@ -85,7 +84,12 @@ def view_passes(
     origin = scene.c2w[view, :3, 3].astype(np.float64)
     seen = SeenFrom(scene, origin, surfaces)
     blocks = [
-        _block(chosen, centre, spread, rays_a_side)
+        {
+            each.name: each.at(centre)
+            if each.averaging == "centre ray"
+            else _means(each.at(spread), rays_a_side, each.nothing)
+            for each in chosen
+        }
         for centre, spread in _blocks(seen, view, resolution, rays_a_side, later)
     ]
     return {each.name: np.concatenate([block[each.name] for block in blocks]) for each in chosen}
@@ -116,26 +120,13 @@ def _blocks(
         yield centre, centre if a_side == 1 else rays(first, last, a_side)
 
 
-def _block(
-    passes: Sequence[Pass], centre: PassRays, spread: PassRays, a_side: int
-) -> dict[str, NDArray]:
-    """Return the pixels of some rows, [rows, R] or [rows, R, channels]."""
-    pixels: dict[str, NDArray] = {}
-    for each in passes:
-        if each.averaging == "centre ray":
-            pixels[each.name] = each.at(centre)
-        else:
-            pixels[each.name] = _means(each.at(spread), a_side, each.nothing)
-    return pixels
-
-
 def _means(values: NDArray, a_side: int, nothing: float) -> NDArray:
     """Return the means over squares of rays that have finite values; `nothing` where none has."""
-    has_value = np.isfinite(values if values.ndim == 2 else values[..., 0])
+    has_value = np.isfinite(values if values.ndim == 2 else values[..., :1])
     if a_side == 1:
-        return np.where(_beside(has_value, values), values, nothing)
-    total = _sums(np.where(_beside(has_value, values), values, 0), a_side)
-    count = _beside(_sums(has_value.astype(np.float64), a_side), total)
+        return np.where(has_value, values, nothing)
+    total = _sums(np.where(has_value, values, 0), a_side)
+    count = _sums(has_value.astype(np.float64), a_side)
     return np.where(count > 0, total / np.maximum(count, 1), nothing)
 
 
@@ -146,12 +137,7 @@ def _sums(values: NDArray, a_side: int) -> NDArray:
     return blocks.sum(axis=3).sum(axis=1)
 
 
-def _beside(pixels: NDArray, values: NDArray) -> NDArray:
-    """Return [rows, R] with a last axis where `values` have one."""
-    return pixels if values.ndim == 2 else pixels[..., None]
-
-
-def _select_passes(names: Sequence[str] | None, *, without: Collection[str]) -> list[Pass]:
+def _select_passes(names: Iterable[str] | None, *, without: Collection[str] = ()) -> list[Pass]:
     known = {each.name: each for each in declared_passes()}
     if names is None:
         return [each for each in known.values() if each.name not in without]
@@ -232,7 +218,7 @@ def passes_exr(
     )
     is_hit = pictures[COVERAGE] > 0
     channels: dict[str, NDArray[np.float32]] = {}
-    for each in _passes(pictures):
+    for each in _select_passes(pictures):
         values = np.atleast_3d(pictures[each.name]).astype(np.float32)
         unmet = np.isnan(values) & ~is_hit[..., None]
         planes = np.where(unmet, np.float32(0), values)
@@ -279,7 +265,8 @@ def picture_passes(
     if lacking:
         computed = view_passes(scene, lacking, view=view, resolution=resolution)
         pictures |= {
-            each.name: computed[each.name].astype(_stored_dtype(each)) for each in _passes(computed)
+            each.name: computed[each.name].astype(_stored_dtype(each))
+            for each in _select_passes(computed)
         }
     return {name: pictures[name] for name in names}
 
@@ -292,10 +279,6 @@ def passes_in_file(scene: Scene, names: Sequence[str]) -> list[str]:
     """
     known = [name for name in names if name != UV or scene.uv is not None]
     return known if COVERAGE in known else [*known, COVERAGE]
-
-
-def _passes(pictures: Mapping[str, NDArray]) -> list[Pass]:
-    return [each for each in declared_passes() if each.name in pictures]
 
 
 def _stored_dtype(each: Pass) -> type:

@@ -32,7 +32,7 @@ from model.scene_tensors import SceneBatch, SceneTensors, batch_scenes, map_tens
 from model.weights import decode_weights, encode_weights
 from scene_templates.rotations import uniform_rotation
 from storage.errors import TrilightError
-from storage.raycast.caster import RayHits, Triangles
+from storage.raycast import RayHits, Triangles
 from storage.records.material import EMISSION
 from storage.records.scene import Scene
 from tests.for_each import for_each

@@ -18,7 +18,7 @@ from model.scene_tensors import batch_scenes, scene_tensors
 from storage.conventions import pixel_places
 from storage.denoiser import Features, denoise
 from storage.metrics import pepper
-from storage.raycast.first_hits import first_hits
+from storage.raycast import first_hits
 from storage.records.material import EMISSION
 from storage.records.scene import Scene
 from tests.for_each import for_each

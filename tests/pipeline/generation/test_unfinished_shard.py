@@ -176,7 +176,7 @@ def test_a_scene_that_crashes_its_child_costs_an_attempt(tmp_path: Path) -> None
     made: Counter[int] = Counter()
     assert _make(tmp_path, 0, 2, made, broken=1) is None
     staged = DatasetFolder(tmp_path).staged_shard(NAME)
-    (failure,) = read_staged_scene(staged, 1).failures
+    _, (failure,) = read_staged_scene(staged, 1)
     assert (failure.reason, failure.attempt) == ("environmental_skip", 0)
     assert "SIGSEGV" in failure.message
 

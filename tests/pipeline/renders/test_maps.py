@@ -17,7 +17,7 @@ from pipeline.renders.tracer import load_tracer
 from pipeline.renders.vector_tracer import VectorTracer
 from scene_templates.rotations import uniform_rotation
 from storage.errors import TrilightError
-from storage.raycast.first_hits import first_hits
+from storage.raycast import first_hits
 from storage.records.environment import Environment, row_solid_angles
 from storage.records.lights import light_rows
 from storage.records.lookup import (

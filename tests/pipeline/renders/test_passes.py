@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from pipeline.renders.kernel_scene import CameraRays
 from pipeline.renders.tracer import load_tracer
-from storage.raycast.caster import Surfaces
+from storage.raycast import Surfaces
 from storage.records.passes.pictures import view_passes
 from storage.records.scene import Scene
 from tests.oracle import plugin_scene, plugin_tracer

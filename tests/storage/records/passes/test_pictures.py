@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from storage.conventions import camera_rays, in_camera, look_at_c2w, pixel_places
 from storage.dataset.settings import StorageSettings
 from storage.errors import TrilightError
-from storage.raycast.first_hits import first_hits
+from storage.raycast import first_hits
 from storage.records.exr import channel_names, decode_channels, encode_channels
 from storage.records.lookup import texture_values
 from storage.records.material import default_rows
@@ -481,7 +481,7 @@ def test_files_of_plain_scenes_have_no_coordinates_and_no_nan() -> None:
         )
         found = decode_passes_exr(packed, RESOLUTION)
         assert set(found) == {"coverage", "shading_normal"} | there
-        raw = decode_channels(packed, sorted(channels), lambda header: None, separate=True)
+        raw = decode_channels(packed, sorted(channels), separate=True)
         assert not any(np.isnan(plane).any() for plane in raw.values())
         again = picture_passes(scene, names, view=0, resolution=RESOLUTION, stored=packed)
         plain = picture_passes(scene, names, view=0, resolution=RESOLUTION)

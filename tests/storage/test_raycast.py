@@ -5,8 +5,7 @@ import pytest
 
 from storage.conventions import camera_rays, look_at_c2w
 from storage.errors import TrilightError
-from storage.raycast.caster import MISS, Surfaces
-from storage.raycast.first_hits import FirstHits, SeenFrom, first_hits
+from storage.raycast import MISS, FirstHits, SeenFrom, Surfaces, first_hits
 from tests.pipeline.renders.scene_kit import join, light
 from tests.scenes_by_hand import tiny_scene
 
