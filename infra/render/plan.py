@@ -27,8 +27,7 @@ from infra.render.quality import Budget, FixedSamples, Traced
 from infra.render.tone_mapping import Look
 from infra.torch_library import require_torch
 from pipeline.exchange.formats import readable_suffixes
-from pipeline.exchange.open_scene import SceneSource, scene_source
-from pipeline.exchange.reader import SceneReader
+from pipeline.exchange.reader import SceneReader, SceneSource, scene_source
 from pipeline.renders.mitsuba_variant import choose_variant
 from storage.atomic import write_atomically, write_error
 from storage.dataset.shard_set import expand_pattern

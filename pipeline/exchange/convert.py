@@ -26,8 +26,7 @@ from pipeline.exchange.formats import (
     writable_suffixes,
 )
 from pipeline.exchange.from_description import SMOOTH_ANGLE_DEG
-from pipeline.exchange.open_scene import load_source
-from pipeline.exchange.reader import SceneReader
+from pipeline.exchange.reader import SceneReader, load_source
 from pipeline.foreign.mesh import TriangleMesh
 from pipeline.scenes.pieces import ScenePiece, concatenate_pieces
 from pipeline.scenes.shading_normals import (

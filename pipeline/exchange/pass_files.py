@@ -4,8 +4,7 @@ import os
 from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
 
-from pipeline.exchange.open_scene import scene_source
-from pipeline.exchange.reader import SceneReader
+from pipeline.exchange.reader import SceneReader, scene_source
 from pipeline.exchange.textured_triangles import LoadedScene
 from storage.atomic import write_atomically
 from storage.conventions import SPLITS

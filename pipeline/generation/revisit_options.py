@@ -7,7 +7,7 @@ from dataclasses import field, fields
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
-from pipeline.exchange.open_scene import load_cameras, scene_source
+from pipeline.exchange.reader import load_cameras, scene_source
 from pipeline.generation.generate_options import GenerateOptions
 from pipeline.presets.settings import MOST_CAMERAS, GivenCamera, RevisitSettings
 from pipeline.renders.mitsuba_variant import Device

@@ -14,7 +14,7 @@ import pytest
 from infra.cli.extend_option import load_extensions
 from model.config import SIZES, ModelConfig
 from pipeline.exchange.convert import write_scene
-from pipeline.exchange.open_scene import load_source, scene_source
+from pipeline.exchange.reader import load_source, scene_source
 from pipeline.executors.registry import EXECUTORS
 from pipeline.objects.sources import check_source, list_objects
 from pipeline.presets.registry import DATASET_PRESETS, preset_settings, resolve_dataset_preset

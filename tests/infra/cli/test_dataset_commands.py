@@ -20,7 +20,7 @@ from infra.run_record import is_run, run_facts
 from model.open import open_network
 from model.weights import encode_weights
 from pipeline.exchange import reader
-from pipeline.exchange.open_scene import load_source, scene_source
+from pipeline.exchange.reader import load_source, scene_source
 from pipeline.exchange.renderformer_h5 import read_renderformer_h5
 from pipeline.exchange.renderformer_json import describe_scene
 from pipeline.renders.mitsuba_variant import choose_variant
