@@ -70,21 +70,19 @@ DEFAULT_FAMILIES = tuple(
 """The sizes are the published ones of most families."""
 
 
-def alone() -> Family:
-    """Return the family of one object within a sphere of radius 0.5 around the origin."""
-    return Family(
-        name="alone",
-        template="alone",
-        shell=SharedRoom(),
-        num_objects=(1, 1),
-        object_scale=(2.0, 2.0),
-    )
-
+_ALONE = Family(
+    name="alone",
+    template="alone",
+    shell=SharedRoom(),
+    num_objects=(1, 1),
+    object_scale=(2.0, 2.0),
+)
+"""One object within a sphere of radius 0.5 around the origin."""
 
 FAMILIES: Registry[Callable[[], Family]] = Registry(
     "family",
     Callable,
-    {**{family.name: partial(replace, family) for family in DEFAULT_FAMILIES}, "alone": alone},
+    {family.name: partial(replace, family) for family in (*DEFAULT_FAMILIES, _ALONE)},
     decides=("data",),
 )
 """Functions that return a family, by its name. A preset states its families in full and asks for no

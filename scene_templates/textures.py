@@ -39,22 +39,6 @@ UserTexture = tuple[NDArray[np.float32], NDArray[np.float32], NDArray[np.float32
 None where one number is to be drawn."""
 
 
-def user_surface(
-    chosen: UserMap[UserTexture], rng: np.random.Generator, roughness_clip: tuple[float, float]
-) -> SurfaceMaps:
-    """Return a user's surface; a roughness that is missing is uniform in `roughness_clip`."""
-    diffuse_rgb, specular_rgb, rough = chosen.load()
-    if rough is None:
-        rough = np.full((*diffuse_rgb.shape[:2], 1), rng.uniform(*roughness_clip), np.float32)
-    return SurfaceMaps(
-        family=chosen.source.name,
-        diffuse_rgb=diffuse_rgb,
-        specular_rgb=specular_rgb,
-        roughness=np.clip(rough, *roughness_clip).astype(np.float32),
-        source=chosen.source,
-    )
-
-
 @dataclass(frozen=True, kw_only=True, eq=False)
 class OwnMaps:
     """User textures and skies that the scenes of a split may use."""
@@ -163,7 +147,17 @@ def draw_look(
     if chosen is None:
         maps = draw_surface(rng, settings.surfaces)
     else:
-        maps = user_surface(chosen, rng, settings.surfaces.roughness_clip)
+        clip = settings.surfaces.roughness_clip
+        diffuse_rgb, specular_rgb, rough = chosen.load()
+        if rough is None:
+            rough = np.full((*diffuse_rgb.shape[:2], 1), rng.uniform(*clip), np.float32)
+        maps = SurfaceMaps(
+            family=chosen.source.name,
+            diffuse_rgb=diffuse_rgb,
+            specular_rgb=specular_rgb,
+            roughness=np.clip(rough, *clip).astype(np.float32),
+            source=chosen.source,
+        )
     return TexturedLook(
         maps=maps,
         tile_m=float(tile_m),

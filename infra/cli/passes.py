@@ -45,7 +45,7 @@ def passes(options: PassOptions) -> None:
     names = pass_names(name for words in options.passes for name in words.split(","))
     gpu, note = choose_gpu("auto", device=options.device)
     first_words(f"Writing {', '.join(names)} to {options.out}")
-    from pipeline.exchange.pass_files import write_passes
+    from pipeline.exchange.exports.export import write_passes
 
     caster: Callable[[Scene], FirstHitCaster] = Surfaces
     if gpu is not None:

@@ -23,7 +23,6 @@ from pipeline.exchange.formats import (
     SceneSource,
     drop_uncarried_maps,
     list_lost_members,
-    writable_suffixes,
 )
 from pipeline.exchange.from_description import SMOOTH_ANGLE_DEG
 from pipeline.exchange.reader import SceneReader, load_source
@@ -104,9 +103,9 @@ def write_scene(
 def _form_of(target: Path) -> SceneFormat:
     form = FORMATS.get(target.suffix.lower())
     if form is None or form.write is None or target.is_dir():
+        suffixes = " ".join(suffix for suffix, each in FORMATS.items() if each.write)
         raise TrilightError(
-            f"{target}: cannot be written as a scene; expected the name of a file: "
-            f"{' '.join(writable_suffixes())}."
+            f"{target}: cannot be written as a scene; expected the name of a file: {suffixes}."
         )
     return form
 

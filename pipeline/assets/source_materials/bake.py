@@ -7,6 +7,7 @@ lookup within it can read belongs to it alone. The other half holds another tria
 degrees. Triangles of one flat color share four texels.
 """
 
+from collections.abc import Mapping
 from dataclasses import dataclass
 
 import numpy as np
@@ -21,27 +22,15 @@ from storage.conventions import linear_from_srgb8, srgb8
 from storage.errors import Rejected
 from storage.records.lookup import FLAT as FLAT_NORMAL
 from storage.records.lookup import unit_or_zero
-from storage.records.texture import Texture
+from storage.records.texture import NORMAL as NORMAL_MAP
+from storage.records.texture import TEXTURED, Texture
 
-SIDES = tuple(sorted({*(1 << k for k in range(14)), *(3 << k for k in range(12))}))
+_SIDES = np.array(sorted({*(1 << k for k in range(14)), *(3 << k for k in range(12))}))
 """Numbers of cells a side: 1, 2, 3, 4, 6, 8, 12, ...; few, so that most tiles find a partner."""
 
 _GUTTER = 3
 FLAT = 2
 """Width in texels of the square of a flat color."""
-
-
-def cells_per_side(corners: NDArray[np.float64], density: float) -> NDArray[np.int64]:
-    """Return the cells a side [F] of triangles with corners [F, 3, 3], the longest edge last.
-
-    Args:
-        corners: the first corner of each lies opposite the longest edge (`longest_edge_order`).
-        density: cells per unit of length.
-    """
-    legs = np.linalg.norm(corners[:, 1:] - corners[:, :1], axis=2).max(axis=1)
-    cells = np.ceil(legs * density - 1e-9).astype(np.int64)
-    index = np.searchsorted(SIDES, np.clip(cells, 1, SIDES[-1]))
-    return np.asarray(SIDES, np.int64)[index]
 
 
 def longest_edge_order(corners: NDArray[np.float64]) -> NDArray[np.int64]:
@@ -162,10 +151,8 @@ class BakedTextures:
 
     uv: NDArray[np.float32]
     """[F, 3, 2] texture coordinates of the corners, v up."""
-    textures: tuple[Texture, Texture, Texture]
-    """Textures for diffuse albedo, specular albedo and roughness."""
-    normal: Texture | None
-    """Normal map; None where the source has none."""
+    textures: Mapping[str, Texture]
+    """Textures by the names of TEXTURED, and the normal map where it is not flat."""
     missed: float
     """Fraction of the texels without a source surface nearby."""
     density: float
@@ -207,7 +194,6 @@ def bake(
     return BakedTextures(
         uv=uv.astype(np.float32),
         textures=_textures(values, texels),
-        normal=_normal_map(values, texels),
         missed=texels.missed,
         density=density,
     )
@@ -216,10 +202,15 @@ def bake(
 def _cells(
     corners: NDArray[np.float64], settings: OwnMaterialSettings
 ) -> tuple[NDArray[np.int64], float]:
-    """Return the cells of each tile, and the density at which the atlas fits its size."""
+    """Return the cells of each tile, and the density at which the atlas fits its size.
+
+    The first corner of each triangle lies opposite its longest edge (`longest_edge_order`).
+    """
+    legs = np.linalg.norm(corners[:, 1:] - corners[:, :1], axis=2).max(axis=1)
     density = float(settings.texels)
     while True:
-        cells = cells_per_side(corners, density)
+        least = np.ceil(legs * density - 1e-9).astype(np.int64)
+        cells = _SIDES[np.searchsorted(_SIDES, np.clip(least, 1, _SIDES[-1]))]
         plan = pack_atlas(cells)
         if max(plan.width, plan.height) <= settings.size or (cells == 1).all():
             return cells, density
@@ -320,14 +311,7 @@ def _atlas_values(plan: Atlas, first_of: NDArray[np.int64], texels: _Texels) -> 
     return values
 
 
-def _normal_map(values: NDArray[np.float64], texels: _Texels) -> Texture | None:
-    """Return the normal map in 8 bits; None where it would be flat."""
-    if _has_flat_normals(texels.codes).all():
-        return None
-    return Texture(texels=np.round(values[..., NORMAL] * 255).astype(np.uint8))
-
-
-def _textures(values: NDArray[np.float64], texels: _Texels) -> tuple[Texture, Texture, Texture]:
+def _textures(values: NDArray[np.float64], texels: _Texels) -> dict[str, Texture]:
     """Return the maps in 8 bits; a constant map is one texel in float32."""
     constants = [_constant(texels, part) for part in _PARTS]
     stored = [srgb8(values[..., DIFFUSE])]
@@ -338,13 +322,16 @@ def _textures(values: NDArray[np.float64], texels: _Texels) -> tuple[Texture, Te
     elif constants[1] is None:
         over = np.minimum(constants[0] + stored[1] / 255, 1) - constants[0]
         stored[1] = np.floor(over * 255 + 1e-6).astype(np.uint8)
-    first, second, third = (
-        Texture(texels=np.ascontiguousarray(coded), is_srgb=part is DIFFUSE)
+    textures = {
+        name: Texture(texels=np.ascontiguousarray(coded), is_srgb=name == TEXTURED[0])
         if constant is None
         else Texture(texels=constant[None, None])
-        for part, coded, constant in zip(_PARTS, stored, constants, strict=True)
-    )
-    return first, second, third
+        for name, coded, constant in zip(TEXTURED, stored, constants, strict=True)
+    }
+    if not _has_flat_normals(texels.codes).all():
+        normal = np.round(values[..., NORMAL] * 255).astype(np.uint8)
+        textures[NORMAL_MAP] = Texture(texels=normal)
+    return textures
 
 
 _PARTS = (DIFFUSE, SPECULAR, ROUGHNESS)

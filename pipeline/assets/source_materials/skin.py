@@ -1,7 +1,7 @@
 """Source materials of one object, from its file to the skins of its levels."""
 
 import dataclasses
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 
 import igl
 import numpy as np
@@ -35,7 +35,7 @@ from storage.errors import Rejected, TrilightError
 from storage.records.asset import Level, LevelSkin, OwnMaterials, SkinQuality
 from storage.records.lookup import texture_values
 from storage.records.packed_maps import pack_map
-from storage.records.texture import NORMAL, TEXTURED, Texture
+from storage.records.texture import TEXTURED, Texture
 from storage.seeds import rng_for
 
 _LEAST_REACH = 1e-3
@@ -112,12 +112,9 @@ def add_skin(level: Level, surface: SourceSurface, settings: OwnMaterialSettings
     _require_near(quality, level.record.budget, settings)
     glow = level_emission(mesh, surface, reach)
     _require_lawful(baked.textures, glow)
-    textures = dict(zip(TEXTURED, baked.textures, strict=True))
-    if baked.normal is not None:
-        textures[NORMAL] = baked.normal
     skin = LevelSkin(
         uv=baked.uv,
-        packed={name: pack_map(texture) for name, texture in textures.items()},
+        packed={name: pack_map(texture) for name, texture in baked.textures.items()},
         quality=quality,
         emission=glow,
     )
@@ -139,10 +136,10 @@ def _require_near(quality: SkinQuality, budget: int, settings: OwnMaterialSettin
         )
 
 
-def _require_lawful(textures: Sequence[Texture], emission: NDArray[np.float32] | None) -> None:
+def _require_lawful(textures: Mapping[str, Texture], emission: NDArray[np.float32] | None) -> None:
     try:
-        for texture, column in zip(textures, TEXTURED, strict=True):
-            texture.check(column)
+        for column in TEXTURED:
+            textures[column].check(column)
     except TrilightError as error:
         raise Rejected("materials_unreadable", str(error)) from error
     if emission is not None and not FINITE.holds(emission).all():
@@ -204,7 +201,7 @@ def _color_errors(
     _, faces, nearest = igl.point_mesh_squared_distance(points, level.positions, level.faces)
     faces = np.asarray(faces, np.int64).ravel()
     uv = np.einsum("nc,ncd->nd", barycentric(level.corners[faces], nearest), baked.uv[faces])
-    level_rgb = texture_values(baked.textures[0], uv)
+    level_rgb = texture_values(baked.textures[TEXTURED[0]], uv)
     return np.abs(level_rgb - source_rgb).mean(axis=1)
 
 

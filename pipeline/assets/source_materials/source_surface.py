@@ -319,7 +319,11 @@ def match_source_surface(mesh: TriangleMesh, parts: TexturedMesh) -> SourceSurfa
             "materials_unreadable",
             f"{missing.mean():.1%} of the faces are not found again beside their materials",
         )
-    source_face = np.where(missing, _nearest_matched(mesh, missing, source_face), source_face)
+    centres = mesh.corners.mean(axis=1)
+    known = np.flatnonzero(~missing)
+    for row in np.flatnonzero(missing):  # rounding split it: the match of the nearest face
+        squared = np.square(centres[known] - centres[row]).sum(axis=1)
+        source_face[row] = source_face[known[squared.argmin()]]
     source_corner = (corners[source_face][:, None, :] == mesh.faces[:, :, None]).argmax(axis=2)
     source_corner[missing] = np.arange(3)
     _require_coordinates(parts, source_face)
@@ -336,21 +340,6 @@ def _first_matches(faces: NDArray[np.int64], candidates: NDArray[np.int64]) -> N
     np.minimum.at(first, number.ravel()[: len(candidates)], np.arange(len(candidates)))
     first_match = first[number.ravel()[len(candidates) :]]
     return np.where(first_match < len(candidates), first_match, -1)
-
-
-def _nearest_matched(
-    mesh: TriangleMesh, missing: NDArray[np.bool_], source_face: NDArray[np.int64]
-) -> NDArray[np.int64]:
-    """Fill in each missing face with the match of the face whose center is nearest."""
-    if not missing.any():
-        return source_face
-    centres = mesh.corners.mean(axis=1)
-    known = np.flatnonzero(~missing)
-    filled = source_face.copy()
-    for row in np.flatnonzero(missing):
-        squared = np.square(centres[known] - centres[row]).sum(axis=1)
-        filled[row] = source_face[known[squared.argmin()]]
-    return filled
 
 
 def _require_coordinates(parts: TexturedMesh, source_face: NDArray[np.int64]) -> None:
