@@ -262,12 +262,10 @@ def check_level(
     if not 1 <= len(mesh.faces) <= budget:
         raise Rejected("budget_missed", f"{len(mesh.faces)} faces; expected 1 to {budget}")
     low, high = gate.area_ratio
-    if not low <= source.area_ratio(mesh) <= high:
-        raise Rejected(
-            "area_changed",
-            f"{source.area_ratio(mesh):.2f} times the source's area at {budget} faces; "
-            f"expected {low} to {high}",
-        )
+    ratio = source.area_ratio(mesh)
+    if not low <= ratio <= high:
+        message = f"{ratio:.2f} times the source's area at {budget} faces; expected {low} to {high}"
+        raise Rejected("area_changed", message)
     deviation = source.surface.hausdorff_deviation(mesh)
     error = deviation.two_way(99)
     if error > max_error_p99:
