@@ -214,12 +214,23 @@ def _build_piece(scene: Scene, row: int) -> ScenePiece:
 
 
 def _reduce_piece(piece: ScenePiece, count: int) -> ScenePiece:
-    from scipy.spatial import cKDTree
-
     old = piece.mesh
     if len(old.faces) <= count:
         return piece
-    positions, faces = _decimate_mesh(piece, count)
+    from scipy.spatial import cKDTree
+
+    from pipeline.assets.decimation.decimate import remesh  # loads mesh libraries
+
+    raw = TriangleMesh(positions=old.positions.astype(np.float64), faces=old.faces.astype(np.int64))
+    try:
+        reduced = remesh(raw, count, "faithful")
+    except Rejected as rejection:
+        raise TrilightError(
+            f"{piece.entry.name}: no method gives at most {count} of its {len(old.faces)} "
+            "triangles; choose a larger --budget."
+        ) from rejection
+    positions = reduced.positions.astype(np.float32)
+    faces = reduced.faces.astype(np.uint32)
     faces = faces[has_area(positions, faces)]
     flat = face_normals(old.positions, old.faces)[:, None]
     smooth = bool((np.abs(old.normals[old.faces] - flat) > _FLAT).any())
@@ -231,18 +242,3 @@ def _reduce_piece(piece: ScenePiece, count: int) -> ScenePiece:
     centers = old.positions[old.faces].mean(axis=1)
     _, nearest = cKDTree(centers).query(mesh.positions[mesh.faces].mean(axis=1))
     return dataclasses.replace(piece, mesh=mesh, material_index=piece.material_index[nearest])
-
-
-def _decimate_mesh(piece: ScenePiece, count: int) -> tuple[NDArray[np.float32], NDArray[np.uint32]]:
-    from pipeline.assets.decimation.decimate import remesh  # loads mesh libraries
-
-    faces = piece.mesh.faces.astype(np.int64)
-    raw = TriangleMesh(positions=piece.mesh.positions.astype(np.float64), faces=faces)
-    try:
-        reduced = remesh(raw, count, "faithful")
-    except Rejected as rejection:
-        raise TrilightError(
-            f"{piece.entry.name}: no method gives at most {count} of its {len(faces)} triangles; "
-            "choose a larger --budget."
-        ) from rejection
-    return reduced.positions.astype(np.float32), reduced.faces.astype(np.uint32)

@@ -52,8 +52,9 @@ def clean(mesh: TriangleMesh) -> TriangleMesh:
     _, first, inverse = np.unique(keys, return_index=True, return_inverse=True)
     cells = cells[first]
     faces = inverse[mesh.faces]
-    faces = faces[_has_area(cells, faces)]
-    faces = canonical(faces)
+    a, b, c = cells[faces].transpose(1, 0, 2)
+    normal = np.cross(b - a, c - a)  # exact, because products stay below 2^43
+    faces = canonical(faces[(normal != 0).any(axis=1)])
     if len(faces):
         _, keep = np.unique(np.sort(faces, axis=1), axis=0, return_index=True)
         faces = faces[np.sort(keep)]
@@ -93,13 +94,6 @@ def _keys(cells: NDArray[np.int64]) -> NDArray[np.int64]:
     """Return one integer per row that orders rows lexicographically."""
     shifted = cells + _OFFSET
     return (shifted[:, 0] << 2 * _BITS) | (shifted[:, 1] << _BITS) | shifted[:, 2]
-
-
-def _has_area(cells: NDArray[np.int64], faces: NDArray[np.int64]) -> NDArray[np.bool_]:
-    """Return [F] True for nonzero area; exact, because products stay below 2^43."""
-    corners = cells[faces]
-    normal = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
-    return (normal != 0).any(axis=1)
 
 
 EXTENT_RANGE = (1e-9, 1e9)

@@ -59,14 +59,16 @@ FLAT = 2
 def tile_weights(cells: int) -> tuple[NDArray[np.int64], NDArray[np.float64]]:
     """Return the texels [P, 2] (column, row) of a tile and their barycentric coordinates [P, 3].
 
-    Texels beyond the longest edge show its nearest point.
+    Texels beyond the longest edge show its nearest point; all are moved off the edges (`_INSET`).
     """
     column, row = np.meshgrid(np.arange(cells + 2), np.arange(cells + 2), indexing="xy")
     mine = column + row <= cells + 1
     texels = np.stack([column[mine], row[mine]], axis=1)
     inside = np.minimum(texels, cells)
     across = inside / np.maximum(inside.sum(axis=1, keepdims=True), cells)
-    return texels, np.concatenate([1 - across.sum(axis=1, keepdims=True), across], axis=1)
+    weights = np.concatenate([1 - across.sum(axis=1, keepdims=True), across], axis=1)
+    part = min(_INSET, 0.25 / cells)
+    return texels, (1 - part) * weights + part / 3
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -243,7 +245,7 @@ def _bake_texels(
     reach: float,
     density: float,
 ) -> _Texels:
-    weights_of = {int(side): _inset(tile_weights(int(side))[1], side) for side in np.unique(cells)}
+    weights_of = {int(side): tile_weights(int(side))[1] for side in np.unique(cells)}
     counts = np.array([len(weights_of[int(side)]) for side in cells])
     start = np.concatenate([[0], np.cumsum(counts)])
     normal = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
@@ -268,11 +270,6 @@ def _bake_texels(
     numbers = np.round(columns[:, DIFFUSE.stop :] * 255).astype(np.uint8)
     codes = np.concatenate([srgb8(columns[:, DIFFUSE]), numbers], axis=1)
     return _Texels(start=start, columns=columns, codes=codes, missed=missed / len(points))
-
-
-def _inset(weights: NDArray[np.float64], cells: np.integer) -> NDArray[np.float64]:
-    part = min(_INSET, 0.25 / int(cells))
-    return (1 - part) * weights + part / 3
 
 
 def _is_flat(texels: _Texels) -> NDArray[np.bool_]:

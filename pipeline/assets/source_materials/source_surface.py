@@ -57,7 +57,13 @@ class SurfaceLookup:
             normals: the level's normals there.
             reach: largest distance to a surface, in the unit box.
         """
-        locations, is_missed = self._closest(points, normals, reach)
+        squared, closest, nearest = self._tree.squared_distance(
+            self._mesh.positions, self._mesh.faces, points
+        )
+        faces = np.asarray(closest, np.int64).ravel()
+        locations = FacePoints(faces, barycentric(self._mesh.corners[faces], np.asarray(nearest)))
+        facing = (self._normals[faces] * normals).sum(axis=1) > 0
+        is_missed = ~(facing & (np.sqrt(np.asarray(squared).ravel()) <= reach))
         best = np.full(len(points), np.inf)
         for sign in (1.0, -1.0):
             face, weights, distance = self._cast_rays(points, sign * normals)
@@ -79,18 +85,6 @@ class SurfaceLookup:
         beyond = np.abs(hits.distance_m.astype(np.float64) - _BEHIND)
         distance = np.where(hits.triangle == MISS, np.inf, beyond)
         return np.maximum(hits.triangle, 0), np.stack([1 - u - v, u, v], axis=1), distance
-
-    def _closest(
-        self, points: NDArray[np.float64], normals: NDArray[np.float64], reach: float
-    ) -> tuple[FacePoints, NDArray[np.bool_]]:
-        squared, face, nearest = self._tree.squared_distance(
-            self._mesh.positions, self._mesh.faces, points
-        )
-        face = np.asarray(face, np.int64).ravel()
-        facing = (self._normals[face] * normals).sum(axis=1) > 0
-        weights = barycentric(self._mesh.corners[face], np.asarray(nearest))
-        is_near = np.sqrt(np.asarray(squared).ravel()) <= reach
-        return FacePoints(face, weights), ~(facing & is_near)
 
 
 def barycentric(corners: NDArray[np.float64], points: NDArray[np.float64]) -> NDArray[np.float64]:
