@@ -3,7 +3,7 @@
 import threading
 from collections.abc import Callable, Iterable
 from concurrent.futures import ThreadPoolExecutor, as_completed
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 
 from pipeline.foreign.limits import SUFFIXES
@@ -26,7 +26,7 @@ class Listing:
 
     records: list[ObjectRecord]
     """Objects in any order; the path of an object that must be fetched has no meaning yet."""
-    failures: list[Failure]
+    failures: list[Failure] = field(default_factory=list)
     """Objects that are unusable, whatever their licence."""
     fetch: Callable[[list[ObjectRecord], CountDone], Fetched] = _already_local
     """Downloads objects; returns them with their paths, and a failure for each that could not be

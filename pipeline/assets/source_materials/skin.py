@@ -376,7 +376,7 @@ def level_emission(
     Raises:
         Rejected: materials_unreadable where the radiance is not a number, or too large for float32.
     """
-    if not source.emits:
+    if not any(material.emits for material in source.parts.materials):
         return None
     weights = spread_points()
     corners = level.corners

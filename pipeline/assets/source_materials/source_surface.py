@@ -66,25 +66,18 @@ class SurfaceLookup:
         is_missed = ~(facing & (np.sqrt(np.asarray(squared).ravel()) <= reach))
         best = np.full(len(points), np.inf)
         for sign in (1.0, -1.0):
-            face, weights, distance = self._cast_rays(points, sign * normals)
+            origins = (points - _BEHIND * sign * normals).astype(np.float32)
+            hits = self._triangles.intersect(origins, (sign * normals).astype(np.float32))
+            face = np.maximum(hits.triangle, 0)
+            distance = np.abs(hits.distance_m.astype(np.float64) - _BEHIND)
             facing = (self._normals[face] * normals).sum(axis=1) > 0
-            taken = facing & (distance <= reach) & (distance < best)
+            taken = (hits.triangle != MISS) & facing & (distance <= reach) & (distance < best)
+            u, v = hits.uv.astype(np.float64)[:, taken]
             best[taken] = distance[taken]
             locations.faces[taken] = face[taken]
-            locations.weights[taken] = weights[taken]
+            locations.weights[taken] = np.stack([1 - u - v, u, v], axis=1)
             is_missed[taken] = False
         return locations, is_missed
-
-    def _cast_rays(
-        self, points: NDArray[np.float64], directions: NDArray[np.float64]
-    ) -> tuple[NDArray[np.int64], NDArray[np.float64], NDArray[np.float64]]:
-        """Return face, weights and distance of each ray's first hit; infinite without one."""
-        origins = (points - _BEHIND * directions).astype(np.float32)
-        hits = self._triangles.intersect(origins, directions.astype(np.float32))
-        u, v = hits.uv.astype(np.float64)
-        beyond = np.abs(hits.distance_m.astype(np.float64) - _BEHIND)
-        distance = np.where(hits.triangle == MISS, np.inf, beyond)
-        return np.maximum(hits.triangle, 0), np.stack([1 - u - v, u, v], axis=1), distance
 
 
 def barycentric(corners: NDArray[np.float64], points: NDArray[np.float64]) -> NDArray[np.float64]:
@@ -137,11 +130,6 @@ class SourceSurface:
         for material, chosen, points in self._by_material(at):
             result[chosen] = self._material_columns(material, points, cell)
         return result
-
-    @property
-    def emits(self) -> bool:
-        """True where any material emits light."""
-        return any(material.emits for material in self.parts.materials)
 
     def emission(self, at: FacePoints, cell: float) -> NDArray[np.float64]:
         """Return the radiance [N, 3] at points of clean faces; arguments as in `columns`."""

@@ -341,7 +341,7 @@ def list_remote(url: RemoteUrl, licence: str | None) -> Listing:
     if catalogue is None:
         listing = _list_object_files(folder, licence)
     else:
-        listing = Listing(records=_list_catalogue(folder, catalogue), failures=[])
+        listing = Listing(records=_list_catalogue(folder, catalogue))
     return dataclasses.replace(listing, fetch=partial(_fetch, folder))
 
 
