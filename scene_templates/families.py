@@ -49,9 +49,6 @@ class Family:
         return TEMPLATES[self.template].shell_triangles
 
 
-LAYOUTS = ("plane", "wall", "corner", "open_box")
-"""A template that is registered later joins a preset when its name is written here."""
-
 DEFAULT_FAMILIES = tuple(
     Family(
         name=f"{name}-{kind}",
@@ -61,7 +58,7 @@ DEFAULT_FAMILIES = tuple(
         num_objects=num_objects,
         object_scale=object_scale,
     )
-    for name in LAYOUTS
+    for name in ("plane", "wall", "corner", "open_box")  # a later template joins by its name here
     for kind, weight, num_objects, object_scale in (
         ("single", 1.0, (1, 1), (1.2, 2.2)),
         ("multi", 2.0, (2, 3), (0.8, 1.8)),
@@ -70,21 +67,19 @@ DEFAULT_FAMILIES = tuple(
 """The sizes are the published ones of most families."""
 
 
-def alone() -> Family:
-    """Return the family of one object within a sphere of radius 0.5 around the origin."""
-    return Family(
-        name="alone",
-        template="alone",
-        shell=SharedRoom(),
-        num_objects=(1, 1),
-        object_scale=(2.0, 2.0),
-    )
-
+_ALONE = Family(
+    name="alone",
+    template="alone",
+    shell=SharedRoom(),
+    num_objects=(1, 1),
+    object_scale=(2.0, 2.0),
+)
+"""One object within a sphere of radius 0.5 around the origin."""
 
 FAMILIES: Registry[Callable[[], Family]] = Registry(
     "family",
     Callable,
-    {**{family.name: partial(replace, family) for family in DEFAULT_FAMILIES}, "alone": alone},
+    {family.name: partial(replace, family) for family in (*DEFAULT_FAMILIES, _ALONE)},
     decides=("data",),
 )
 """Functions that return a family, by its name. A preset states its families in full and asks for no

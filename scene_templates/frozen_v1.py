@@ -11,10 +11,10 @@ from scene_templates.rooms import SharedRoom
 from scene_templates.sample_camera import CameraSettings
 from scene_templates.sample_lights import LightSettings
 from scene_templates.sample_material import MaterialSettings
+from scene_templates.scene_maps import TextureSettings
 from scene_templates.settings import SceneSettings, ViewLaws
 from scene_templates.skies.procedural_skies import SkyMapSettings, SkySettings
 from scene_templates.surfaces.procedural_textures import SurfaceMapSettings
-from scene_templates.textures import TextureSettings
 
 _ROOM = SharedRoom(
     square_share=0.5, scale=(1.0, 1.35), shift=0.05, raise_z=(-0.05, 0.25), tilt_deg=3.0

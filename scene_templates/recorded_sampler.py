@@ -61,9 +61,8 @@ class RecordedSampler:
 
     def whole(self, name: str, low: int, high: int) -> int:
         """Return a whole number; each from `low` to `high` is equally likely."""
-        return self._record(
-            name, "whole number", (low, high), int(self._rng.integers(low, high + 1))
-        )
+        drawn = int(self._rng.integers(low, high + 1))
+        return self._record(name, "whole number", (low, high), drawn)
 
     def holds(self, name: str, share: float) -> bool:
         """Return whether something holds, which it does with a probability of `share`."""

@@ -19,8 +19,8 @@ from scene_templates.placement import PlacementSettings
 from scene_templates.sample_camera import CameraSettings
 from scene_templates.sample_lights import LightSettings
 from scene_templates.sample_material import MaterialSettings
+from scene_templates.scene_maps import TextureSettings
 from scene_templates.skies.procedural_skies import SkySettings
-from scene_templates.textures import TextureSettings
 from storage.settings.described import checked
 from storage.settings.overrides import apply_overrides
 from storage.settings.ranges import FLOAT32_MAX, Share, Within

@@ -11,8 +11,7 @@ from numpy.typing import NDArray
 
 from pipeline.exchange.convert import reduce_scene
 from pipeline.exchange.convert import write_scene as write_in_form
-from pipeline.exchange.open_scene import LoadedScene, scene_source
-from pipeline.exchange.reader import SceneReader
+from pipeline.exchange.reader import LoadedScene, SceneReader, scene_source
 from pipeline.generation.generate_options import GenerateOptions
 from storage.records.scene import Scene
 

@@ -1,5 +1,6 @@
 """`trilight convert`, `export` and `push`: scenes and datasets for other programs and people."""
 
+import dataclasses
 from pathlib import Path
 from typing import Annotated, Literal
 
@@ -41,11 +42,10 @@ class ConvertOptions:
 def convert(options: ConvertOptions) -> None:
     first_words(f"Converting {options.source} to {options.target}")
     from pipeline.exchange.convert import convert_scene
-    from pipeline.exchange.open_scene import scene_source
+    from pipeline.exchange.reader import scene_source
 
-    scene = scene_source(
-        options.source,
-        many=True,
+    scene = dataclasses.replace(
+        scene_source(options.source, many=True),
         usd_folder=options.usd_folder,
         albedo_over_one=options.albedo_over_one,
     )

@@ -118,7 +118,7 @@ def _fact_rows(facts: Mapping[str, Any]) -> list[tuple[str, str]]:
 
 def _inspect_scene(source: str, turntable: Path | None) -> None:
     first_words(f"Reading {source}")
-    from pipeline.exchange.open_scene import scene_source
+    from pipeline.exchange.reader import scene_source
     from pipeline.generation.inspect_scene import inspect_scene
 
     facts, notes = inspect_scene(scene_source(source), turntable)

@@ -45,7 +45,7 @@ class PassOptions:
 def passes(options: PassOptions) -> None:
     names = pass_names(name for words in options.passes for name in words.split(","))
     first_words(f"Writing {', '.join(names)} to {options.out}")
-    from pipeline.exchange.pass_files import write_passes
+    from pipeline.exchange.exports.export import write_passes
 
     files: list[Path] = []
     notes: list[str] = []

@@ -18,8 +18,7 @@ from infra.render.preview_table import Choice, choose, known_costs, price_all, s
 from infra.render.quality import Budget
 from infra.render.tone_mapping import Look
 from infra.torch_library import require_torch
-from pipeline.exchange.open_scene import SceneSource, scene_source
-from pipeline.exchange.reader import SceneReader
+from pipeline.exchange.reader import SceneReader, SceneSource, scene_source
 from pipeline.renders.mitsuba_variant import choose_variant
 from pipeline.renders.preview import PreviewSettings
 from storage.errors import TrilightError

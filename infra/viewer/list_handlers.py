@@ -36,8 +36,7 @@ from infra.viewer.server import (
 from pipeline.documents.png import encode_png
 from pipeline.documents.scene_page import preview
 from pipeline.exchange.formats import LoadedScene
-from pipeline.exchange.open_scene import scene_source
-from pipeline.exchange.reader import SceneReader
+from pipeline.exchange.reader import SceneReader, scene_source
 from pipeline.generation.derive_dataset import Selection, columns_of
 from pipeline.renders.preview import PreviewSettings
 from pipeline.shards.finished_dataset import SceneFacts

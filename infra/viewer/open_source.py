@@ -107,8 +107,7 @@ def open_handlers(source: str, *, checkpoint: str | None, threads: int | None) -
     from infra.render.path_tracer import RenderChild
     from infra.viewer.list_handlers import DatasetHandlers, FolderHandlers
     from infra.viewer.scene_handlers import handlers_of_scene
-    from pipeline.exchange.open_scene import scene_source
-    from pipeline.exchange.reader import SceneReader
+    from pipeline.exchange.reader import SceneReader, scene_source
     from pipeline.renders.mitsuba_variant import choose_variant
     from storage.dataset.dataset import open_dataset
 

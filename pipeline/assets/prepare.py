@@ -54,6 +54,7 @@ def prepare_asset(
         if settings.watertight
         else LevelBase(mesh=mesh, start=mesh, gate=settings.gate)
     )
+    shared = faces_of_edges(mesh)
     safe = safe_method(base.start, method)
     levels, missed = _levels(measured, base, settings, safe)
     levels, missed, materials = add_source_materials(levels, missed, source, mesh, settings)
@@ -63,27 +64,20 @@ def prepare_asset(
             geometry_sha256=geometry_sha256(cleaned),
             source_sha256=source.sha256,
             recipe=RECIPE,
-            source=_facts(raw, cleaned, measured, front_share),
+            source=SourceFacts(
+                num_faces_read=len(raw.faces),
+                num_faces=len(mesh.faces),
+                num_faces_turned=_count_flipped(cleaned, mesh),
+                num_parts=measured.num_components,
+                open_edges=int((shared == 1).sum()),
+                nonmanifold_edges=int((shared > 2).sum()),
+                front_share=round(front_share, 6),
+            ),
             levels=levels,
             materials=materials,
         ),
         missed=missed,
         unread=source.unread,
-    )
-
-
-def _facts(
-    raw: TriangleMesh, cleaned: TriangleMesh, source: MeasuredSource, front_share: float
-) -> SourceFacts:
-    shared = faces_of_edges(source.mesh)
-    return SourceFacts(
-        num_faces_read=len(raw.faces),
-        num_faces=len(source.mesh.faces),
-        num_faces_turned=_count_flipped(cleaned, source.mesh),
-        num_parts=source.num_components,
-        open_edges=int((shared == 1).sum()),
-        nonmanifold_edges=int((shared > 2).sum()),
-        front_share=round(front_share, 6),
     )
 
 

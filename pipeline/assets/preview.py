@@ -32,17 +32,16 @@ def preview_source_and_level(
 ) -> tuple[NDArray[np.uint8], NDArray[np.uint8]]:
     """Return gray pictures [W, W] of a cleaned source file and of one of its levels.
 
+    That of a level with colors is [W, W, 3].
+
     Raises Rejected as `prepare_asset`.
     """
     data = read_source(Path(path), settings.read_limits)
     mesh, _ = orient_outward(clean(normalize(load_mesh(data))))
-    return preview(mesh, width_px), preview_level(level, width_px)
-
-
-def preview_level(level: Level, width_px: int) -> NDArray[np.uint8]:
-    """Return a picture of a level: gray [W, W], or [W, W, 3] where the level has colors."""
-    mesh = level_mesh(level)
-    return preview(mesh, width_px) if level.skin is None else _colors(mesh, level.skin, width_px)
+    simplified = level_mesh(level)
+    if level.skin is None:
+        return preview(mesh, width_px), preview(simplified, width_px)
+    return preview(mesh, width_px), _colors(simplified, level.skin, width_px)
 
 
 def _colors(mesh: TriangleMesh, skin: LevelSkin, width_px: int) -> NDArray[np.uint8]:

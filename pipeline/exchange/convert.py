@@ -23,11 +23,9 @@ from pipeline.exchange.formats import (
     SceneSource,
     drop_uncarried_maps,
     list_lost_members,
-    writable_suffixes,
 )
 from pipeline.exchange.from_description import SMOOTH_ANGLE_DEG
-from pipeline.exchange.open_scene import load_source
-from pipeline.exchange.reader import SceneReader
+from pipeline.exchange.reader import SceneReader, load_source
 from pipeline.foreign.mesh import TriangleMesh
 from pipeline.scenes.pieces import ScenePiece, concatenate_pieces
 from pipeline.scenes.shading_normals import (
@@ -105,9 +103,9 @@ def write_scene(
 def _form_of(target: Path) -> SceneFormat:
     form = FORMATS.get(target.suffix.lower())
     if form is None or form.write is None or target.is_dir():
+        suffixes = " ".join(suffix for suffix, each in FORMATS.items() if each.write)
         raise TrilightError(
-            f"{target}: cannot be written as a scene; expected the name of a file: "
-            f"{' '.join(writable_suffixes())}."
+            f"{target}: cannot be written as a scene; expected the name of a file: {suffixes}."
         )
     return form
 
@@ -216,12 +214,23 @@ def _build_piece(scene: Scene, row: int) -> ScenePiece:
 
 
 def _reduce_piece(piece: ScenePiece, count: int) -> ScenePiece:
-    from scipy.spatial import cKDTree
-
     old = piece.mesh
     if len(old.faces) <= count:
         return piece
-    positions, faces = _decimate_mesh(piece, count)
+    from scipy.spatial import cKDTree
+
+    from pipeline.assets.decimation.decimate import remesh  # loads mesh libraries
+
+    raw = TriangleMesh(positions=old.positions.astype(np.float64), faces=old.faces.astype(np.int64))
+    try:
+        reduced = remesh(raw, count, "faithful")
+    except Rejected as rejection:
+        raise TrilightError(
+            f"{piece.entry.name}: no method gives at most {count} of its {len(old.faces)} "
+            "triangles; choose a larger --budget."
+        ) from rejection
+    positions = reduced.positions.astype(np.float32)
+    faces = reduced.faces.astype(np.uint32)
     faces = faces[has_area(positions, faces)]
     flat = face_normals(old.positions, old.faces)[:, None]
     smooth = bool((np.abs(old.normals[old.faces] - flat) > _FLAT).any())
@@ -233,18 +242,3 @@ def _reduce_piece(piece: ScenePiece, count: int) -> ScenePiece:
     centers = old.positions[old.faces].mean(axis=1)
     _, nearest = cKDTree(centers).query(mesh.positions[mesh.faces].mean(axis=1))
     return dataclasses.replace(piece, mesh=mesh, material_index=piece.material_index[nearest])
-
-
-def _decimate_mesh(piece: ScenePiece, count: int) -> tuple[NDArray[np.float32], NDArray[np.uint32]]:
-    from pipeline.assets.decimation.decimate import remesh  # loads mesh libraries
-
-    faces = piece.mesh.faces.astype(np.int64)
-    raw = TriangleMesh(positions=piece.mesh.positions.astype(np.float64), faces=faces)
-    try:
-        reduced = remesh(raw, count, "faithful")
-    except Rejected as rejection:
-        raise TrilightError(
-            f"{piece.entry.name}: no method gives at most {count} of its {len(faces)} triangles; "
-            "choose a larger --budget."
-        ) from rejection
-    return reduced.positions.astype(np.float32), reduced.faces.astype(np.uint32)

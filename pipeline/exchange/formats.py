@@ -19,7 +19,7 @@ from pipeline.exchange.from_description import AlbedoOverOne, Cameras, scaled_al
 from pipeline.exchange.gltf.read_gltf import read_gltf
 from pipeline.exchange.gltf.write_gltf import write_gltf
 from pipeline.exchange.renderformer_h5 import read_renderformer_h5, write_renderformer_h5
-from pipeline.exchange.renderformer_json import describe_scene
+from pipeline.exchange.renderformer_json import write_renderformer_json
 from pipeline.exchange.scene_files import build_scene, read_scene_cameras, read_scene_description
 from pipeline.exchange.textured_triangles import LoadedScene as LoadedScene
 from pipeline.exchange.textured_triangles import Pictures as Pictures
@@ -92,11 +92,6 @@ def readable_suffixes() -> list[str]:
     return [suffix for suffix, form in FORMATS.items() if form.read and not form.always_many]
 
 
-def writable_suffixes() -> list[str]:
-    """Return the suffixes of files that can be written."""
-    return [suffix for suffix, form in FORMATS.items() if form.write]
-
-
 def _list_usd_pictures(target: Path) -> Sequence[Path]:
     from pxr import UsdUtils
 
@@ -120,14 +115,6 @@ def _read_json(source: SceneSource, pictures: bool) -> LoadedScene:
         notes=notes,
     )
     return LoadedScene(scene=scene, notes=(*notes, *scaled_albedo_notes(scene)))
-
-
-def _write_json(target: Path, scene: Scene, pictures: Pictures) -> Iterable[str]:
-    described = describe_scene(scene, target.stem)
-    for path, data in described.meshes.items():
-        write_atomically(target.parent / path, data)
-    write_atomically(target, described.json)  # last, so that the files that it names exist
-    return described.lost
 
 
 def _write_scene_file(target: Path, scene: Scene, pictures: Pictures) -> Iterable[str]:
@@ -181,7 +168,7 @@ FORMATS: Registry[SceneFormat] = Registry(
             cameras=lambda source: read_scene_cameras(
                 source.path.parent.resolve(), source.path.name
             ),
-            write=_write_json,
+            write=lambda target, scene, _: write_renderformer_json(target, scene),
             carried=_GEOMETRY,
         ),
         ".glb": dataclasses.replace(

@@ -128,7 +128,12 @@ class PartConverter:
         rows[:, EMISSION] = _emission(part, self._lost)
         texture_sets: Sequence[TextureSet] = (NO_TEXTURES,)
         if uv is not None:
-            texture_sets = self._build_textures(part.material, placed, tints, source)
+            keys = [(id(part.material), placed.tiles, source, tint.tobytes()) for tint in tints]
+            if not self._textures.keys() >= set(keys):
+                maps = placed.build_maps()
+                for key, tint in zip(keys, tints, strict=True):
+                    self._textures[key] = _textures(part.material, maps, tint, source)
+            texture_sets = [self._textures[key] for key in keys]
         else:
             if id(part.material) not in self._means:
                 self._means[id(part.material)] = placed.build_maps()
@@ -150,21 +155,6 @@ class PartConverter:
             texture_set_index=tint_index % len(texture_sets),
             texture_sets=texture_sets,
         )
-
-    def _build_textures(
-        self,
-        material: SourceMaterial,
-        placed: "_PlacedSlots",
-        tints: NDArray[np.float64],
-        source: MapSource,
-    ) -> list[TextureSet]:
-        """Return the textures of a material for each tint [K, 3]."""
-        keys = [(id(material), placed.tiles, source, tint.tobytes()) for tint in tints]
-        if not self._textures.keys() >= set(keys):
-            maps = placed.build_maps()
-            for key, tint in zip(keys, tints, strict=True):
-                self._textures[key] = _textures(material, maps, tint, source)
-        return [self._textures[key] for key in keys]
 
 
 def _textures(

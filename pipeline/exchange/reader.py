@@ -1,17 +1,35 @@
-"""Reads scenes of untrusted files in a child process with limits; returns checked scenes only."""
+"""Opens the `SRC` of a command, a file or a sample of a shard, and reads its scenes.
+
+    scene.json                 RenderFormer scene; its meshes lie in the folder of the file
+    scene.safetensors          storage.records.scene_file
+    scene.h5                   the published layout (pipeline.exchange.renderformer_h5)
+    scene.glb .gltf            glTF 2.0 (pipeline.exchange.gltf)
+    scene.usda .usdc .usdz .usd   a USD stage (pipeline.exchange.usd)
+    train-000000.tar::KEY      the sample KEY of a shard
+    scenes.usdc::KEY           a scene of a USD shard, or a time code of an animated stage
+
+Only this module splits `FILE::KEY`, so that no library that parses URLs ever sees it. Files are
+untrusted: a child process with limits reads them, and checked scenes alone come back.
+"""
 
 import contextlib
-import dataclasses
 import logging
 import re
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 from pipeline.assets.settings import AssetSettings
-from pipeline.exchange.formats import LoadedScene, SceneSource, readable_suffixes
-from pipeline.exchange.from_description import AlbedoOverOne, LoadedMesh
-from pipeline.exchange.open_scene import load_cameras, load_source, scene_source, source_keys
+from pipeline.exchange.formats import (
+    FORMATS,
+    SEPARATOR,
+    LoadedScene,
+    SceneFormat,
+    SceneSource,
+    readable_suffixes,
+)
+from pipeline.exchange.from_description import AlbedoOverOne, Cameras, LoadedMesh
 from pipeline.exchange.scene_files import load_mesh_file
 from pipeline.isolation import (
     ChildFailed,
@@ -23,9 +41,86 @@ from pipeline.isolation import (
 )
 from storage.dataset.shard_set import expand_pattern
 from storage.errors import TrilightError
+from storage.remote.safe_url import safe_url
 from storage.renderer import Camera
 
 log = logging.getLogger("trilight.exchange")
+
+_KEY = re.compile(r"[0-9A-Za-z_.\-]+")
+
+
+def scene_source(text: str, *, many: bool = False) -> SceneSource:
+    """Return the source that the text of `SRC` names, without opening the file.
+
+    `many` accepts a shard without a key.
+
+    Raises:
+        TrilightError: a URL, a missing file, or a name in none of these forms.
+    """
+    expected = f"expected a scene {' '.join(readable_suffixes())}, or SHARD.tar{SEPARATOR}KEY"
+    if "://" in text:
+        raise TrilightError(f"{safe_url(text)}: only files of this machine are read; {expected}.")
+    name, separator, key = text.rpartition(SEPARATOR)
+    path = Path(name if separator else text)
+    form = FORMATS.get(path.suffix.lower())
+    is_keyed = form is not None and form.keys is not None and bool(_KEY.fullmatch(key))
+    for is_wrong, why in (
+        (separator and not is_keyed, "no shard and key"),
+        (path.is_dir(), "a folder"),
+        (not path.exists(), "no such file"),
+        (form is None or form.read is None, "cannot be read as a scene"),
+    ):
+        if is_wrong:
+            raise TrilightError(f"{text}: {why}; {expected}.")
+    if form is not None and form.always_many and not (separator or many):
+        raise TrilightError(f"{text}: a shard holds many scenes; expected {text}{SEPARATOR}KEY.")
+    return SceneSource(path=path, key=key if separator else None)
+
+
+def source_keys(source: SceneSource) -> Sequence[str | None]:
+    """Return the key of every scene of a source; [None] for a single scene.
+
+    Only child processes call this, since a stage may be read.
+    """
+    keys = _form_of(source).keys
+    return [source.key] if source.key is not None or keys is None else keys(source)
+
+
+def load_cameras(source: SceneSource) -> Cameras:
+    """Read the cameras alone: poses [C, 4, 4] and angles [C] in degrees.
+
+    Only child processes call this. A JSON file needs nothing but its list `cameras`.
+
+    Raises:
+        TrilightError: the file is unusable.
+    """
+    form = _form_of(source)
+    if form.cameras:
+        return form.cameras(source)
+    scene = load_source(source).scene
+    return scene.c2w, scene.fov_deg
+
+
+def load_source(source: SceneSource, pictures: bool = False) -> LoadedScene:
+    """Read a scene with all of its cameras; only child processes call this.
+
+    `pictures` also reads the pictures of a shard's sample or an HDF5 file.
+
+    Raises:
+        TrilightError: anything in the file is unusable, or the scene breaks a law (`Scene.check`).
+    """
+    read = _form_of(source).read
+    assert read is not None, source
+    loaded = read(source, pictures)
+    if not FORMATS.is_ours(source.path.suffix.lower()):
+        loaded.scene.check()
+        return loaded
+    notes = tuple(f"{source.name}: {text}" for text in loaded.notes)
+    return replace(loaded, notes=notes)
+
+
+def _form_of(source: SceneSource) -> SceneFormat:
+    return FORMATS[source.path.suffix.lower()]
 
 
 class SceneReader(contextlib.AbstractContextManager["SceneReader"]):
@@ -44,7 +139,7 @@ class SceneReader(contextlib.AbstractContextManager["SceneReader"]):
         keys = self._read(source_keys, source)
         if not keys:
             raise TrilightError(f"{source.name}: holds no scene.")
-        return [dataclasses.replace(source, key=key) for key in keys]
+        return [replace(source, key=key) for key in keys]
 
     def list_scenes(
         self, text: str, albedo_over_one: AlbedoOverOne = "scale", *, many: bool = True
@@ -75,14 +170,15 @@ class SceneReader(contextlib.AbstractContextManager["SceneReader"]):
             names = expand_pattern(text, "scenes")
         holds_many = many and not is_folder
         files = [
-            scene_source(name, many=holds_many, albedo_over_one=albedo_over_one) for name in names
+            replace(scene_source(name, many=holds_many), albedo_over_one=albedo_over_one)
+            for name in names
         ]
         if not holds_many:
             return files
         return [scene for file in files for scene in self.scenes_of(file)]
 
     def load(self, source: SceneSource, *, pictures: bool = False) -> LoadedScene:
-        """Read one scene; see `pipeline.exchange.open_scene.load_source`."""
+        """Read one scene; as `load_source`."""
         return self._read(load_source, source, pictures)
 
     def cameras(self, file: SceneSource, view: int) -> list[Camera]:
@@ -102,7 +198,7 @@ class SceneReader(contextlib.AbstractContextManager["SceneReader"]):
                 for pose, angle in zip(*self._read(load_cameras, frames[0]), strict=True)
             ]
         of_frames = [Camera.of_scene(self.load(each).scene, view, "--view") for each in frames]
-        return [dataclasses.replace(camera, view=None) for camera in of_frames]
+        return [replace(camera, view=None) for camera in of_frames]
 
     def mesh(self, path: Path, licence: str) -> LoadedMesh:
         """Read the mesh of an object file; log the parts of the file that are ignored.
@@ -165,4 +261,4 @@ def unconfined_child(address_space: Callable[[int], int]) -> IsolatedChild:
         address_space: returns the memory limit for what the child renders with, of the usual one.
     """
     memory_bytes = address_space(LIMITS.memory_bytes)
-    return IsolatedChild(limits=dataclasses.replace(LIMITS, memory_bytes=memory_bytes))
+    return IsolatedChild(limits=replace(LIMITS, memory_bytes=memory_bytes))

@@ -100,7 +100,7 @@ _PUBLISHED_EMITTER = (1, 1, 1, 0, 0, 0, 1)
 NEAR = 0.05
 FAR = 5.0
 """Clip distances of `mvp`, in meters."""
-GZIP_LEVEL = 9
+GZIP_LEVEL = 9  # to h5py, a bare number is a level of gzip
 
 
 def write_renderformer_h5(
@@ -155,16 +155,14 @@ def _stated_rows(reflecting: ArrayLike, emission: NDArray[np.float32]) -> NDArra
 
 
 def _write(file: Any, name: str, values: NDArray) -> None:
-    file.create_dataset(name, data=values, compression="gzip", compression_opts=GZIP_LEVEL)
+    file.create_dataset(name, data=values, compression=GZIP_LEVEL)
 
 
 def _write_texture(file: Any, rows: NDArray[np.float32], scene: Scene) -> None:
     """Write textures in blocks of triangles; in memory each triangle takes 53 kB."""
     textured = textured_triangles(scene)
     shape = (len(rows), CHANNELS, CELLS, CELLS)
-    texture = file.create_dataset(
-        "texture", shape, rows.dtype, compression="gzip", compression_opts=GZIP_LEVEL
-    )
+    texture = file.create_dataset("texture", shape, rows.dtype, compression=GZIP_LEVEL)
     step = texture.chunks[0]
     for start in range(0, len(rows), step):
         block = rows[start : start + step, :, None, None]

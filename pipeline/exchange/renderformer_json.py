@@ -6,7 +6,7 @@ ignores unknown fields. It knows the fields of the published example scenes only
 
 A written file names one OBJ file per mesh, in world space and not normalized. An object of the file
 has one material, so an object of a scene becomes one object for each of its materials. Of what the
-format holds (pipeline.exchange.formats), `DescribedFiles.lost` lists what a reader cannot restore:
+format holds (pipeline.exchange.formats), the writer lists what a reader cannot restore:
 objects of several materials; shading normals other than flat ones and those that readers compute
 (smooth across edges of up to 30 degrees).
 """
@@ -16,6 +16,7 @@ import re
 from collections import Counter
 from collections.abc import Mapping
 from dataclasses import dataclass
+from pathlib import Path
 from typing import Any, Literal, TypeVar, cast
 
 import numpy as np
@@ -29,13 +30,10 @@ from pipeline.exchange.from_description import (
     PrintableText,
     SceneDescription,
 )
-from pipeline.exchange.textured_triangles import (
-    group_triangles,
-    require_at_most,
-    unique_name,
-)
+from pipeline.exchange.textured_triangles import group_triangles, unique_name
 from pipeline.foreign.numbers import Malformed
 from pipeline.scenes.shading_normals import face_normals, has_area, smooth_shaded
+from storage.atomic import write_atomically
 from storage.conventions import HALF_FLOAT_MAX
 from storage.errors import TrilightError
 from storage.records.material import DIFFUSE, EMISSION, ROUGHNESS, SPECULAR
@@ -203,23 +201,18 @@ _NO_FILE_LETTERS = '/\\:*?"<>|'
 """Characters that some operating system forbids in file names."""
 
 
-@dataclass(frozen=True, kw_only=True)
-class DescribedFiles:
-    """The scene file and mesh files of one scene."""
+def write_renderformer_json(path: Path, scene: Scene) -> tuple[str, ...]:
+    """Write a scene as the files that the published tools read: the scene file and its meshes.
 
-    json: bytes  # the scene file
-    meshes: dict[str, bytes]  # OBJ files by path relative to the scene file
-    lost: tuple[str, ...]  # sentences about members in the file that readers cannot restore
+    The stem of the scene file is the name of the folders of meshes next to it.
 
-
-def describe_scene(scene: Scene, stem: str) -> DescribedFiles:
-    """Return a scene that passes `Scene.check` as the files that the published tools read.
-
-    `stem` is the stem of the scene file and the name of its mesh folders.
+    Returns:
+        Sentences about members in the file that readers cannot restore.
 
     Raises:
-        TrilightError: more objects or cameras than a file may have, a number out of range, or no
-            emitter with an area.
+        TrilightError: the scene breaks a law (`Scene.check`); more objects or cameras than a file
+            may have, a number out of range, or no emitter with an area; or a file cannot be
+            written.
     """
     scene.check()
     lost: list[str] = []
@@ -232,31 +225,27 @@ def describe_scene(scene: Scene, stem: str) -> DescribedFiles:
         # it becomes the name of a file, whose case some systems ignore
         name = unique_name(_name(scene, row, material), taken, str.casefold)
         normals = scene.vertex_normals[scene.faces[faces]]
-        path = _mesh_path(scene, row, material, stem)
-        meshes[path] = _obj(scene, faces)
+        mesh_path = _mesh_path(scene, row, material, path.stem)
+        meshes[mesh_path] = _obj(scene, faces)
         smooth = _is_smooth(scene, faces, normals)
-        objects[name] = _object_entry(path, scene.materials[material], smooth)
+        objects[name] = _object_entry(mesh_path, scene.materials[material], smooth)
         if smooth and not _is_reproduced(scene, faces, normals):
             lost.append(f"{name}: shading normals, which readers compute again")
     if not any(max(entry["material"]["emissive"]) > 0 for entry in objects.values()):
         raise TrilightError("scene: no emitter has an area; a scene file needs at least one.")
     data = json.dumps(
         {
-            "scene_name": _printable(stem),
+            "scene_name": _printable(path.stem),
             "version": "1.0",
             "objects": objects,
             "cameras": list(map(camera_entry, scene.c2w, scene.fov_deg)),
         }
     ).encode()
-    require_at_most(
-        {
-            "objects of one material": (len(objects), MAX_OBJECTS),
-            "cameras": (scene.num_views, MAX_CAMERAS),
-            "bytes of a scene file": (len(data), MAX_BYTES),
-        }
-    )
-    read_renderformer_json(data, f"{stem}.json")  # raises for anything that readers would refuse
-    return DescribedFiles(json=data, meshes=meshes, lost=(*_losses(scene), *lost))
+    read_renderformer_json(data, path.name)  # raises for anything that readers would refuse
+    for mesh_path, mesh in meshes.items():
+        write_atomically(path.parent / mesh_path, mesh)
+    write_atomically(path, data)  # last, so that the files that it names exist
+    return (*_losses(scene), *lost)
 
 
 def _name(scene: Scene, row: int, material: int) -> str:

@@ -210,9 +210,8 @@ def load_mesh_file(
             raise Rejected("nonfinite_vertices", "a vertex without a triangle is not finite")
         mesh = raw
         if remesh_faces is not None:
-            from pipeline.assets.decimation.decimate import (
-                remesh,  # mesh libraries: in children only
-            )
+            # mesh libraries: in children only
+            from pipeline.assets.decimation.decimate import remesh
 
             mesh = remesh(raw, remesh_faces)
     except Rejected as rejection:

@@ -114,7 +114,7 @@ class SourceFolder:
         """
         plain = unquote(name) if is_uri else name.replace("\\", "/")
         stated = (plain, name, plain.replace("\\", "/")) if is_uri else (plain,)
-        if "\x00" in plain or (is_uri and _is_elsewhere(name)):
+        if "\x00" in plain or (is_uri and is_elsewhere(name)):
             raise Rejected("texture_outside", "it lies elsewhere, and is never fetched")
         is_outside = False
         extra_spellings = (f"{folder}/{plain}" for folder in extra_folders)
@@ -130,7 +130,8 @@ class SourceFolder:
         raise Rejected("missing_file", "there is no such file")
 
 
-def _is_elsewhere(uri: str) -> bool:
+def is_elsewhere(uri: str) -> bool:
+    """Return whether a URI leads to another machine or folder tree, or is no URI."""
     try:
         parts = urlsplit(uri)
     except ValueError:

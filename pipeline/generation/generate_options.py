@@ -339,16 +339,19 @@ def _cameras(words: str, num_views: int) -> dict[str, Any]:
         if layout in TEMPLATES:
             return {"kept_cameras": 0, "new_cameras": count, "camera_layout": layout}
     if Path(words).is_file():
-        from pipeline.exchange.open_scene import load_cameras, scene_source  # slow: every reader
+        from pipeline.exchange.reader import SceneReader, scene_source  # slow: every reader
 
-        c2w, fov_deg = load_cameras(scene_source(words))
-        if len(c2w) > MOST_CAMERAS:
-            raise TrilightError(f"--cameras {words}: {len(c2w)}; expected up to {MOST_CAMERAS}.")
-        cameras = tuple(
-            GivenCamera(c2w=tuple(pose.ravel().tolist()), fov_deg=float(angle))
-            for pose, angle in zip(c2w, fov_deg, strict=True)
+        with SceneReader() as reader:
+            cameras = reader.cameras(scene_source(words), 0)
+        if len(cameras) > MOST_CAMERAS:
+            raise TrilightError(
+                f"--cameras {words}: {len(cameras)}; expected up to {MOST_CAMERAS}."
+            )
+        given = tuple(
+            GivenCamera(c2w=tuple(camera.c2w.ravel().tolist()), fov_deg=camera.fov_deg)
+            for camera in cameras
         )
-        return {"kept_cameras": 0, "given_cameras": cameras}
+        return {"kept_cameras": 0, "given_cameras": given}
     layouts = ", ".join(TEMPLATES)
     raise TrilightError(f"--cameras is {words!r}; {_CAMERAS} (layouts: {layouts}).")
 

@@ -11,8 +11,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from pipeline.exchange.open_scene import SceneSource
-from pipeline.exchange.reader import SceneReader, unconfined_child
+from pipeline.exchange.reader import SceneReader, SceneSource, unconfined_child
 from pipeline.isolation import ChildFailed, call_with_retries
 from pipeline.renders.mitsuba_variant import Variant, activate, choose_variant
 from pipeline.renders.settings import RenderSettings

@@ -36,8 +36,8 @@ from pipeline.renders.renderer import RenderedView, SceneRenderer, set_threads
 from pipeline.scenes.compose import compose_scene
 from pipeline.scenes.triangle_budget import FitTable, PooledAsset, least_triangles
 from pipeline.scenes.views import ViewCamera, Visibility, cameras_of, cameras_of_view, with_cameras
+from scene_templates.scene_maps import OwnMaps, UserMap, UserTexture
 from scene_templates.settings import SceneSettings
-from scene_templates.textures import OwnMaps, UserMap, UserTexture
 from storage.dataset.layout import DatasetFolder
 from storage.dataset.progress import tell_views
 from storage.digests import sha256_hex

@@ -11,6 +11,7 @@ import re
 from collections import defaultdict
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from pathlib import Path, PurePosixPath
+from posixpath import dirname
 
 from pipeline.foreign.limits import USD_SUFFIXES
 from storage.conventions import SPLITS
@@ -81,7 +82,7 @@ def drop_outputs(names: Iterable[str]) -> list[str]:
     names = list(names)
     inside: dict[str, set[str]] = defaultdict(set)
     for name in names:
-        inside[_folder(name)].add(name.rpartition("/")[2])
+        inside[dirname(name)].add(name.rpartition("/")[2])
     folders = {str(folder) for name in inside for folder in PurePosixPath(name, "x").parents}
     outputs = {folder for folder in folders - {"."} if _is_output(folder, inside)}
     remaining = [
@@ -101,7 +102,7 @@ def _is_output(folder: str, inside: Mapping[str, set[str]]) -> bool:
         return all(map(_MESH_OF_SCENE.fullmatch, inside[folder]))
     return any(
         all(
-            fnmatch.filter(inside.get(_folder(f"{folder}/{mark}"), ()), mark.rpartition("/")[2])
+            fnmatch.filter(inside.get(dirname(f"{folder}/{mark}"), ()), mark.rpartition("/")[2])
             for mark in marks
         )
         for marks in _OUTPUTS
@@ -167,9 +168,9 @@ def drop_duplicates(names: Sequence[str]) -> list[str]:
 def _collisions(names: Sequence[str]) -> Iterator[str]:
     """Yield collision shapes that have visual shapes next to them."""
     shapes = {name for name in names if _COLLISION.fullmatch(_stem(name))}
-    seen = {_folder(name) for name in names if name not in shapes}
+    seen = {dirname(name) for name in names if name not in shapes}
     for name in names:
-        folder = _folder(name)
+        folder = dirname(name)
         above, _, last = folder.rpartition("/")
         twin = re.sub(r"(?i)collisions?", "visual", last)
         visual_folders = {f"{above}/{each}".lstrip("/") for each in (twin, f"{twin}s")}
@@ -195,10 +196,6 @@ def _twins(names: Sequence[str]) -> Iterator[str]:
             other = pattern.sub(better, name)
             if other != name and other in present:
                 yield name
-
-
-def _folder(name: str) -> str:
-    return name.rpartition("/")[0]
 
 
 def _stem(name: str) -> str:

@@ -3,7 +3,7 @@
 import threading
 from collections.abc import Callable, Iterable
 from concurrent.futures import ThreadPoolExecutor, as_completed
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 
 from pipeline.foreign.limits import SUFFIXES
@@ -26,7 +26,7 @@ class Listing:
 
     records: list[ObjectRecord]
     """Objects in any order; the path of an object that must be fetched has no meaning yet."""
-    failures: list[Failure]
+    failures: list[Failure] = field(default_factory=list)
     """Objects that are unusable, whatever their licence."""
     fetch: Callable[[list[ObjectRecord], CountDone], Fetched] = _already_local
     """Downloads objects; returns them with their paths, and a failure for each that could not be
@@ -64,7 +64,9 @@ def assign_uids(names: Iterable[str]) -> tuple[dict[str, str], list[Failure]]:
     taken: set[str] = set()
     for name in sorted(names):
         full = printable(name)
-        short = _without_suffixes(full)
+        short = full
+        while short.lower().endswith(SUFFIXES):
+            short = short[: short.rindex(".")]
         uid = full if short in taken or not short.rpartition("/")[2].strip() else short
         if uid in taken:
             message = "another file has a name that prints alike; rename one of them"
@@ -73,12 +75,6 @@ def assign_uids(names: Iterable[str]) -> tuple[dict[str, str], list[Failure]]:
         taken.add(uid)
         uids[name] = uid
     return uids, failures
-
-
-def _without_suffixes(name: str) -> str:
-    while name.lower().endswith(SUFFIXES):
-        name = name[: name.rindex(".")]
-    return name
 
 
 def fetch_all(

@@ -82,9 +82,7 @@ SOURCES: Registry[ObjectSource] = Registry(
     ObjectSource,
     {
         "builtin": ObjectSource(
-            list=lambda query: Listing(
-                records=generate_objects(query.source, query.work_dir), failures=[]
-            ),
+            list=lambda query: Listing(records=generate_objects(query.source, query.work_dir)),
             look=lambda query: num_builtin(query.source),
         ),
         "objaverse": ObjectSource(

@@ -36,9 +36,8 @@ from pipeline.scenes.views import require_valid, with_first_cameras
 from scene_templates.layout import Layout, Pose
 from scene_templates.rotations import rotate_points
 from scene_templates.sample_layout import ScenePlan, sample_layout, scene_plan
+from scene_templates.scene_maps import NO_OWN_MAPS, OwnMaps, scene_sky
 from scene_templates.settings import SceneSettings
-from scene_templates.skies.drawn_scene import scene_sky
-from scene_templates.textures import NO_OWN_MAPS, OwnMaps
 from storage.errors import Rejected, TrilightError
 from storage.records.asset import Level
 from storage.records.material import EMISSION

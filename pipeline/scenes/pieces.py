@@ -31,8 +31,7 @@ from pipeline.scenes.shading_normals import (
 from pipeline.scenes.triangle_budget import PooledAsset
 from scene_templates.layout import Emitter, Layout, ShellPart, SurfaceLook
 from scene_templates.sample_material import MaterialSettings
-from scene_templates.surfaces.maps import SurfaceMaps
-from scene_templates.textures import (
+from scene_templates.scene_maps import (
     MOST_TEXTURED,
     TexturedLook,
     TextureSettings,
@@ -40,6 +39,7 @@ from scene_templates.textures import (
     UserTexture,
     draw_look,
 )
+from scene_templates.surfaces.maps import SurfaceMaps
 from storage.conventions import linear_from_srgb8, srgb8
 from storage.errors import Rejected, TrilightError
 from storage.records.asset import Level, LevelSkin

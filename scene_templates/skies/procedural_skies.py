@@ -123,15 +123,11 @@ def sun_and_sky(draws: SkyDraws, texels: SkyTexels) -> Numbers:
     glow = texels.lobe(towards, sharpness)[..., None] * sun
     sky = sky * (1 - haze) + glow * (haze * _mean(texels.flux(sky)))
     from_sky = _mean(texels.irradiance(sky * _above_share(texels)[..., None]))
-    disk = _spot_above(texels, towards)[..., None] * sun * (ratio * from_sky)
-    return _with_ground(draws, texels, sky + disk)
-
-
-def _spot_above(texels: SkyTexels, towards: NDArray) -> Numbers:
-    """Return a spot [H, 2H] whose part above the horizon has unit flux, or none if it has set."""
     spot = texels.spot(towards)
     seen = float(texels.flux(spot * _above_share(texels)))
-    return spot / seen if seen > 0 else np.zeros_like(spot)
+    if seen > 0:  # otherwise the sun has set
+        sky = sky + (spot / seen)[..., None] * sun * (ratio * from_sky)
+    return _with_ground(draws, texels, sky)
 
 
 def clouds(draws: SkyDraws, texels: SkyTexels) -> Numbers:

@@ -154,13 +154,7 @@ def _axes(towards: NDArray, roll_rad: float) -> tuple[Numbers, Numbers]:
     """Return two unit vectors across a direction; without a roll, the first one is level."""
     x, y, z = towards
     level = np.array([-y, x, 0.0]) if abs(z) < 0.999 else np.array([0.0, 1.0, 0.0])
-    upright = np.array(
-        [
-            y * level[2] - z * level[1],
-            z * level[0] - x * level[2],
-            x * level[1] - y * level[0],
-        ]
-    )
+    upright = np.cross(towards, level)
     level, upright = (axis / np.sqrt(dot(axis, axis)) for axis in (level, upright))
     turn_cos = float(cosine(roll_rad))
     turn_sin = float(sine(roll_rad))

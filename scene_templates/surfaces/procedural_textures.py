@@ -385,20 +385,12 @@ def fabric(draws: SurfaceDraws, texels: Texels) -> Finish:
     visible_fraction = min(1.0, texels.size / (TEXELS_PER_CELL * threads))
     # 0.3 is the mean of what is taken off: where threads are too fine to show, it alone is left
     shade = 0.7 - visible_fraction * (0.7 * rim * rim + 0.2 * crown * crown - 0.3)
-    random = draws.stream()
-    uneven = np.where(over, *_of_threads(random, threads, column, row))
+    warp, weft = draws.stream().random((2, threads))
+    of_warp = warp[column.astype(np.int64) % threads]
+    uneven = np.where(over, of_warp, weft[row.astype(np.int64) % threads])
     fluff = texels.noise(draws.stream(), (32, 32), octaves=2)
     woven = across.covered(along, over).toned(1 - wear * uneven)
     return woven.toned(shade * (0.9 + 0.15 * fluff))
-
-
-def _of_threads(
-    random: np.random.Generator, threads: int, column: NDArray, row: NDArray
-) -> tuple[NDArray, NDArray]:
-    """Return a number in [0, 1] for the thread of each column and for that of each row."""
-    warp = random.random(threads)
-    weft = random.random(threads)
-    return warp[column.astype(np.int64) % threads], weft[row.astype(np.int64) % threads]
 
 
 def camouflage(draws: SurfaceDraws, texels: Texels) -> Finish:

@@ -14,12 +14,12 @@ import pytest
 from infra.cli.extend_option import load_extensions
 from model.config import SIZES, ModelConfig
 from pipeline.exchange.convert import write_scene
-from pipeline.exchange.open_scene import load_source, scene_source
+from pipeline.exchange.reader import load_source, scene_source
 from pipeline.executors.registry import EXECUTORS
 from pipeline.objects.sources import check_source, list_objects
 from pipeline.presets.registry import DATASET_PRESETS, preset_settings, resolve_dataset_preset
+from scene_templates.scene_maps import draw_look
 from scene_templates.skies.procedural_skies import draw_sky
-from scene_templates.textures import draw_look
 from storage.dataset.manifest import read_manifest
 from storage.errors import TrilightError
 from storage.records.scene_file import decode_scene_file, encode_scene

@@ -18,7 +18,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from infra.bench.workloads.named_scenes import cost_scene
 from pipeline.exchange.renderformer_h5 import read_renderformer_h5, write_renderformer_h5
-from pipeline.exchange.renderformer_json import describe_scene
+from pipeline.exchange.renderformer_json import write_renderformer_json
 from pipeline.presets.registry import preset_settings
 from storage.conventions import HALF_FLOAT_MAX
 from storage.errors import TrilightError
@@ -185,14 +185,14 @@ REFUSED: dict[str, tuple[Callable[[], Scene], str]] = {
 def test_what_readers_would_refuse_or_no_scene_may_be_is_not_written(tmp_path: Path) -> None:
     for name, (make, message) in REFUSED.items():
         with case(name), pytest.raises(TrilightError, match=message):
-            describe_scene(make(), "a")
+            write_renderformer_json(tmp_path / "a.json", make())
     for name, changes in UNLAWFUL.items():
         scene = dataclasses.replace(tiny_scene(), **changes)  # type: ignore[arg-type]
         with case(name):
             with pytest.raises(TrilightError):
                 assert_usd_keeps_all(scene, tmp_path, ".usda")
             with pytest.raises(TrilightError):
-                describe_scene(scene, "a")
+                write_renderformer_json(tmp_path / "a.json", scene)
             assert not list(tmp_path.iterdir())
 
 

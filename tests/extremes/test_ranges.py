@@ -33,10 +33,10 @@ from scene_templates.rooms import SharedRoom, SideRanges
 from scene_templates.sample_camera import CameraSettings
 from scene_templates.sample_lights import LightSettings
 from scene_templates.sample_material import MaterialSettings
+from scene_templates.scene_maps import TextureSettings
 from scene_templates.settings import MAX_TRIANGLES, Excursion, SceneSettings, ViewLaws
 from scene_templates.skies.procedural_skies import SkyMapSettings, SkySettings
 from scene_templates.surfaces.procedural_textures import SurfaceMapSettings
-from scene_templates.textures import TextureSettings
 from storage.dataset.settings import ListedShard, SplitSettings
 from storage.errors import TrilightError
 from storage.records.material import PUBLISHED_COLUMNS, laid_out

@@ -16,7 +16,7 @@ from typing import Any
 import numpy as np
 
 from pipeline.exchange.renderformer_h5 import write_renderformer_h5
-from pipeline.exchange.renderformer_json import describe_scene
+from pipeline.exchange.renderformer_json import write_renderformer_json
 from storage.records.sample import encode_sample
 from storage.records.scene_file import encode_scene
 from tests.scenes_by_hand import tiny_sample, tiny_scene
@@ -96,11 +96,8 @@ LEAK_OBJ = "v 777 0 0\nv 778 0 0\nv 777 1 0\nf 1 2 3\n"
 
 
 def _base(folder: Path) -> dict[str, Any]:
-    files = describe_scene(tiny_scene(), "s")
-    for path, data in files.meshes.items():
-        (folder / path).parent.mkdir(parents=True, exist_ok=True)
-        (folder / path).write_bytes(data)
-    return dict(json.loads(files.json))
+    write_renderformer_json(folder / "s.json", tiny_scene())
+    return dict(json.loads((folder / "s.json").read_bytes()))
 
 
 def _changed(*where: Any, value: Any) -> Make:

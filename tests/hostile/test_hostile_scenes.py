@@ -25,7 +25,7 @@ from infra.judging import _read_picture
 from model.weights import read_metadata, read_tensors
 from pipeline.assets.prepare import prepare_asset
 from pipeline.assets.settings import AssetSettings, OwnMaterialSettings
-from pipeline.exchange.open_scene import load_source, scene_source, source_keys
+from pipeline.exchange.reader import load_source, scene_source, source_keys
 from pipeline.exchange.renderformer_h5 import write_renderformer_h5
 from pipeline.exchange.renderformer_json import read_renderformer_json
 from pipeline.foreign.source_file import load_mesh, read_source

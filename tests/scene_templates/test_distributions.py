@@ -19,7 +19,7 @@ from numpy.typing import NDArray
 from scipy import stats
 
 from pipeline.presets.registry import preset_settings
-from scene_templates.families import Family, alone
+from scene_templates.families import FAMILIES, Family
 from scene_templates.layout import CameraPose, Emitter, SurfaceLook
 from scene_templates.renderformer_v1 import Policy, stage_1_families, stage_2_families
 from scene_templates.rooms import SIDES, PatchPlacement, SharedRoom, plane_of
@@ -523,7 +523,7 @@ def test_records_of_random_cameras_say_nothing_of_a_path() -> None:
 
 
 def test_an_object_alone_stands_in_the_middle() -> None:
-    settings = SceneSettings(families=(alone(),))
+    settings = SceneSettings(families=(FAMILIES["alone"](),))
     settings = dataclasses.replace(
         settings, placement=dataclasses.replace(settings.placement, orientation="kept")
     )
@@ -536,7 +536,7 @@ def test_an_object_alone_stands_in_the_middle() -> None:
 
 def test_a_layout_without_a_room_holds_one_object() -> None:
     with pytest.raises(TrilightError, match=r"\(1, 2\); expected \(1, 1\) for alone"):
-        Family(**{**vars(alone()), "num_objects": (1, 2)})
+        Family(**{**vars(FAMILIES["alone"]()), "num_objects": (1, 2)})
 
 
 def test_no_lamps_need_a_sky_in_every_scene() -> None:

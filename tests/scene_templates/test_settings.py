@@ -258,7 +258,6 @@ def test_maps_are_made_of_exact_operations_alone() -> None:
     """`draws.uniform`, of ours, is exact; everything else of that name belongs to numpy."""
     folder = ROOT / "scene_templates"
     sources = {*(folder / "surfaces").glob("*.py"), *(folder / "skies").glob("*.py")}
-    sources -= {folder / "skies/drawn_scene.py"}  # turns and scales a map
     assert len(sources) > 5
     found = []
     for path in (*sources, folder / "exact.py", folder / "recorded_sampler.py"):

@@ -52,8 +52,9 @@ def clean(mesh: TriangleMesh) -> TriangleMesh:
     _, first, inverse = np.unique(keys, return_index=True, return_inverse=True)
     cells = cells[first]
     faces = inverse[mesh.faces]
-    faces = faces[_has_area(cells, faces)]
-    faces = canonical(faces)
+    a, b, c = cells[faces].transpose(1, 0, 2)
+    normal = np.cross(b - a, c - a)  # exact, because products stay below 2^43
+    faces = canonical(faces[(normal != 0).any(axis=1)])
     if len(faces):
         _, keep = np.unique(np.sort(faces, axis=1), axis=0, return_index=True)
         faces = faces[np.sort(keep)]
@@ -93,13 +94,6 @@ def _keys(cells: NDArray[np.int64]) -> NDArray[np.int64]:
     """Return one integer per row that orders rows lexicographically."""
     shifted = cells + _OFFSET
     return (shifted[:, 0] << 2 * _BITS) | (shifted[:, 1] << _BITS) | shifted[:, 2]
-
-
-def _has_area(cells: NDArray[np.int64], faces: NDArray[np.int64]) -> NDArray[np.bool_]:
-    """Return [F] True for nonzero area; exact, because products stay below 2^43."""
-    corners = cells[faces]
-    normal = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
-    return (normal != 0).any(axis=1)
 
 
 EXTENT_RANGE = (1e-9, 1e9)
@@ -151,21 +145,15 @@ def check_clean(mesh: TriangleMesh) -> None:
     """Raise Rejected where a cleaned mesh has too little area to render."""
     areas = mesh.areas
     area = float(areas.sum())
-    bulk = _bulk_extent(mesh.corners.reshape(-1, 3), np.repeat(areas, 3)) if area else 0.0
-    if area and bulk < MIN_BULK:
-        raise Rejected(
-            "far_outlier", f"99 % of the area lies within {bulk:.2g} of the box; >= {MIN_BULK}"
-        )
+    if area:
+        points = mesh.corners.reshape(-1, 3)
+        weights = np.repeat(areas, 3)
+        ends = (0.005, 0.995)
+        low, high = np.quantile(points, ends, axis=0, weights=weights, method="inverted_cdf")
+        bulk = float((high - low).max())
+        if bulk < MIN_BULK:
+            raise Rejected(
+                "far_outlier", f"99 % of the area lies within {bulk:.2g} of the box; >= {MIN_BULK}"
+            )
     if area < MIN_AREA:
         raise Rejected("degenerate", f"area {area:.3g} in the unit box; expected >= {MIN_AREA}")
-
-
-def _bulk_extent(points: NDArray[np.float64], weights: NDArray[np.float64]) -> float:
-    """Return the longest side of the box without the outer 0.5 % of the area at either end."""
-    sides = []
-    for axis in points.T:
-        order = np.argsort(axis, kind="stable")
-        cumulative = np.cumsum(weights[order])
-        low, high = np.searchsorted(cumulative, [0.005 * cumulative[-1], 0.995 * cumulative[-1]])
-        sides.append(float(axis[order[min(high, len(order) - 1)]] - axis[order[low]]))
-    return max(sides)

@@ -87,12 +87,8 @@ def _front_votes(mesh: TriangleMesh, patch: NDArray[np.int64]) -> NDArray[np.int
     facing = np.einsum("ij,ij->i", mesh.double_area_vectors[face[hit]], directions[hit])
     seen = patch[face[hit]]
     num_patches = int(patch.max()) + 1
-    return np.stack(
-        [
-            np.bincount(seen[facing < 0], minlength=num_patches),
-            np.bincount(seen[facing > 0], minlength=num_patches),
-        ]
-    )
+    sides = (facing < 0, facing > 0)
+    return np.stack([np.bincount(seen[side], minlength=num_patches) for side in sides])
 
 
 def _signed_volume(mesh: TriangleMesh, patch: NDArray[np.int64]) -> NDArray[np.float64]:

@@ -115,8 +115,12 @@ def smallest_passing(attempt: Callable[[int], Result], largest: int) -> Result:
     Raises:
         Rejected: `largest` itself does not pass.
     """
-    budgets = _falling_budgets(largest)
-    best = attempt(budgets[0])
+    budgets = [largest]
+    budget = float(largest)
+    while (budget := budget / _STEP) >= _FEWEST:
+        if round(budget) < budgets[-1]:
+            budgets.append(round(budget))
+    best = attempt(largest)
     passed = 0
     failed = len(budgets)
     while failed - passed > 1:
@@ -127,13 +131,3 @@ def smallest_passing(attempt: Callable[[int], Result], largest: int) -> Result:
         except Rejected:
             failed = middle
     return best
-
-
-def _falling_budgets(largest: int) -> list[int]:
-    """Return falling budgets from `largest` down to the fewest faces."""
-    budgets = [largest]
-    budget = float(largest)
-    while (budget := budget / _STEP) >= _FEWEST:
-        if round(budget) < budgets[-1]:
-            budgets.append(round(budget))
-    return budgets

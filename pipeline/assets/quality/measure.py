@@ -195,15 +195,14 @@ class MeasuredSource:
     def quality(self, result: TriangleMesh, deviation: Deviation | None = None) -> LevelQuality:
         """Return all measures of a clean result; a known `deviation` saves its computation."""
         measured = deviation or self.surface.hausdorff_deviation(result)
+        iou = intersection_over_union(self._silhouette, silhouette(result))
         return LevelQuality(
             error_mean=round_digits(max(measured.to_other.mean(), measured.from_other.mean())),
             error_p99=round_digits(measured.two_way(99)),
             error_max=round_digits(measured.two_way(100)),
             normal_error_deg=round_digits(measured.angle_deg.mean()),
             area_ratio=round_digits(self.area_ratio(result)),
-            silhouette_iou=round_digits(
-                intersection_over_union(self._silhouette, silhouette(result))
-            ),
+            silhouette_iou=round_digits(iou),
             lost_area=round_digits(self._lost_area(measured.to_other)),
             area_variation=round_digits(area_variation(result)),
             min_angle_p5_deg=round_digits(np.percentile(smallest_angles_deg(result), 5)),
@@ -262,12 +261,10 @@ def check_level(
     if not 1 <= len(mesh.faces) <= budget:
         raise Rejected("budget_missed", f"{len(mesh.faces)} faces; expected 1 to {budget}")
     low, high = gate.area_ratio
-    if not low <= source.area_ratio(mesh) <= high:
-        raise Rejected(
-            "area_changed",
-            f"{source.area_ratio(mesh):.2f} times the source's area at {budget} faces; "
-            f"expected {low} to {high}",
-        )
+    ratio = source.area_ratio(mesh)
+    if not low <= ratio <= high:
+        message = f"{ratio:.2f} times the source's area at {budget} faces; expected {low} to {high}"
+        raise Rejected("area_changed", message)
     deviation = source.surface.hausdorff_deviation(mesh)
     error = deviation.two_way(99)
     if error > max_error_p99:

@@ -1,6 +1,5 @@
 """Source materials of objects, baked onto each level of an asset.
 
 - `source_surface`: the cleaned source with its materials at the nearest point of any other.
-- `bake`: the textures of a level, an atlas with a tile for every triangle.
-- `skin`: the skins of all levels, with the errors of their textures.
+- `skin`: the textures of a level, an atlas with a tile for every triangle, and their errors.
 """

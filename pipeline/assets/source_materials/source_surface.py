@@ -57,40 +57,27 @@ class SurfaceLookup:
             normals: the level's normals there.
             reach: largest distance to a surface, in the unit box.
         """
-        locations, is_missed = self._closest(points, normals, reach)
-        best = np.full(len(points), np.inf)
-        for sign in (1.0, -1.0):
-            face, weights, distance = self._cast_rays(points, sign * normals)
-            facing = (self._normals[face] * normals).sum(axis=1) > 0
-            taken = facing & (distance <= reach) & (distance < best)
-            best[taken] = distance[taken]
-            locations.faces[taken] = face[taken]
-            locations.weights[taken] = weights[taken]
-            is_missed[taken] = False
-        return locations, is_missed
-
-    def _cast_rays(
-        self, points: NDArray[np.float64], directions: NDArray[np.float64]
-    ) -> tuple[NDArray[np.int64], NDArray[np.float64], NDArray[np.float64]]:
-        """Return face, weights and distance of each ray's first hit; infinite without one."""
-        origins = (points - _BEHIND * directions).astype(np.float32)
-        hits = self._triangles.intersect(origins, directions.astype(np.float32))
-        u, v = hits.uv.astype(np.float64)
-        beyond = np.abs(hits.distance_m.astype(np.float64) - _BEHIND)
-        distance = np.where(hits.triangle == MISS, np.inf, beyond)
-        return np.maximum(hits.triangle, 0), np.stack([1 - u - v, u, v], axis=1), distance
-
-    def _closest(
-        self, points: NDArray[np.float64], normals: NDArray[np.float64], reach: float
-    ) -> tuple[FacePoints, NDArray[np.bool_]]:
-        squared, face, nearest = self._tree.squared_distance(
+        squared, closest, nearest = self._tree.squared_distance(
             self._mesh.positions, self._mesh.faces, points
         )
-        face = np.asarray(face, np.int64).ravel()
-        facing = (self._normals[face] * normals).sum(axis=1) > 0
-        weights = barycentric(self._mesh.corners[face], np.asarray(nearest))
-        is_near = np.sqrt(np.asarray(squared).ravel()) <= reach
-        return FacePoints(face, weights), ~(facing & is_near)
+        faces = np.asarray(closest, np.int64).ravel()
+        locations = FacePoints(faces, barycentric(self._mesh.corners[faces], np.asarray(nearest)))
+        facing = (self._normals[faces] * normals).sum(axis=1) > 0
+        is_missed = ~(facing & (np.sqrt(np.asarray(squared).ravel()) <= reach))
+        best = np.full(len(points), np.inf)
+        for sign in (1.0, -1.0):
+            origins = (points - _BEHIND * sign * normals).astype(np.float32)
+            hits = self._triangles.intersect(origins, (sign * normals).astype(np.float32))
+            face = np.maximum(hits.triangle, 0)
+            distance = np.abs(hits.distance_m.astype(np.float64) - _BEHIND)
+            facing = (self._normals[face] * normals).sum(axis=1) > 0
+            taken = (hits.triangle != MISS) & facing & (distance <= reach) & (distance < best)
+            u, v = hits.uv.astype(np.float64)[:, taken]
+            best[taken] = distance[taken]
+            locations.faces[taken] = face[taken]
+            locations.weights[taken] = np.stack([1 - u - v, u, v], axis=1)
+            is_missed[taken] = False
+        return locations, is_missed
 
 
 def barycentric(corners: NDArray[np.float64], points: NDArray[np.float64]) -> NDArray[np.float64]:
@@ -143,11 +130,6 @@ class SourceSurface:
         for material, chosen, points in self._by_material(at):
             result[chosen] = self._material_columns(material, points, cell)
         return result
-
-    @property
-    def emits(self) -> bool:
-        """True where any material emits light."""
-        return any(material.emits for material in self.parts.materials)
 
     def emission(self, at: FacePoints, cell: float) -> NDArray[np.float64]:
         """Return the radiance [N, 3] at points of clean faces; arguments as in `columns`."""
@@ -319,7 +301,11 @@ def match_source_surface(mesh: TriangleMesh, parts: TexturedMesh) -> SourceSurfa
             "materials_unreadable",
             f"{missing.mean():.1%} of the faces are not found again beside their materials",
         )
-    source_face = np.where(missing, _nearest_matched(mesh, missing, source_face), source_face)
+    centres = mesh.corners.mean(axis=1)
+    known = np.flatnonzero(~missing)
+    for row in np.flatnonzero(missing):  # rounding split it: the match of the nearest face
+        squared = np.square(centres[known] - centres[row]).sum(axis=1)
+        source_face[row] = source_face[known[squared.argmin()]]
     source_corner = (corners[source_face][:, None, :] == mesh.faces[:, :, None]).argmax(axis=2)
     source_corner[missing] = np.arange(3)
     _require_coordinates(parts, source_face)
@@ -336,21 +322,6 @@ def _first_matches(faces: NDArray[np.int64], candidates: NDArray[np.int64]) -> N
     np.minimum.at(first, number.ravel()[: len(candidates)], np.arange(len(candidates)))
     first_match = first[number.ravel()[len(candidates) :]]
     return np.where(first_match < len(candidates), first_match, -1)
-
-
-def _nearest_matched(
-    mesh: TriangleMesh, missing: NDArray[np.bool_], source_face: NDArray[np.int64]
-) -> NDArray[np.int64]:
-    """Fill in each missing face with the match of the face whose center is nearest."""
-    if not missing.any():
-        return source_face
-    centres = mesh.corners.mean(axis=1)
-    known = np.flatnonzero(~missing)
-    filled = source_face.copy()
-    for row in np.flatnonzero(missing):
-        squared = np.square(centres[known] - centres[row]).sum(axis=1)
-        filled[row] = source_face[known[squared.argmin()]]
-    return filled
 
 
 def _require_coordinates(parts: TexturedMesh, source_face: NDArray[np.int64]) -> None:

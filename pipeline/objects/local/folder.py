@@ -229,7 +229,7 @@ def list_folder(folder: Path, licence: str | None) -> Listing:
     catalogue = only_catalogue(lambda name: (folder / name).exists(), licence)
     if catalogue is None:
         return _scan_folder(folder, licence)
-    return Listing(records=read_catalogue(folder / catalogue), failures=[])
+    return Listing(records=read_catalogue(folder / catalogue))
 
 
 def _scan_folder(folder: Path, licence: str | None) -> Listing:

@@ -17,8 +17,9 @@ from concurrent.futures import Future
 from functools import partial
 from pathlib import Path
 from typing import Any, BinaryIO, cast
-from urllib.parse import quote, unquote, urlsplit
+from urllib.parse import quote, unquote
 
+from pipeline.foreign.material_files import is_elsewhere
 from pipeline.objects.listing import CountDone, Fetched, Listing, fetch_all
 from pipeline.objects.local.folder import (
     CATALOGUE_NAMES,
@@ -94,12 +95,6 @@ class RemoteFolder:
     def name_of(self, record: ObjectRecord) -> str:
         """Return the name of the file of a record."""
         return Path(record.path).relative_to(self.files).as_posix()
-
-    def facts(self, name: str) -> dict[str, Any]:
-        """Return the server's metadata of a file; raises the driver's errors."""
-        if name in self._facts:
-            return self._facts[name]
-        return dict(self.driver.info(self.address(name)))
 
     def has(self, name: str) -> bool:
         """Return True where a file exists; False also where the server denies access.
@@ -227,7 +222,7 @@ class RemoteFolder:
     def _refresh(self, name: str) -> Path:
         """Download a file unless the local copy has the server's version; return its path."""
         path = self.path(name)
-        facts = with_tries(lambda: self.facts(name))
+        facts = self._facts.get(name) or with_tries(lambda: self.driver.info(self.address(name)))
         if facts.get("type") == "directory":
             raise TransferFailed("download_failed", "is a folder, not a file")
         size = facts.get("size")
@@ -324,16 +319,9 @@ def buffer_names(path: Path, name: str) -> list[str]:
 
 def _inner(uri: str) -> str | None:
     """Return the path that a relative URI names below its folder, or None."""
-    try:
-        parts = urlsplit(uri)
-    except ValueError:
-        return None
     inner = posixpath.normpath(unquote(uri))
-    if parts.scheme or parts.netloc or not uri or "\x00" in inner or "\n" in inner:
-        return None
-    if inner.startswith("/") or inner in (".", "..") or inner.startswith("../"):
-        return None
-    return inner
+    is_name = inner.split("/")[0] not in ("", ".", "..") and not {"\x00", "\n"} & set(inner)
+    return inner if is_name and not is_elsewhere(uri) else None
 
 
 def list_remote(url: RemoteUrl, licence: str | None) -> Listing:
@@ -353,7 +341,7 @@ def list_remote(url: RemoteUrl, licence: str | None) -> Listing:
     if catalogue is None:
         listing = _list_object_files(folder, licence)
     else:
-        listing = Listing(records=_list_catalogue(folder, catalogue), failures=[])
+        listing = Listing(records=_list_catalogue(folder, catalogue))
     return dataclasses.replace(listing, fetch=partial(_fetch, folder))
 
 

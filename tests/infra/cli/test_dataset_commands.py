@@ -20,9 +20,9 @@ from infra.run_record import is_run, run_facts
 from model.open import open_network
 from model.weights import encode_weights
 from pipeline.exchange import reader
-from pipeline.exchange.open_scene import load_source, scene_source
+from pipeline.exchange.reader import load_source, scene_source
 from pipeline.exchange.renderformer_h5 import read_renderformer_h5
-from pipeline.exchange.renderformer_json import describe_scene
+from pipeline.exchange.renderformer_json import write_renderformer_json
 from pipeline.renders.mitsuba_variant import choose_variant
 from storage.dataset.dataset import open_dataset
 from storage.dataset.layout import DatasetFolder
@@ -414,8 +414,9 @@ def test_mistakes(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
         (tmp_path / name).touch()
     (tmp_path / "a.usda").write_text("#usda 1.0\n")
     (tmp_path / "broken.usda").write_text("{")
-    described = describe_scene(tiny_scene(), "s").json.decode()
-    (tmp_path / "meshless.json").write_text(described.replace("templates/", "absent.obj/"))
+    meshless = tmp_path / "meshless.json"
+    write_renderformer_json(meshless, tiny_scene())
+    meshless.write_text(meshless.read_text().replace("templates/", "absent.obj/"))
     monkeypatch.chdir(tmp_path)
     before = set(tmp_path.iterdir())
     for source, target, message in MISTAKES:

@@ -19,8 +19,7 @@ from infra.render.options import RenderOptions
 from infra.render.preview_table import shipped_table
 from model.inference import NeuralRenderer
 from pipeline.exchange.convert import write_scene
-from pipeline.exchange.open_scene import load_source, scene_source
-from pipeline.exchange.reader import SceneReader
+from pipeline.exchange.reader import SceneReader, load_source, scene_source
 from pipeline.exchange.renderformer_h5 import write_renderformer_h5
 from pipeline.exchange.usd.write_usd import write_usd
 from storage.conventions import preview_srgb8

@@ -31,8 +31,7 @@ from infra.render.raw_references import RawReference, true_error, true_error_db
 from infra.render.run_render import Frame, flicker
 from model.config import SIZES
 from model.inference import NeuralRenderer
-from pipeline.exchange.open_scene import SceneSource, scene_source
-from pipeline.exchange.reader import SceneReader
+from pipeline.exchange.reader import SceneReader, SceneSource, scene_source
 from pipeline.renders.mitsuba_variant import choose_variant
 from pipeline.renders.noise_floor import clamped_radiance
 from pipeline.renders.preview import PreviewSettings

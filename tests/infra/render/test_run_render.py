@@ -19,8 +19,7 @@ from infra.render.plan import (
 )
 from infra.render.run_render import FinishedShot, run_plan, write_video
 from infra.render.tone_mapping import Look, tone_mapped
-from pipeline.exchange.open_scene import SceneSource
-from pipeline.exchange.reader import SceneReader
+from pipeline.exchange.reader import SceneReader, SceneSource
 from storage.conventions import preview_srgb8
 from storage.errors import TrilightError
 from storage.records.exr import decode_exr

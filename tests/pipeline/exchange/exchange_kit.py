@@ -13,7 +13,7 @@ from pxr import Gf, Sdf, Usd, UsdGeom, UsdLux, UsdValidation
 
 from pipeline.assets.settings import AssetSettings
 from pipeline.exchange.renderformer_h5 import read_renderformer_h5, write_renderformer_h5
-from pipeline.exchange.renderformer_json import describe_scene
+from pipeline.exchange.renderformer_json import write_renderformer_json
 from pipeline.exchange.scene_files import build_scene
 from pipeline.exchange.textured_triangles import LoadedScene
 from pipeline.exchange.usd.read_usd import read_usd
@@ -49,12 +49,8 @@ def build_json(folder: Path, name: str, **more: Any) -> Scene:
 
 def json_and_back(scene: Scene, folder: Path) -> tuple[Scene, tuple[str, ...]]:
     """Return the scene that our reader makes of its RenderFormer files, and what was lost."""
-    files = describe_scene(scene, "again")
-    for path, data in files.meshes.items():
-        (folder / path).parent.mkdir(parents=True, exist_ok=True)
-        (folder / path).write_bytes(data)
-    (folder / "again.json").write_bytes(files.json)
-    return build_json(folder, "again.json"), files.lost
+    lost = write_renderformer_json(folder / "again.json", scene)
+    return build_json(folder, "again.json"), lost
 
 
 def h5_and_back(scene: Scene, folder: Path) -> Scene:

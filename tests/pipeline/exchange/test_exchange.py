@@ -13,7 +13,7 @@ import trimesh
 from infra.bench.workloads.named_scenes import cost_scene
 from pipeline.exchange.convert import convert_scene, within_budget, write_scene
 from pipeline.exchange.formats import FORMATS, LoadedScene, list_lost_members
-from pipeline.exchange.open_scene import SceneSource, load_source, scene_source
+from pipeline.exchange.reader import SceneSource, load_source, scene_source
 from pipeline.isolation import ChildLimits, IsolatedChild
 from pipeline.presets.registry import preset_settings
 from pipeline.scenes.triangle_budget import PooledAsset

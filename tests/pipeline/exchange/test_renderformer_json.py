@@ -12,7 +12,11 @@ import pytest
 import trimesh
 
 from pipeline.exchange.from_description import DescribedObject, scaled_albedo_notes
-from pipeline.exchange.renderformer_json import MAX_BYTES, describe_scene, read_renderformer_json
+from pipeline.exchange.renderformer_json import (
+    MAX_BYTES,
+    read_renderformer_json,
+    write_renderformer_json,
+)
 from storage.errors import TrilightError
 from storage.records.material import DIFFUSE, EMISSION, ROUGHNESS, SPECULAR
 from storage.records.scene import Scene, SceneObject
@@ -208,13 +212,15 @@ def test_normals_that_no_reader_makes_are_said_to_be_lost(tmp_path: Path) -> Non
     assert "floor: shading normals, which readers compute again" in lost
 
 
-def test_too_much_light_and_too_many_objects(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_too_much_light_and_too_many_objects(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     bright = tiny_scene()
     bright.materials[LIGHT, 7:] = 65505
-    assert any("cuts off" in text for text in describe_scene(bright, "a").lost)
+    assert any("cuts off" in text for text in write_renderformer_json(tmp_path / "a.json", bright))
     monkeypatch.setattr("pipeline.exchange.renderformer_json.MAX_OBJECTS", 1)
-    with pytest.raises(TrilightError, match="2 objects of one material; expected at most 1"):
-        describe_scene(tiny_scene(), "a")
+    with pytest.raises(TrilightError, match=r"a\.json: 2 objects; expected 1 to 1"):
+        write_renderformer_json(tmp_path / "a.json", tiny_scene())
 
 
 Point = tuple[float, float, float]

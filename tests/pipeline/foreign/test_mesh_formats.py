@@ -18,7 +18,7 @@ from pxr import Gf, Usd, UsdGeom, UsdLux, UsdShade
 from pipeline.assets.settings import OwnMaterialSettings
 from pipeline.assets.source_materials.skin import _parts
 from pipeline.assets.source_materials.source_surface import FacePoints, SourceSurface
-from pipeline.exchange.open_scene import load_source, scene_source
+from pipeline.exchange.reader import load_source, scene_source
 from pipeline.exchange.renderformer_json import read_renderformer_json
 from pipeline.foreign.gltf.document import data_uri_bytes
 from pipeline.foreign.limits import ReadLimits

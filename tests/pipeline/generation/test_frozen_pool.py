@@ -26,7 +26,7 @@ from pipeline.presets.registry import preset_settings
 from pipeline.presets.settings import DatasetSettings
 from pipeline.scenes.compose import compose_scene
 from pipeline.scenes.triangle_budget import PooledAsset, draw_rows, fits_of
-from scene_templates.textures import UserMap, draw_user_map
+from scene_templates.scene_maps import UserMap, draw_user_map
 from storage.conventions import SPLITS
 from storage.dataset.verify import check_sample
 from storage.errors import Rejected, TrilightError

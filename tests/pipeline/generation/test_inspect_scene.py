@@ -15,8 +15,7 @@ from PIL import Image
 from infra.render.path_tracer import PathTracer, RenderChild
 from infra.render.quality import measured_settings
 from pipeline.exchange.convert import convert_scene
-from pipeline.exchange.open_scene import SceneSource
-from pipeline.exchange.reader import SceneReader
+from pipeline.exchange.reader import SceneReader, SceneSource
 from pipeline.exchange.usd.write_usd import write_usd
 from pipeline.generation import inspect_scene as inspecting
 from pipeline.generation import scene_worker as rendering

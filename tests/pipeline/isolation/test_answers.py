@@ -26,7 +26,7 @@ from numpy.typing import NDArray
 
 from pipeline.exchange.convert import convert_sources
 from pipeline.exchange.formats import SceneSource
-from pipeline.exchange.open_scene import load_cameras, load_source, source_keys
+from pipeline.exchange.reader import load_cameras, load_source, source_keys
 from pipeline.isolation import ChildFailed, ChildLimits, IsolatedChild, answers
 from pipeline.isolation.answers import (
     CLASS,

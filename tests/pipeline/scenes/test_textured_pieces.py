@@ -28,9 +28,9 @@ from pipeline.scenes.shading_normals import flat_shaded
 from pipeline.scenes.triangle_budget import PooledAsset
 from scene_templates.layout import Emitter, Layout, ObjectPlacement, Pose
 from scene_templates.rotations import rotate_points
+from scene_templates.scene_maps import TextureSettings
 from scene_templates.settings import SceneSettings
 from scene_templates.surfaces.procedural_textures import SurfaceMapSettings
-from scene_templates.textures import TextureSettings
 from storage.conventions import look_at_c2w
 from storage.errors import Rejected
 from storage.records.asset import Level, LevelSkin, SkinQuality

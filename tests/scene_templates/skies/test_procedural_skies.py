@@ -15,7 +15,7 @@ import pytest
 from numpy.typing import NDArray
 
 from pipeline.presets.registry import preset_settings
-from scene_templates.skies.drawn_scene import SceneSky, lamp_irradiance, scene_sky
+from scene_templates.scene_maps import SceneSky, lamp_irradiance, scene_sky
 from scene_templates.skies.procedural_skies import (
     OUR_SKIES,
     SKIES,

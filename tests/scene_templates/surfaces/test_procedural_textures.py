@@ -12,6 +12,7 @@ import pytest
 from numpy.typing import NDArray
 
 from scene_templates.exact import Numbers
+from scene_templates.scene_maps import TexturedLook, TextureSettings, draw_look
 from scene_templates.surfaces.maps import MOST_ALBEDO, Finish, SurfaceDraws, SurfaceMaps, finish
 from scene_templates.surfaces.procedural_textures import (
     OUR_SURFACES,
@@ -22,7 +23,6 @@ from scene_templates.surfaces.procedural_textures import (
     lay_rows,
 )
 from scene_templates.surfaces.texels import Texels, stones
-from scene_templates.textures import TexturedLook, TextureSettings, draw_look
 from storage.seeds import rng_for
 from storage.settings.overrides import apply_overrides
 from tests.for_each import for_each

@@ -15,7 +15,7 @@ from PIL import Image
 from model.scene_tensors import scene_tensors
 from pipeline.exchange.exports import export
 from pipeline.exchange.exports.pictures import stands_alone
-from pipeline.exchange.open_scene import load_source, scene_source
+from pipeline.exchange.reader import load_source, scene_source
 from storage.conventions import in_camera, preview_srgb8, srgb8
 from storage.dataset.dataset import open_dataset
 from storage.records.exr import decode_exr
