@@ -271,7 +271,7 @@ def _probe(variant: Variant, walls_s: Sequence[float] = _PROBE_S) -> _ProbeResul
         if variant.libllvm:
             environment["DRJIT_LIBLLVM_PATH"] = variant.libllvm
         try:
-            result = run_module("variant_probe", variant.name, wall_s, environment)
+            result = run_probe(variant.name, wall_s, environment)
         except subprocess.TimeoutExpired:
             silent = _ProbeResult(problem=f"no answer within {wall_s:g} s", is_silent=True)
             return _probe(variant, more_s) if more_s else silent
@@ -283,12 +283,12 @@ def _probe(variant: Variant, walls_s: Sequence[float] = _PROBE_S) -> _ProbeResul
     return _ProbeResult(problem=lines[-1] if lines else f"it ended with status {result.returncode}")
 
 
-def run_module(
-    name: str, argument: str, wall_s: float, environment: Mapping[str, str]
+def run_probe(
+    argument: str, wall_s: float, environment: Mapping[str, str]
 ) -> subprocess.CompletedProcess[str]:
-    """Run a module of this package in a child; raises TimeoutExpired after so many seconds."""
+    """Run `variant_probe` in a child; raises TimeoutExpired after so many seconds."""
     return subprocess.run(
-        [sys.executable, "-m", f"{__package__}.{name}", argument],
+        [sys.executable, "-m", f"{__package__}.variant_probe", argument],
         cwd=IMPORT_ROOT,
         env=environment,
         capture_output=True,
