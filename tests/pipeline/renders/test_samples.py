@@ -1,6 +1,8 @@
 """How many samples, where they go, when they end, and what error is stated of them."""
 
 from collections.abc import Sequence
+from functools import partial
+from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
@@ -452,13 +454,23 @@ def test_the_choice_is_that_of_handing_out_passes_one_by_one(
     assert ((found == given_out) | (found == given_out + 1)).all()
 
 
+def one_pass(
+    tracer: Any, camera: PixelCamera, *, seed: int, spp: int, chosen: Chosen = None
+) -> NDArray[np.float32]:
+    """Return `VectorTracer.radiance` of some pixels; 0 in the others."""
+    samples = tracer.pass_sum(camera)
+    samples.add(seed=seed, spp=spp, chosen=chosen)
+    (picture,) = samples.read() / spp
+    return np.asarray(picture.astype(np.float32))
+
+
 def test_a_pass_over_some_pixels_agrees_with_passes_over_all() -> None:
     """The slow twin traces the whole picture. Each pixel is off by less than 5.5 of its standard
     errors, and the mean square of the scores is 1: they go by 15 degrees of freedom each."""
     tracer, camera = load_tracer(_noisy(), max_depth=6, rr_depth=2), camera_of(_noisy(), 16)
     chosen = np.random.default_rng(0).random((16, 16)) < 0.6
     some, all_ = (
-        np.array([tracer.radiance(camera, seed=seed, spp=64, chosen=pixels) for seed in seeds])
+        np.array([one_pass(tracer, camera, seed=seed, spp=64, chosen=pixels) for seed in seeds])
         .astype(np.float64).mean(axis=-1)
         for seeds, pixels in ((range(32), chosen), (range(500, 532), None))
     )  # fmt: skip
@@ -470,7 +482,7 @@ def test_a_pass_over_some_pixels_agrees_with_passes_over_all() -> None:
     assert np.abs(score).max() < 5.5
     assert 0.7 < np.sqrt(np.mean(score**2)) < 1.4
     np.testing.assert_array_equal(
-        tracer.radiance(camera, seed=3, spp=16, chosen=np.ones_like(chosen)),
+        one_pass(tracer, camera, seed=3, spp=16, chosen=np.ones_like(chosen)),
         tracer.radiance(camera, seed=3, spp=16),
     )
 
@@ -478,7 +490,8 @@ def test_a_pass_over_some_pixels_agrees_with_passes_over_all() -> None:
 def test_sums_over_chosen_pixels_are_those_of_the_passes() -> None:
     tracer, camera = load_tracer(_noisy(), max_depth=6, rr_depth=2), camera_of(_noisy(), 32)
     rng = np.random.default_rng(2)
-    fast, slow = tracer.pass_sum(camera), HostSum(tracer, camera)
+    passes = SimpleNamespace(radiance=partial(one_pass, tracer))
+    fast, slow = tracer.pass_sum(camera), HostSum(passes, camera)
     for seed, share in enumerate((0.2, 1.1, 0.5)):
         chosen = rng.random((32, 32)) < share
         for part in (fast, slow):
