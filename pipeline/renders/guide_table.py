@@ -11,22 +11,25 @@ large ones: a cell takes the smallest that has enough photons, with a part of wh
 one says, for what the few have missed.
 
 The path tracer draws a share of its directions from the table and the others by the BRDF. The
-density of this mixture is the c_i of pipeline.renders.light_kernel for i > 1. At x1 the path tracer
+density of this mixture is the c_i of pipeline.renders.path_kernel for i > 1. At x1 the path tracer
 is not guided: light paths land there, and guiding there too made pictures no better (study S18).
 """
 
 import math
 from dataclasses import dataclass
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import drjit as dr
 import mitsuba as mi
 import numpy as np
 from numpy.typing import NDArray
 
-from pipeline.renders.device_memory import own_floats, own_integers
+from pipeline.renders.device_memory import own_floats, own_integers, read_back
 from pipeline.renders.ggx import KernelLobes
 from pipeline.renders.surface_table import Hit
+
+if TYPE_CHECKING:
+    from pipeline.renders.path_kernel import Arrival
 
 _CELLS = 1500
 """A cell is about as large as so many parts of the scene's whole surface, or smaller."""
@@ -208,6 +211,55 @@ class Photons:
     """[P] bin of the direction from which each photon came (`bin_of`)."""
     power: NDArray[np.float64]
     """[P] in any unit, above 0."""
+
+
+_SLOTS = 6
+"""Vertices of a path that are recorded at most."""
+
+_NARROW = 1.0
+"""Least density (per steradian) of a bounce whose arrival is recorded: thrice that of a cosine."""
+
+_LEAST_ROUGH = 0.2
+"""Least share of a surface's lobes that may be guided, for an arrival to be recorded."""
+
+
+class PhotonRecords:
+    """Where light arrives by way of narrow lobes; path guiding learns from it.
+
+    Arrivals straight from an emitter are not recorded, because the path tracer picks emitters, nor
+    those by way of wide lobes, because a BRDF sample finds such light. Not a dataclass: Dr.Jit
+    would take its arrays for loop variables.
+    """
+
+    def __init__(self, cells: GuideCells, count: int) -> None:
+        """Begin with none, for `count` paths."""
+        self._guide_cells = cells
+        self._first = dr.arange(mi.UInt32, count) * _SLOTS
+        self._cells = dr.zeros(mi.UInt32, count * _SLOTS)
+        self._bins = dr.zeros(mi.UInt32, count * _SLOTS)
+        self._powers = dr.zeros(mi.Float, count * _SLOTS)
+
+    def __call__(self, _: Any, arrival: "Arrival") -> None:
+        """Record an arrival of each lane in a cell, from the bin of its direction."""
+        vertex = arrival.vertex
+        cell = self._guide_cells.index(vertex.hit, vertex.front, arrival.active)
+        index, _ = bin_of(-arrival.direction)
+        reflects = dr.max(vertex.lobes.diffuse + vertex.lobes.specular) > 0
+        arrives = arrival.active & (arrival.drawn > _NARROW) & reflects
+        arrives &= rough_share(vertex.lobes) > _LEAST_ROUGH
+        slot = arrival.depth - 2
+        active = arrives & (slot < _SLOTS)
+        place = self._first + slot
+        dr.scatter(self._cells, cell, place, active)
+        dr.scatter(self._bins, index, place, active)
+        dr.scatter(self._powers, arrival.power, place, active)
+
+    def photons(self) -> Photons:
+        """Return all that was recorded, path by path."""
+        powers = read_back(self._powers).astype(np.float64)
+        rows = np.flatnonzero((powers > 0) & np.isfinite(powers))
+        cell, number = (read_back(v)[rows].astype(np.int64) for v in (self._cells, self._bins))
+        return Photons(cell=cell, bin=number, power=powers[rows])
 
 
 def learn(cells: GuideCells, photons: Photons) -> GuideTable | None:

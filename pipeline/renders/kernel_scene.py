@@ -10,10 +10,9 @@ from numpy.typing import NDArray
 
 from pipeline.renders import ggx
 from pipeline.renders.device_memory import own_floats, own_integers, read_back
-from pipeline.renders.emitter_table import EmissionCone, EmitterTable
 from pipeline.renders.ggx import AlbedoLookup, KernelLobes
 from pipeline.renders.guide_table import GuideTable
-from pipeline.renders.sky_table import SkyTable, sky_share
+from pipeline.renders.light_tables import EmissionCone, EmitterTable, SkyTable, sky_share
 from pipeline.renders.surface_table import Hit, SurfacePoint, SurfaceTable
 from pipeline.renders.tracer import split_triangles
 from storage.raycast.caster import MISS, RayHits

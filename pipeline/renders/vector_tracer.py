@@ -19,13 +19,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pipeline.renders.device_memory import KernelInputs, own_integers, read_back, record_launches
-from pipeline.renders.emitter_table import EmitterTable
 from pipeline.renders.film import Film, Splats, SplatUnit
-from pipeline.renders.guide_table import GuideCells, GuideTable, learn
+from pipeline.renders.guide_table import GuideCells, GuideTable, PhotonRecords, learn
 from pipeline.renders.kernel_scene import KernelParts, KernelScene, hit_of
-from pipeline.renders.light_kernel import CameraJoin, PhotonRecords, trace_light
-from pipeline.renders.path_kernel import trace
-from pipeline.renders.sky_table import SkyTable
+from pipeline.renders.light_tables import EmitterTable, SkyTable
+from pipeline.renders.path_kernel import CameraJoin, trace, trace_light
 from pipeline.renders.tracer import Chosen, PixelCamera, split_triangles
 from storage.denoiser import Features
 from storage.records.lights import shining_sky
