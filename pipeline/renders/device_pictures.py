@@ -84,9 +84,6 @@ class KernelPixels(Pixels):
     def difference(self, first: Any, second: Any) -> Any:
         return mi.Color3d(first) - mi.Color3d(second)
 
-    def are_equal(self, first: Any, second: Any) -> bool:
-        return False
-
     def error_around(self, squared_error: Any) -> Any:
         dr.eval(squared_error)  # eight neighbours of each pixel read it
         row, column = self._rows_and_columns()

@@ -277,8 +277,7 @@ def measure_pixels(
         a, b, denoised_a, denoised_b = (add_up(each[slice(*group)]) for each in (*raws, *corrected))
         halves = join_halves(a, b, denoised_a, denoised_b, pixels)
         if finished is None:
-            is_filtered = bool(filtered) and not pixels.are_equal(a, denoised_a)
-            rows = estimates(halves, hit, pixels, is_filtered)
+            rows = estimates(halves, hit, pixels, bool(filtered))
             errors += [error for error, _ in rows]
             surprises += [surprise for _, surprise in rows]
         else:

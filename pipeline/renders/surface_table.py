@@ -60,23 +60,19 @@ class SurfaceTable:
         corners = scene.vertex_positions[scene.faces[order]]
         normals = scene.vertex_normals[scene.faces[order]]
         lobes = bsdf_lobes(scene.materials[scene.material_index[order]])
-        rows = np.concatenate(
-            [
-                np.concatenate([corners[:, 0], normals[:, 0, 0:1]], axis=1),
-                np.concatenate([corners[:, 1] - corners[:, 0], normals[:, 0, 1:2]], axis=1),
-                np.concatenate([corners[:, 2] - corners[:, 0], normals[:, 0, 2:3]], axis=1),
-                normals[:, 1:].reshape(-1, 6),
-                lobes.diffuse,
-                lobes.specular,
-                lobes.alpha[:, None],
-                lobes.weight[:, None],
-                scattered_again(lobes.specular, lobes.alpha, "correlated"),
-            ],
-            axis=1,
-        )
-        padded = np.zeros((len(rows), 4 * _GROUPS), np.float32)
-        padded[:, : rows.shape[1]] = rows
-        self._rows = own_floats(padded)
+        # The first corner and both edges from it, each with a component of the first normal.
+        edges = np.concatenate([corners[:, :1], corners[:, 1:] - corners[:, :1]], axis=1)
+        rows = [
+            np.concatenate([edges, normals[:, 0, :, None]], axis=2).reshape(-1, 12),
+            normals[:, 1:].reshape(-1, 6),
+            lobes.diffuse,
+            lobes.specular,
+            lobes.alpha,
+            lobes.weight,
+            scattered_again(lobes.specular, lobes.alpha, "correlated"),
+            np.zeros((len(order), 3)),
+        ]
+        self._rows = own_floats(np.column_stack(rows))
         self._textures = KernelTextures(scene, order) if scene.textures else None
 
     def point(self, hit: Hit, active: Any) -> SurfacePoint:

@@ -373,28 +373,23 @@ def _skin(skin: LevelSkin, locked: LockedObject) -> Skin:
     Raises:
         Rejected: law_broken if the textures are invalid: an old version may have prepared them.
     """
+
+    def with_rights(texture: Texture, column: str) -> Texture:
+        source = MapSource(
+            name=f"{locked.uid} {column}",
+            licence=locked.licence,
+            attribution=locked.attribution,
+            source_url=locked.source_url,
+        )
+        return dataclasses.replace(texture, source=source)
+
     try:
-        textures = [*skin.textures, *(() if skin.normal is None else (skin.normal,))]
+        first, second, third = map(with_rights, skin.textures, TEXTURED)
+        normal = skin.normal and with_rights(skin.normal, NORMAL)
     except TrilightError as error:
         raise Rejected("law_broken", f"object {locked.uid}: {error}") from error
-    first, second, third, *normal = (
-        dataclasses.replace(
-            texture,
-            source=MapSource(
-                name=f"{locked.uid} {column}",
-                licence=locked.licence,
-                attribution=locked.attribution,
-                source_url=locked.source_url,
-            ),
-        )
-        for texture, column in zip(textures, (*TEXTURED, NORMAL), strict=False)
-    )
-    return Skin(
-        uv=skin.uv.reshape(-1, 2),
-        textures=(first, second, third),
-        normal=normal[0] if normal else None,
-        emission=skin.emission,
-    )
+    uv = skin.uv.reshape(-1, 2)
+    return Skin(uv=uv, textures=(first, second, third), normal=normal, emission=skin.emission)
 
 
 def with_source_emission(
