@@ -97,7 +97,6 @@ class IsolatedChild:
         Raises:
             TrilightError: TRILIGHT_CONFINE has an unknown value, or requires a missing feature.
         """
-        self._is_confined = confined_to is not None and should_confine()
         self._limits = limits
         self._factory = factory
         self._args = args
@@ -105,7 +104,7 @@ class IsolatedChild:
         self._connection: Connection | None = None
         self._calls_left = 0
         self._closed = False
-        self._reach = confined_to
+        self._reach = confined_to if confined_to is not None and should_confine() else None
         self._code = frozenset[Path]()
 
     def allow_files(self, more: Reach) -> None:
@@ -174,7 +173,7 @@ class IsolatedChild:
         self._process, self._connection = _launch(self._limits)
         try:
             files = loaded_files()
-            if self._is_confined:  # before it starts threads
+            if self._reach is not None:  # before it starts threads
                 code = self._code | {Path(path).parent for path, _ in files}
                 if self._factory is not None:
                     code |= code_of(self._factory)
@@ -251,11 +250,10 @@ def _launch(limits: ChildLimits) -> tuple[Any, Connection]:
     for tries_left in reversed(range(_LAUNCHES)):
         ours, theirs = context.Pipe()
         output, output_sink = context.Pipe(duplex=False)
-        process = context.Process(
-            target=serve, args=(theirs, output_sink, limits.memory_bytes, limits.cpu_s), daemon=True
-        )
+        words = (theirs, output_sink, limits.memory_bytes, limits.cpu_s)
+        process = context.Process(target=serve, args=words, daemon=True)
         try:
-            with _apart_from_program():
+            with theirs, output_sink, _apart_from_program():
                 process.start()
         except (EOFError, OSError) as error:
             ours.close()
@@ -268,9 +266,6 @@ def _launch(limits: ChildLimits) -> tuple[Any, Connection]:
             os.set_blocking(ours.fileno(), False)
             threading.Thread(target=_print_output, args=(output,), daemon=True).start()
             return process, ours
-        finally:
-            theirs.close()
-            output_sink.close()
     raise AssertionError("unreachable: the last try returns or raises")
 
 

@@ -12,6 +12,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from pipeline.renders.settings import RenderSettings
 from storage.errors import Rejected
 from storage.records.retextured import without_constant_textures
 from storage.records.scene import Scene
@@ -58,7 +59,12 @@ SIZES_AS_THEY_ARE_M = (0.1, 10.0)
 """Scenes between these sizes are traced as they are; all presets' scenes are."""
 
 
-def load_tracer(scene: Scene, *, max_depth: int, rr_depth: int) -> "VectorTracer":
+def load_tracer(
+    scene: Scene,
+    *,
+    max_depth: int = RenderSettings.max_depth,
+    rr_depth: int = RenderSettings.rr_depth,
+) -> "VectorTracer":
     """Return the tracer of a scene; call after `activate`.
 
     Textures of one value are the constants that they are: they cost nothing.
