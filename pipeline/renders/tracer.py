@@ -6,7 +6,7 @@ that estimates the same integral.
 
 import dataclasses
 import math
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -31,12 +31,6 @@ class PixelCamera:
     """Full field of view, equal in width and height."""
     resolution: int
     """Width and height in pixels."""
-
-    def at_scale(self, factor: float) -> "PixelCamera":
-        """Return the camera that sees the same of a scene that is so many times as large."""
-        c2w = self.c2w.copy()
-        c2w[:3, 3] *= factor
-        return replace(self, c2w=c2w)
 
 
 def pixel_camera(c2w: ArrayLike, fov_deg: float, resolution: int) -> PixelCamera:

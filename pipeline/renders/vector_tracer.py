@@ -184,7 +184,7 @@ class VectorTracer:
         return DeviceSum(self, camera)
 
     def _film(self, camera: PixelCamera) -> Film:
-        return Film(camera.at_scale(self._scale))
+        return Film(camera, self._scale)
 
     def _light(self, camera: PixelCamera, seed: int | None, spp: int) -> Any:
         """Return the light (Color3f) of each lobe that paths of a seed throw on a whole picture.

@@ -86,25 +86,17 @@ class Pixels:
     clamp = staticmethod(clamped_radiance)
     sqrt: Any = np.sqrt
     maximum: Any = np.maximum
-
-    def single(self, color: Any) -> Any:
-        return color.astype(np.float32)
-
-    def double(self, color: Any) -> Any:
-        return color.astype(np.float64)
+    single: Any = staticmethod(functools.partial(np.asarray, dtype=np.float32))
+    double: Any = staticmethod(functools.partial(np.asarray, dtype=np.float64))
+    channel_mean: Any = staticmethod(functools.partial(np.mean, axis=-1))
+    brightest: Any = staticmethod(functools.partial(np.max, axis=-1))
+    """Largest channel of each pixel."""
 
     def select(self, mask: Any, first: Any, second: Any) -> Any:
         return np.where(mask[..., None] if np.ndim(first) > mask.ndim else mask, first, second)
 
     def channels(self, color: Any) -> Sequence[Any]:
         return list(np.moveaxis(color, -1, 0))
-
-    def channel_mean(self, color: Any) -> Any:
-        return color.mean(axis=-1)
-
-    def brightest(self, color: Any) -> Any:
-        """Return the largest channel of each pixel."""
-        return color.max(axis=-1)
 
     def is_finite(self, color: Any) -> Any:
         return np.isfinite(color).all(axis=-1)
