@@ -134,11 +134,6 @@ class KernelPixels(Pixels):
             pictures.append(mi.Color3f(mi.Color3d(denoised) * factor))
         return pictures
 
-    def shares(self, parts: Sequence[Any]) -> list[Any]:
-        total = add_up([mi.Color3d(part) for part in parts])
-        equal = 1 / len(parts)
-        return [mi.Color3f(dr.select(total > 0, mi.Color3d(part) / total, equal)) for part in parts]
-
     def tile_sums(self, values: Sequence[Any]) -> Sequence[Any]:
         count = self._resolution**2 // TILE
         tiles = self.reduce_tiles(values, dr.ReduceOp.Add)

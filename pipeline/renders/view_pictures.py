@@ -131,10 +131,11 @@ class Pixels:
 
     def shares(self, parts: Sequence[Any]) -> list[Any]:
         """Return what share of their sum each of some pictures is: equal ones where all are 0."""
-        parts_rgb = np.stack(parts)
-        total = parts_rgb.sum(axis=0, dtype=np.float64)
-        equal = np.full(parts_rgb.shape, 1 / len(parts_rgb))
-        return list(np.divide(parts_rgb, total, out=equal, where=total > 0).astype(np.float32))
+        doubles = [self.double(part) for part in parts]
+        total = add_up(doubles)
+        with np.errstate(invalid="ignore"):  # 0 / 0, which is not selected
+            shares = [self.select(total > 0, part / total, 1 / len(parts)) for part in doubles]
+        return [self.single(share) for share in shares]
 
     def tile_sums(self, values: Sequence[Any]) -> Sequence[Any]:
         """Return the sums over tiles of each of some values of pixels."""
