@@ -138,8 +138,8 @@ def _renderer() -> Finding:
 def _denoiser() -> Finding:
     variant = choose_variant("auto")
     facts = render_facts(variant)
-    if "denoiser" not in facts:
-        text = f"pyoidn {facts['pyoidn']} does not respond"
+    if not facts:
+        text = f"pyoidn {metadata.version('pyoidn')} does not respond"
         return Finding("missing", text, "pictures cannot be denoised", "make setup")
     text = (
         f"OIDN {facts['denoiser']}, {facts['denoiser_device']}, {facts['threads']} threads; a view "

@@ -16,8 +16,6 @@ import sys
 import time
 from collections.abc import Callable
 from functools import partial
-from importlib import metadata
-from pathlib import Path
 from typing import TYPE_CHECKING, Literal
 
 import numpy as np
@@ -77,14 +75,12 @@ def main() -> None:
 
 
 def render_facts(variant: Variant) -> dict[str, str]:
-    """Return versions, devices, threads and seconds of a view by name, as far as known in time."""
-    facts = {name: metadata.version(name) for name in ("mitsuba", "drjit", "pyoidn")}
-    facts |= {"variant": variant.name, "llvm": Path(variant.libllvm).name}
+    """Return the denoiser, threads and seconds of a view by name; empty if unknown in time."""
     try:
         result = run_probe(json.dumps(vars(variant)), _FACTS_S, child_environment())
     except subprocess.TimeoutExpired:  # a busy machine
-        return facts
-    return facts | json.loads(result.stdout) if result.returncode == 0 else facts
+        return {}
+    return dict(json.loads(result.stdout)) if result.returncode == 0 else {}
 
 
 def _measure_facts(variant: Variant) -> dict[str, str]:

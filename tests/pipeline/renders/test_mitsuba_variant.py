@@ -3,6 +3,7 @@
 import copy
 import dataclasses
 import json
+import re
 import subprocess
 from collections.abc import Callable
 from pathlib import Path
@@ -253,17 +254,16 @@ def test_asking_does_not_import_mitsuba_nor_the_denoiser_torch() -> None:
     assert printed_by(code) == "[]\nFalse"
 
 
-def test_facts_name_versions_device_and_threads_as_far_as_there_is_time(
+def test_facts_name_denoiser_and_threads_if_there_is_time(
     variant: Variant, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     facts = render_facts(variant)
-    assert facts["variant"] == variant.name
     assert facts["denoiser_device"] == "CPU"
     assert int(facts["threads"]) >= 1
-    assert {"mitsuba", "drjit", "pyoidn", "llvm", "denoiser"} <= facts.keys()
+    assert re.fullmatch(r"\d+\.\d+\.\d+", facts["denoiser"])
     assert float(facts["view_s"]) > 0
     monkeypatch.setattr("pipeline.renders.variant_probe._FACTS_S", 0.01)
-    assert render_facts(variant).keys() == {"mitsuba", "drjit", "pyoidn", "variant", "llvm"}
+    assert render_facts(variant) == {}
 
 
 class _Blind:
