@@ -22,7 +22,6 @@ doubling of the samples bought in its own metric, and the one that needs most sa
 
 import math
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -294,46 +293,34 @@ _MAX_GROWTH = 2.0
 With 4 half of what these gain was lost."""
 
 
-@dataclass(frozen=True, kw_only=True)
-class Goal:
-    """Targets and cap of the samples of a view."""
-
-    targets_db: Floors
-    """Stated errors to reach, in dB by metric."""
-    step: int
-    """Samples per pixel that one pass adds, both halves together."""
-    max_spp: int
-    """Maximum samples per pixel, a multiple of `step`."""
-
-
 def gaps_db(targets_db: Floors, floors_db: Floors) -> dict[str, float]:
     """Return by how many dB each target is missed, by metric; without those that are reached."""
     gaps = {metric: target_db - floors_db[metric] for metric, target_db in targets_db.items()}
     return {metric: gap_db for metric, gap_db in gaps.items() if gap_db > 0}
 
 
-def next_spp(measured: Measured, goal: Goal) -> int:
-    """Return the number of samples at which the floors are measured next.
+def next_spp(spp: int, expected: int, step: int) -> int:
+    """Return the samples at which floors are measured next, of `expected_spp` after `spp`."""
+    growth = max(step * math.ceil(spp * _MAX_GROWTH / step), spp + step)
+    return min(expected, growth)
+
+
+def expected_spp(measured: Measured, targets_db: Floors, *, step: int, max_spp: int) -> int:
+    """Return the number of samples that should reach all targets, or the cap.
 
     Args:
-        measured: of this view so far; the last floors miss a target of the goal, and their samples
-            are a multiple of its step below its cap.
-        goal: when sampling ends.
+        measured: of this view so far; the last floors miss a target, and their samples are a
+            multiple of `step` below the cap.
+        targets_db: stated errors to reach, in dB by metric.
+        step: samples per pixel that one pass adds, both halves together.
+        max_spp: the cap, a multiple of `step`.
     """
-    spp = measured[-1][0]
-    step = goal.step
-    growth = max(step * math.ceil(spp * _MAX_GROWTH / step), spp + step)
-    return min(expected_spp(measured, goal), growth)
-
-
-def expected_spp(measured: Measured, goal: Goal) -> int:
-    """Return the number of samples that should reach all targets, or the cap; as `next_spp`."""
     spp, floors_db = measured[-1]
-    gaps = gaps_db(goal.targets_db, floors_db)
+    gaps = gaps_db(targets_db, floors_db)
     needed_doublings = max(gap_db / slope_db(measured, metric) for metric, gap_db in gaps.items())
-    doublings = min(needed_doublings, math.log2(goal.max_spp / spp) + 1)
-    target_spp = goal.step * math.ceil(spp * 2**doublings / goal.step)
-    return min(goal.max_spp, max(target_spp, spp + goal.step))
+    doublings = min(needed_doublings, math.log2(max_spp / spp) + 1)
+    target_spp = step * math.ceil(spp * 2**doublings / step)
+    return min(max_spp, max(target_spp, spp + step))
 
 
 def slope_db(measured: Measured, metric: str) -> float:

@@ -20,7 +20,6 @@ from pipeline.renders.renderer import SceneRenderer
 from pipeline.renders.samples import (
     TILE_PX,
     DualBuffer,
-    Goal,
     TileChoice,
     expected_spp,
     gaps_db,
@@ -159,8 +158,12 @@ def test_targets_go_by_the_name_of_their_metric() -> None:
         assert RenderSettings(**{**GOOD, **target_overrides(targets)}).targets_db == expected
 
 
-def log_goal(target_db: float, step: int, max_spp: int) -> Goal:
-    return Goal(targets_db={"psnr_log_db": target_db}, step=step, max_spp=max_spp)
+def log_goal(target_db: float, step: int, max_spp: int) -> dict[str, Any]:
+    return {"targets_db": {"psnr_log_db": target_db}, "step": step, "max_spp": max_spp}
+
+
+def following_spp(measured: list[tuple[int, dict[str, float]]], goal: dict[str, Any]) -> int:
+    return next_spp(measured[-1][0], expected_spp(measured, **goal), goal["step"])
 
 
 def logs(*measured: tuple[int, float]) -> list[tuple[int, dict[str, float]]]:
@@ -172,12 +175,12 @@ def test_samples_grow_in_whole_steps_up_to_the_cap(
     steps: int, gap_db: float, wider_gap_db: float, step: int
 ) -> None:
     spp, cap = steps * step, 64 * step
-    chosen = next_spp(logs((spp, 0.0)), log_goal(gap_db, step, cap))
+    chosen = following_spp(logs((spp, 0.0)), log_goal(gap_db, step, cap))
     assert chosen % step == 0
     assert spp < chosen <= cap
     assert chosen <= max(2 * spp, spp + step)
     if wider_gap_db >= gap_db:
-        assert chosen <= next_spp(logs((spp, 0.0)), log_goal(wider_gap_db, step, cap))
+        assert chosen <= following_spp(logs((spp, 0.0)), log_goal(wider_gap_db, step, cap))
 
 
 def test_samples_go_by_what_a_doubling_buys() -> None:
@@ -194,8 +197,8 @@ def test_samples_go_by_what_a_doubling_buys() -> None:
         (slow, 44.0, 1024, 2048),
     ):
         goal = log_goal(target_db, 128, 4096)
-        assert next_spp(measured, goal) == following
-        assert expected_spp(measured, goal) == in_all
+        assert following_spp(measured, goal) == following
+        assert expected_spp(measured, **goal) == in_all
     assert (slope_db(fast, "psnr_log_db"), slope_db(slow, "psnr_log_db")) == (2.0, 1.0)
     assert slope_db(logs((128, 40.0), (256, 39.0)), "psnr_log_db") == 0.6
     assert slope_db(logs((128, 40.0), (256, 50.0)), "psnr_log_db") == 3.0
@@ -212,14 +215,14 @@ def test_the_target_that_needs_most_samples_governs() -> None:
     assert gaps_db(missed, TWICE[-1][1]) == {"psnr_linear_db": 4.0}
     assert gaps_db({"psnr_log_db": 41.0}, TWICE[-1][1]) == {}
     # 2 dB a doubling of the log floor, 1 dB of both others
-    both = Goal(targets_db={"psnr_log_db": 45.0, "psnr_linear_db": 33.0}, step=128, max_spp=8192)
-    assert expected_spp(TWICE, both) == 1024  # two doublings: the gap of 3 dB takes 1.5
-    alone = Goal(targets_db={"psnr_log_db": 46.0}, step=128, max_spp=8192)
-    assert expected_spp(TWICE, alone) == 1024
+    both = {"psnr_log_db": 45.0, "psnr_linear_db": 33.0}
+    assert expected_spp(TWICE, both, step=128, max_spp=8192) == 1024  # two doublings: of 3 dB 1.5
+    alone = {"psnr_log_db": 46.0}
+    assert expected_spp(TWICE, alone, step=128, max_spp=8192) == 1024
     reached = {"psnr_log_db": 44.0, "psnr_linear_db": 31.0, "object_psnr_log_db": 39.0}
     for targets_db in ({"psnr_log_db": 44.0}, reached):  # what is reached costs nothing
-        goal = Goal(targets_db=targets_db, step=128, max_spp=8192)
-        assert expected_spp(TWICE, goal) == next_spp(TWICE, goal) == 512
+        goal: dict[str, Any] = {"targets_db": targets_db, "step": 128, "max_spp": 8192}
+        assert expected_spp(TWICE, **goal) == following_spp(TWICE, goal) == 512
 
 
 NOISE = 0.05
