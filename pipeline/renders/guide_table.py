@@ -201,18 +201,6 @@ _PARENT = 0.25
 """Part of a row that the next larger cube says."""
 
 
-@dataclass(frozen=True, kw_only=True, eq=False)
-class Photons:
-    """Photons that arrived by way of a narrow lobe."""
-
-    cell: NDArray[np.int64]
-    """[P] cell that each photon hit (`GuideCells`)."""
-    bin: NDArray[np.int64]
-    """[P] bin of the direction from which each photon came (`bin_of`)."""
-    power: NDArray[np.float64]
-    """[P] in any unit, above 0."""
-
-
 _SLOTS = 6
 """Vertices of a path that are recorded at most."""
 
@@ -254,27 +242,42 @@ class PhotonRecords:
         dr.scatter(self._bins, index, place, active)
         dr.scatter(self._powers, arrival.power, place, active)
 
-    def photons(self) -> Photons:
-        """Return all that was recorded, path by path."""
+    def photons(self) -> tuple[NDArray[np.int64], NDArray[np.int64], NDArray[np.float64]]:
+        """Return cells, bins and powers of all that was recorded, path by path, as for `learn`."""
         powers = read_back(self._powers).astype(np.float64)
         rows = np.flatnonzero((powers > 0) & np.isfinite(powers))
-        cell, number = (read_back(v)[rows].astype(np.int64) for v in (self._cells, self._bins))
-        return Photons(cell=cell, bin=number, power=powers[rows])
+        hit_cells, bins = (read_back(v)[rows].astype(np.int64) for v in (self._cells, self._bins))
+        return hit_cells, bins, powers[rows]
 
 
-def learn(cells: GuideCells, photons: Photons) -> GuideTable | None:
-    """Return the guide table, or None if no cell got enough photons."""
-    least = max(_LEAST_PHOTONS, math.ceil(len(photons.cell) / _MOST_ROWS))
+def learn(
+    cells: GuideCells,
+    hit_cells: NDArray[np.int64],
+    bins: NDArray[np.int64],
+    powers: NDArray[np.float64],
+) -> GuideTable | None:
+    """Return the guide table, or None if no cell got enough photons.
+
+    Args:
+        cells: of the surfaces.
+        hit_cells: [P] cell that each photon hit.
+        bins: [P] bin of the direction from which each photon came (`bin_of`).
+        powers: [P] in any unit, above 0.
+    """
+    least = max(_LEAST_PHOTONS, math.ceil(len(hit_cells) / _MOST_ROWS))
     row_of_cell = np.zeros(len(cells.facing), np.int64)
     rows = np.zeros((1, BINS))
     for level in reversed(range(_LEVELS)):
         group = _groups(cells, cells.size_m * 2**level)
         large_groups = np.flatnonzero(
-            np.bincount(group[photons.cell], minlength=group.max() + 1) >= least
+            np.bincount(group[hit_cells], minlength=group.max() + 1) >= least
         )
         place = np.full(group.max() + 1, -1)
         place[large_groups] = np.arange(len(large_groups))
-        finer = _shares(_histograms(place[group], photons, len(large_groups)))
+        row = place[group][hit_cells]
+        flat = row[row >= 0] * BINS + bins[row >= 0]
+        sums = np.bincount(flat, powers[row >= 0], minlength=len(large_groups) * BINS)
+        finer = _shares(sums.astype(np.float64).reshape(-1, SIDE, SIDE))
         parents = np.zeros(len(large_groups), np.int64)
         held = place[group] >= 0
         parents[place[group[held]]] = row_of_cell[held]
@@ -299,13 +302,6 @@ def _groups(cells: GuideCells, width_m: float) -> NDArray[np.int64]:
     cube = np.floor(cells.centres_m / width_m).astype(np.int64)
     _, group = np.unique(np.column_stack([cube, cells.facing]), axis=0, return_inverse=True)
     return group.ravel()
-
-
-def _histograms(place: NDArray[np.int64], photons: Photons, count: int) -> NDArray[np.float64]:
-    row = place[photons.cell]
-    flat = row[row >= 0] * BINS + photons.bin[row >= 0]
-    sums = np.bincount(flat, photons.power[row >= 0], minlength=count * BINS).astype(np.float64)
-    return sums.reshape(count, SIDE, SIDE)
 
 
 def _shares(histograms: NDArray[np.float64]) -> NDArray[np.float64]:

@@ -407,7 +407,7 @@ def _learn_guide(record: Scene, scene: KernelScene) -> GuideTable | None:
     records = PhotonRecords(cells, PHOTON_PATHS)
     seed = seed_for(_PHOTON_SEED, "photons")
     _trace_light_paths(scene, seed, even_shifts(_PHOTON_SEED), PHOTON_PATHS, records)
-    return learn(cells, records.photons())
+    return learn(cells, *records.photons())
 
 
 def even_shifts(seed: int) -> list[Any]:
