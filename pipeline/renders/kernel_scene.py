@@ -157,30 +157,24 @@ def face_viewer(
     `normalmap`: a half turn about that normal maps one frame to the other. Where the scene has no
     normal map, all stays.
     """
-    if vertex.unmapped is not None:
-        vertex, directions = _turn_to_viewer(vertex, vertex.unmapped, directions)
+    if (axis := vertex.unmapped) is not None:
+        turned = (vertex.incoming.z <= 0) & (dr.dot(vertex.incoming, axis) > 0)
+
+        def turn(direction: Any) -> Any:
+            return dr.select(turned, axis * (2 * dr.dot(axis, direction)) - direction, direction)
+
+        to_world = vertex.frame.to_world
+        axes = (mi.Vector3f(1, 0, 0), mi.Vector3f(0, 1, 0), mi.Vector3f(0, 0, 1))
+        vertex = replace(
+            vertex,
+            frame=mi.Frame3f(*(mi.Vector3f(to_world(turn(each))) for each in axes)),
+            geometric=turn(vertex.geometric),
+            incoming=turn(vertex.incoming),
+            turned=turned,
+        )
+        directions = tuple(map(turn, directions))
     albedo = scene.albedo(vertex.incoming.z, vertex.lobes.alpha, active)
     return replace(vertex, lobes=ggx.seen_from(vertex.lobes, vertex.incoming, albedo)), directions
-
-
-def _turn_to_viewer(
-    vertex: Vertex, axis: Any, directions: tuple[Any, ...]
-) -> tuple[Vertex, tuple[Any, ...]]:
-    turned = (vertex.incoming.z <= 0) & (dr.dot(vertex.incoming, axis) > 0)
-
-    def turn(direction: Any) -> Any:
-        return dr.select(turned, axis * (2 * dr.dot(axis, direction)) - direction, direction)
-
-    axes = (mi.Vector3f(1, 0, 0), mi.Vector3f(0, 1, 0), mi.Vector3f(0, 0, 1))
-    frame = mi.Frame3f(*(mi.Vector3f(vertex.frame.to_world(turn(each))) for each in axes))
-    faced = replace(
-        vertex,
-        frame=frame,
-        geometric=turn(vertex.geometric),
-        incoming=turn(vertex.incoming),
-        turned=turned,
-    )
-    return faced, tuple(map(turn, directions))
 
 
 def hit_of(intersection: Any) -> tuple[Hit, Any]:

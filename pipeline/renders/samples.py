@@ -163,8 +163,9 @@ class TileChoice:
             visible: [R, R] pixels that may have light at all.
         """
         self._weight = tile_means(visible.astype(np.float64))
-        self._seen: list[NDArray[np.int64]] = []
-        self._variance: list[NDArray[np.float64]] = []
+        self._seen: NDArray[np.int64] | None = None
+        self._variance: NDArray[np.float64] | None = None
+        """[2, T, T] of one sample, by two looks; a tile that got none keeps what was known."""
         self._filter: Filtered | None = None
 
     def learn(
@@ -178,13 +179,12 @@ class TileChoice:
             quality: of the filter. What changes with it says nothing of the samples: after that
                 nothing new is known.
         """
-        tiles = slice(None, None, TILE_PX)
-        seen = [samples.spp_by_half[half][tiles, tiles].copy() for half in range(len(changes))]
-        if self._seen and quality == self._filter:
-            known = self._variance or [np.zeros_like(self._weight)] * 2
-            self._variance = [
-                _variance(*each) for each in zip(changes, self._seen, seen, known, strict=True)
-            ]
+        seen = samples.spp_by_half[:, ::TILE_PX, ::TILE_PX].copy()
+        if self._seen is not None and quality == self._filter:
+            grown = seen > self._seen
+            less = np.where(grown, 1 / self._seen - 1 / seen, 1)
+            known = 0.0 if self._variance is None else self._variance
+            self._variance = np.where(grown, np.stack([*map(_smooth, changes)]) / less, known)
         self._seen = seen
         self._filter = quality
 
@@ -196,26 +196,15 @@ class TileChoice:
             mean_spp: samples per pixel that are wanted, both halves together.
         """
         more = mean_spp - samples.spp
-        started = self._variance and self._seen[0].min() >= _PASS
-        if not started or more < 2 * _PASS:
+        if self._variance is None or self._seen is None:
+            return None
+        if self._seen[0].min() < _PASS or more < 2 * _PASS:
             return None
         of_tiles = [
             passes_of_tiles(other_variance, spp, self._weight, more / 2)
             for other_variance, spp in zip(self._variance[::-1], self._seen, strict=True)
         ]
         return [each.repeat(TILE_PX, axis=0).repeat(TILE_PX, axis=1) for each in of_tiles]
-
-
-def _variance(
-    change: NDArray[np.float64],
-    spp_before: NDArray[np.int64],
-    spp: NDArray[np.int64],
-    known: NDArray[np.float64],
-) -> NDArray[np.float64]:
-    """Return the variance of one sample, [T, T], by two looks; `known` where nothing was added."""
-    grown = spp > spp_before
-    less = np.where(grown, 1 / spp_before - 1 / spp, 1)
-    return np.where(grown, _smooth(change) / less, known)
 
 
 def passes_of_tiles(
