@@ -415,44 +415,33 @@ class CameraJoin:
 
     def __call__(self, scene: KernelScene, arrival: Arrival) -> None:
         """Add the light that reaches a vertex to the pictures in which it shows."""
-        visible = arrival.active & (arrival.vertex.hit.triangle < scene.num_surfaces)
+        vertex = arrival.vertex
+        visible = arrival.active & (vertex.hit.triangle < scene.num_surfaces)
         landing = visible & (arrival.depth > 1) & (arrival.depth < scene.max_depth)
         ratio = dr.minimum(dr.hypot(arrival.hit_mis_ratio, arrival.pick_mis_ratio), MAX_MIS_RATIO)
+        # the square root of (hit^2 + pick^2) / land^2, without P and c_1
+        mis_ratio = ratio / self._light_paths
         for film, sums in zip(self._films, self._splats, strict=True):
-            sight = mi.Bool(landing)  # each camera narrows its own
-            value, share, pixel, lands = self._connect(
-                scene, film, arrival.vertex, ratio / self._light_paths, sight
-            )
-            values = self._parts.by_lobe(arrival.light * value, share)
+            active = mi.Bool(landing)  # each camera narrows its own
+            to_camera = film.origin - vertex.point.position
+            distance_sq = dr.squared_norm(to_camera)
+            direction = to_camera * dr.rsqrt(distance_sq)
+            local = vertex.frame.to_local(direction)
+            reflected, forward, _ = _evaluate_brdf(scene, vertex, local, active, None)
+            pixels = film.pdf(-direction) * dr.abs(dr.dot(vertex.geometric, local)) / distance_sq
+            share = 1 / (1 + dr.square(pixels * mis_ratio * forward))
+            pixel, inside = film.pixel(vertex.point.position)
+            active &= inside & (dr.max(reflected) > 0)
+            start = off_surface(vertex.point, to_camera)
+            remaining = film.origin - start
+            ray = mi.Ray3f(start, mi.Vector3f(dr.normalize(remaining)))
+            ray.maxt = dr.norm(remaining)
+            active &= ~scene.surfaces.ray_test(ray, active=active)
+            of_diffuse = self._parts.share(*_flip_to_viewer(scene, vertex, local, active))
+            value = reflected * (share * pixels / self._light_paths)
+            values = self._parts.by_lobe(arrival.light * value, of_diffuse)
             for total, part in zip(sums, values, strict=True):
-                total.add(part, pixel, lands)
-
-    def _connect(
-        self, scene: KernelScene, film: Film, vertex: Vertex, mis_ratio: Any, active: Any
-    ) -> tuple[Any, Any, Any, Any]:
-        """Return the light of a vertex in the picture: value, diffuse share, pixel and visibility.
-
-        The value and the share of the diffuse lobe are Color3f, the pixel UInt32, visibility Bool.
-
-        Args:
-            mis_ratio: Float, the square root of (hit^2 + pick^2) / land^2, without P and c_1.
-        """
-        to_camera = film.origin - vertex.point.position
-        distance_sq = dr.squared_norm(to_camera)
-        direction = to_camera * dr.rsqrt(distance_sq)
-        local = vertex.frame.to_local(direction)
-        reflected, forward, _ = _evaluate_brdf(scene, vertex, local, active, None)
-        pixels = film.pdf(-direction) * dr.abs(dr.dot(vertex.geometric, local)) / distance_sq
-        share = 1 / (1 + dr.square(pixels * mis_ratio * forward))
-        pixel, inside = film.pixel(vertex.point.position)
-        active &= inside & (dr.max(reflected) > 0)
-        start = off_surface(vertex.point, to_camera)
-        remaining = film.origin - start
-        ray = mi.Ray3f(start, mi.Vector3f(dr.normalize(remaining)))
-        ray.maxt = dr.norm(remaining)
-        active &= ~scene.surfaces.ray_test(ray, active=active)
-        of_diffuse = self._parts.share(*_flip_to_viewer(scene, vertex, local, active))
-        return reflected * (share * pixels / self._light_paths), of_diffuse, pixel, active
+                total.add(part, pixel, active)
 
 
 def bounce(
