@@ -21,7 +21,7 @@ import subprocess
 import sys
 import tempfile
 import zlib
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from importlib import metadata
 from pathlib import Path
@@ -320,7 +320,14 @@ def llvm_libraries() -> list[Path]:
     Symbolic links are resolved, so that one library is named once.
     """
     named = os.environ.get("DRJIT_LIBLLVM_PATH")
-    candidates = {path.resolve() for path in _in_usual_folders()}
+    candidates = {
+        path.resolve()
+        for pattern in _FOLDERS
+        for folder in Path("/").glob(pattern.lstrip("/"))
+        for name in ("libLLVM*.so*", "libLLVM*.dylib")
+        for path in folder.glob(name)
+        if _NAME.match(path.name)
+    }
     ordered = sorted(candidates, key=lambda path: (-_version_in_name(path), str(path)))
     first = [Path(named).resolve()] if named else []
     return [path for path in dict.fromkeys([*first, *_of_wheel(), *ordered]) if path.is_file()]
@@ -338,13 +345,6 @@ def _of_wheel() -> list[Path]:
     except metadata.PackageNotFoundError:
         return []
     return [Path(str(file.locate())).resolve() for file in members if _NAME.match(file.name)]
-
-
-def _in_usual_folders() -> Iterable[Path]:
-    for pattern in _FOLDERS:
-        for folder in Path("/").glob(pattern.lstrip("/")):
-            for name in ("libLLVM*.so*", "libLLVM*.dylib"):
-                yield from (path for path in folder.glob(name) if _NAME.match(path.name))
 
 
 _LIBRARIES = (

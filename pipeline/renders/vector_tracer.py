@@ -372,7 +372,10 @@ class DeviceSum:
         numbers = _PassNumbers(camera, seed, spp, tracer._light_paths)
         light = tracer._light(camera, light_seed, spp)
         inputs = KernelInputs(tracer._scene, self._film, tracer._parts, light, numbers)
-        pixels = _pixels(camera, chosen)
+        pixels = dr.arange(mi.UInt32, camera.resolution**2)
+        if chosen is not None:
+            pixels = own_integers(np.flatnonzero(chosen))
+        dr.eval(pixels)  # in memory even where they are all: one kernel serves any choice
         self.sums = _add_pass(inputs, pixels, camera.resolution, spp, self.sums)
 
     def guide(self) -> None:
@@ -427,18 +430,6 @@ def even_numbers(count: int, shifts: Sequence[Any]) -> list[Any]:
         mi.Float((lane * stride + shift) >> 8) * 2.0**-24
         for stride, shift in zip(strides, shifts, strict=True)
     ]
-
-
-def _pixels(camera: PixelCamera, chosen: Chosen) -> Any:
-    """Return the numbers of the chosen pixels (UInt32), row by row.
-
-    They are in memory even where they are all: one kernel serves any choice.
-    """
-    if chosen is not None:
-        return own_integers(np.flatnonzero(chosen))
-    numbers = dr.arange(mi.UInt32, camera.resolution**2)
-    dr.eval(numbers)
-    return numbers
 
 
 def _pixel_means(spp: int, samples: Any) -> Any:
