@@ -275,7 +275,7 @@ class KernelParts:
     def share(self, vertex: Vertex, local: Any) -> Any:
         """Return the share (Color3f) of the diffuse lobe in the light that a vertex reflects.
 
-        It is None where lobes are not apart.
+        It is 1 of no light, and None where lobes are not apart.
 
         Args:
             vertex: as the camera path sees it.
@@ -283,9 +283,9 @@ class KernelParts:
         """
         if not self._lobes:
             return None
-        return ggx.diffuse_share(
-            vertex.lobes, vertex.incoming, local, vertex.geometric, vertex.unmapped
-        )
+        reflected, _ = vertex.evaluate(local)
+        diffuse = vertex.lobes.diffuse * (ggx.INV_PI * dr.maximum(local.z, 0))
+        return dr.select(reflected > diffuse, diffuse / reflected, 1)
 
     def carry_share(self, vertex: Vertex, local: Any, depth: Any, before: Any) -> Any:
         """Return the `share` of the first vertex of a path, which has `depth` (UInt32) by now."""
