@@ -173,11 +173,15 @@ class EmissionCone:
     def sample(self, position: Any, normal: Any, u: Any) -> Any:
         """Return a unit direction (Vector3f) from a uniform Point2f."""
         axis, height, outside = self._cone(position)
-        in_cone = mi.Frame3f(axis).to_world(_cap(height, u))
+        down = height * u.x
+        radius = dr.safe_sqrt(down * (2 - down))
+        sine, cosine = dr.sincos(2 * dr.pi * u.y)
+        cap = mi.Vector3f(radius * cosine, radius * sine, 1 - down)
+        in_cone = mi.Frame3f(axis).to_world(cap)
         side = dr.mulsign(mi.Float(1), u.x - 0.5)
         flat = mi.warp.square_to_cosine_hemisphere(mi.Point2f(dr.abs(2 * u.x - 1), u.y))
-        cosine = mi.Frame3f(normal).to_world(flat) * side
-        return mi.Vector3f(dr.select(outside, in_cone, cosine))
+        by_cosine = mi.Frame3f(normal).to_world(flat) * side
+        return mi.Vector3f(dr.select(outside, in_cone, by_cosine))
 
     def pdf(self, position: Any, normal: Any, direction: Any) -> Any:
         """Return the density (Float, per steradian) with which `sample` draws a direction."""
@@ -194,13 +198,6 @@ class EmissionCone:
         height = sine_sq / (1 + dr.safe_sqrt(1 - sine_sq))  # no cancellation
         outside = sine_sq < 1
         return mi.Vector3f(to_centre * dr.rsqrt(distance_sq)), height, outside
-
-
-def _cap(height: Any, u: Any) -> Any:
-    down = height * u.x
-    radius = dr.safe_sqrt(down * (2 - down))
-    sine, cosine = dr.sincos(2 * dr.pi * u.y)
-    return mi.Vector3f(radius * cosine, radius * sine, 1 - down)
 
 
 _TINY = 1e-30

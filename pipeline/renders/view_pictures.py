@@ -186,13 +186,6 @@ def representable(radiance_rgb: NDArray[np.float32]) -> NDArray[np.float32]:
     return radiance_rgb
 
 
-def stands_out(denoised: Any, raw: Any, standard_error: Any, error_around: Any) -> Any:
-    """Return where the raw grey values are right, by their standard errors and the neighbours'."""
-    bright = (raw - denoised > STANDARD_ERRORS * standard_error) & (raw > STANDS_OUT * denoised)
-    dark = (denoised - raw > STANDARD_ERRORS * error_around) & (denoised > DARKER * raw)
-    return bright | dark
-
-
 def to_filter(pictures: Sequence[Any], names: Sequence[str]) -> Iterator[tuple[Any, str]]:
     """Yield the pictures that a denoiser is asked for, each with the name of its part.
 
