@@ -208,9 +208,8 @@ class DevicePictures(ViewPictures):
     def _denoise_raws(self, quality: Filtered, *, of_both: bool) -> Sequence[Any]:
         if quality == "off":
             return []
-        sums = self._sums
-        raws = _raws(KernelInputs(), sums, self._names, of_both, self._resolution)
-        pictures = range(sum(len(tracer) - 3 for tracer in sums[0]))
+        raws = _raws(KernelInputs(), self._sums, self._names, of_both, self._resolution)
+        pictures = range(sum(len(tracer) - 3 for tracer in self._sums[0]))
         guides = [self._guides[name] for _, name in to_filter(pictures, self._names)]
         return [denoise_arrays(raw, guides, self._resolution, quality) for raw in raws]
 

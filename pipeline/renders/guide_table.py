@@ -268,7 +268,10 @@ def learn(
     row_of_cell = np.zeros(len(cells.facing), np.int64)
     rows = np.zeros((1, BINS))
     for level in reversed(range(_LEVELS)):
-        group = _groups(cells, cells.size_m * 2**level)
+        # the number of each cell's cube and facing
+        cube = np.floor(cells.centres_m / (cells.size_m * 2**level)).astype(np.int64)
+        _, group = np.unique(np.column_stack([cube, cells.facing]), axis=0, return_inverse=True)
+        group = group.ravel()
         large_groups = np.flatnonzero(
             np.bincount(group[hit_cells], minlength=group.max() + 1) >= least
         )
@@ -295,13 +298,6 @@ def apportion_entries(shares: NDArray[np.float64]) -> NDArray[np.int64]:
     """Return shares [N, BINS] as whole numbers that add up to ENTRIES; each row of shares to 1."""
     edges = np.rint(np.cumsum(shares, axis=1) * ENTRIES).astype(np.int64)
     return np.diff(edges, axis=1, prepend=0)
-
-
-def _groups(cells: GuideCells, width_m: float) -> NDArray[np.int64]:
-    """Return for each cell the number of its cube and facing, [C]."""
-    cube = np.floor(cells.centres_m / width_m).astype(np.int64)
-    _, group = np.unique(np.column_stack([cube, cells.facing]), axis=0, return_inverse=True)
-    return group.ravel()
 
 
 def _shares(histograms: NDArray[np.float64]) -> NDArray[np.float64]:

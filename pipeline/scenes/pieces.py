@@ -418,8 +418,10 @@ def with_source_emission(
         emits: NDArray[np.bool_] = np.asarray(emission.any(axis=1))
         if not emits.any():
             continue
-        entry = _entry(piece.entry, taken)
-        taken.add(entry.name)
+        names = (f"{piece.entry.name}_light{number or ''}" for number in range(len(taken) + 1))
+        name = next(name for name in names if name not in taken)
+        taken.add(name)
+        entry = dataclasses.replace(piece.entry, name=name, kind="emitter")
         mesh = _part(plain[row], emits).mesh
         emitter = lamp_piece(entry, mesh, scale * emission[emits], reflected)
         if emits.all():
@@ -470,9 +472,3 @@ def _emission(piece: ScenePiece) -> NDArray[np.float32]:
 def _areas(piece: ScenePiece) -> NDArray[np.float64]:
     cross = face_crosses(piece.mesh.positions, piece.mesh.faces)
     return np.asarray(np.linalg.norm(cross, axis=1) / 2)
-
-
-def _entry(of: SceneObject, taken: set[str]) -> SceneObject:
-    names = (f"{of.name}_light{number or ''}" for number in range(len(taken) + 1))
-    name = next(name for name in names if name not in taken)
-    return dataclasses.replace(of, name=name, kind="emitter")
