@@ -176,8 +176,8 @@ class VectorTracer:
         """
         samples = self.pass_sum(camera)
         samples.add(seed=seed, spp=spp)
-        means = (samples.read() / spp).astype(np.float32)  # spp is a power of two: exact
-        return np.asarray(means.sum(axis=0))
+        means = [mi.Color3f(total / spp) for total in samples.sums[:-3]]  # a power of two: exact
+        return _picture(camera, sum(means))
 
     def pass_sum(self, camera: PixelCamera) -> "DeviceSum":
         self._landed.begin(camera)
