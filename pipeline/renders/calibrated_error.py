@@ -86,11 +86,6 @@ class MetricStatement:
     judged: Mapping[str, JudgedShare]
     """Records by width in pixels."""
 
-    def center_db(self, measures: ErrorMeasures, resolution: int, spp: float) -> float:
-        """Return the weighted mean in dB, without a shift."""
-        terms = terms_of(measures, resolution, spp)
-        return self.intercept + sum(self.weights[name] * terms[name] for name in terms)
-
 
 @dataclass(frozen=True, kw_only=True)
 class CalibratedStatement:
@@ -125,7 +120,9 @@ class CalibratedStatement:
         for name, measured in measures.items():
             metric = self.metrics[name]
             is_empty = name == "object" and not measured.hits
-            center_db = MAX_DB if is_empty else metric.center_db(measured, resolution, spp)
+            terms = terms_of(measured, resolution, spp)
+            mean_db = metric.intercept + sum(metric.weights[each] * terms[each] for each in terms)
+            center_db = MAX_DB if is_empty else mean_db
             for result, shifts in ((bound, metric.bound), (expected, metric.expected)):
                 shift_db = 0.0 if is_empty else shifts[group]
                 result[_FIELDS[name]] = min(MAX_DB, center_db + shift_db)
@@ -136,15 +133,15 @@ OUTSIDE = "other samples, widths, filters, layers or versions than measured, or 
 """Reasons for the bound of noise_floor, for people."""
 
 
-def promise_sentence(resolution: int, metric: str = "log") -> str:
-    """Return what a stated error promises at a width, as measured on other scenes; in a sentence.
+def promise_sentence(resolution: int) -> str:
+    """Return what a stated log error promises at a width, as measured on other scenes; a sentence.
 
     The width is the next one below that was judged, or the smallest.
     """
     statement = load_statement()
     if statement is None:
         return f"The stated error is a bound ({OUTSIDE})."
-    judged = statement.metrics[metric].judged
+    judged = statement.metrics["log"].judged
     widths = sorted(map(int, judged))
     width = max((px for px in widths if px <= resolution), default=widths[0])
     record = judged[str(width)]
