@@ -22,9 +22,10 @@ from pipeline.exchange.textured_triangles import (
     SceneParts,
     TexturedTriangles,
     build_lamp,
+    octahedron,
     rigid_pose,
+    sum_area,
 )
-from pipeline.exchange.usd.foreign_lights import octahedron, sum_area
 from pipeline.foreign.gltf.document import GltfDocument, refuse_malformed
 from pipeline.foreign.gltf.materials import DEFAULT, GltfMaterials
 from pipeline.foreign.gltf.nodes import PlacedNode, entry, extension, placed_nodes

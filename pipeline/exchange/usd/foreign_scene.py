@@ -12,6 +12,7 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
+from pxr import UsdGeom
 
 from pipeline.exchange.from_description import SMOOTH_ANGLE_DEG
 from pipeline.exchange.part_materials import Part, PartConverter, drop_empty, unit_normals
@@ -77,8 +78,6 @@ def _smooth(positions: NDArray[np.float32], cut: CutMesh) -> NDArray[np.float32]
 
 
 def _stated_normals(prim: Any, time: Any) -> tuple[NDArray[np.float64], str] | None:
-    from pxr import UsdGeom
-
     mesh = UsdGeom.Mesh(prim)
     if not mesh:
         return None
@@ -191,8 +190,6 @@ class StageReader:
 
     def _read_camera(self, placed: PlacedPrim) -> tuple[NDArray[np.float64], float] | None:
         """Return pose [4, 4] and full angle in degrees of a camera; None for an unusable one."""
-        from pxr import UsdGeom
-
         time = self._time
         camera = UsdGeom.Camera(placed.prim)
         lens = (

@@ -13,6 +13,7 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
+from pxr import UsdShade
 
 from pipeline.exchange.pictures import MAX_BYTES
 from pipeline.exchange.textured_triangles import (
@@ -162,8 +163,6 @@ class HeldMaterial:
         Blender writes no specular albedo: the exact one is taken, or the texture that the roughness
         of the absent coat still refers to.
         """
-        from pxr import UsdShade
-
         textures = dict(stated.textures)
         constants = {**stated.constants, **_WORKFLOW}
         if stated.has_strength and "emissiveColor" not in {*stated.textures, *stated.primvars}:

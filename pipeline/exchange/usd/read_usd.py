@@ -18,6 +18,7 @@ from typing import Any, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
+from pxr import Usd
 
 from pipeline.exchange.pictures import MAX_BYTES
 from pipeline.exchange.textured_triangles import MAX_ROWS, LoadedScene
@@ -97,8 +98,6 @@ def _read_file(path: Path, read: Callable[[], Read]) -> Read:
 
 
 def _read(opened: OpenedStage, key: str | None) -> LoadedScene:
-    from pxr import Usd
-
     shard = _scene_keys(opened.root)
     if shard is not None:
         return _read_shard_scene(opened, shard, key or shard[0])
@@ -144,8 +143,6 @@ def _keys(opened: OpenedStage) -> list[str]:
 
 def _frames(stage: Any) -> Iterator[str]:
     """Yield the time codes of an animated stage: its frames, or else its samples."""
-    from pxr import Usd
-
     if len({t for layer in stage.GetUsedLayers() for t in layer.ListAllTimeSamples()}) < 2:
         return
     if not stage.HasAuthoredTimeCodeRange():

@@ -17,6 +17,7 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
+from pxr import Usd
 
 from pipeline.foreign.limits import ReadLimits
 from pipeline.foreign.material_files import MaterialFiles
@@ -280,8 +281,6 @@ def _reject_errors(path: Path) -> Iterator[None]:
 
 
 def _read_stage(path: Path, limits: ReadLimits) -> UsdStage:
-    from pxr import Usd
-
     opened = OpenedStage(path, max_file_bytes=limits.max_bytes)
     stage = opened.compose()
     time = Usd.TimeCode.EarliestTime()

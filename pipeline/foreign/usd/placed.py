@@ -13,6 +13,7 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
+from pxr import Usd, UsdGeom, UsdSkel, Vt
 
 from pipeline.foreign.numbers import FINITE, read_number
 from storage.errors import TrilightError
@@ -45,8 +46,6 @@ class BoundSkin:
         Raises:
             UnposedMesh: joints, weights and points contradict each other.
         """
-        from pxr import UsdGeom, Vt
-
         points = Vt.Vec3fArray(stated)
         if self.binding.HasBlendShapes():
             _blend_shapes(self.skeleton, self.binding, prim, points, time)
@@ -64,8 +63,6 @@ class BoundSkin:
 
 def bind_skins(prim: Any, predicate: Any, cache: Any) -> dict[Any, BoundSkin]:
     """Return the skins that a SkelRoot binds below it, by the paths of their meshes."""
-    from pxr import UsdSkel
-
     root = UsdSkel.Root(prim)
     cache.Populate(root, predicate)
     return {
@@ -106,8 +103,6 @@ def find_skin(skins: Mapping[Any, BoundSkin], prim: Any) -> BoundSkin | None:
 
 def _blend_shapes(skeleton: Any, binding: Any, prim: Any, points: Any, time: Any) -> None:
     """Deform points in place by the blend shapes of an animation, if there is one."""
-    from pxr import UsdSkel
-
     animation = skeleton.GetAnimQuery() if skeleton else None
     weights = animation.ComputeBlendShapeWeights(time) if animation else None
     if not weights:
@@ -159,8 +154,6 @@ def placed_prims(
         TrilightError: more than MAX_PLACED prims with all instances, prims or prototypes that are
             nested more than MAX_NESTED deep, a transform that is not finite, or UnposedMesh.
     """
-    from pxr import UsdGeom, UsdSkel
-
     placed: list[PlacedPrim] = []
     unread = Counter[str]()
     known: dict[Any, list[str]] = {}
@@ -201,8 +194,6 @@ def placed_prims(
 
 def _stage_to_world(stage: Any, meters_per_unit: float) -> NDArray[np.float64]:
     """Return the matrix [4, 4] from a stage's units and up axis to meters with +Z up."""
-    from pxr import UsdGeom
-
     base = np.diag([meters_per_unit, meters_per_unit, meters_per_unit, 1.0])
     if UsdGeom.GetStageUpAxis(stage) == UsdGeom.Tokens.y:
         base[:3, :3] = meters_per_unit * np.array([[1, 0, 0], [0, 0, -1], [0, 1, 0]])
@@ -227,8 +218,6 @@ def _visit_prims(
     stage: Any, base: NDArray[np.float64], time: Any, lost: list[str]
 ) -> Iterator[_Visit]:
     """Yield the visible prims of a stage with world transforms, in the order of the tree."""
-    from pxr import Usd, UsdGeom
-
     root = _Visit(
         prim=stage.GetPseudoRoot(),
         to_world=base,
@@ -270,8 +259,6 @@ def _visit_children(above: _Visit) -> Iterator[_Visit]:
 
 def _inherit_purpose(above: _Visit, imageable: Any, time: Any) -> _Visit:
     """Return a visit with the prim's authored purpose, if any, which its children inherit."""
-    from pxr import UsdGeom
-
     if not imageable:
         return above
     purpose = imageable.GetPurposeAttr()
@@ -284,8 +271,6 @@ def _inherit_purpose(above: _Visit, imageable: Any, time: Any) -> _Visit:
 
 
 def _compute_world(visit: _Visit, time: Any) -> NDArray[np.float64]:
-    from pxr import UsdGeom
-
     move = UsdGeom.Xformable(visit.prim)
     if not move:
         return visit.to_world
@@ -295,8 +280,6 @@ def _compute_world(visit: _Visit, time: Any) -> NDArray[np.float64]:
 
 
 def _visit_instances(above: _Visit, time: Any, lost: list[str]) -> Iterator[_Visit]:
-    from pxr import Usd, UsdGeom
-
     prim = above.prim
     instancer = UsdGeom.PointInstancer(prim)
     targets = instancer.GetPrototypesRel().GetForwardedTargets()

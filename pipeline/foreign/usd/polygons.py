@@ -12,6 +12,7 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
+from pxr import UsdGeom
 
 from pipeline.foreign.numbers import read_number
 from pipeline.foreign.polygons import triangulate
@@ -80,8 +81,6 @@ class CutMesh:
 
         None where there is none, or not for every corner.
         """
-        from pxr import UsdGeom
-
         primvar = UsdGeom.PrimvarsAPI(self.prim).FindPrimvarWithInheritance(name)
         if not primvar or not primvar.HasValue():
             return None
@@ -125,8 +124,6 @@ def cut_mesh(placed: PlacedPrim, time: Any, max_faces: int | None = None) -> Cut
         Rejected: too_many_faces.
         TrilightError: its arrays contradict each other, or are not finite.
     """
-    from pxr import UsdGeom
-
     prim = placed.prim
     holes = as_array(None, np.int64, (-1,))
     if prim.GetTypeName() in SOLIDS:
@@ -262,8 +259,6 @@ def _revolve(profile: NDArray[np.float64]) -> tuple[NDArray[np.float64], list[li
 
 
 def _read_tetrahedra(prim: Any, time: Any) -> Polygons:
-    from pxr import UsdGeom
-
     mesh = UsdGeom.TetMesh(prim)
     faces = mesh.GetSurfaceFaceVertexIndicesAttr().Get(time)
     if not faces:

@@ -10,6 +10,7 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
+from pxr import UsdShade
 
 from pipeline.foreign.usd.polygons import CutMesh, as_array
 from pipeline.foreign.usd.stage import OpenedStage
@@ -170,8 +171,6 @@ def read_bindings(prim: Any, time: Any) -> Iterator[tuple[Any, NDArray[np.int64]
     The binding for full rendering, or else that for previews, counts if its shader is supported.
     Later subsets override earlier ones.
     """
-    from pxr import UsdShade
-
     yield _find_material(prim), None
     for subset in UsdShade.MaterialBindingAPI(prim).GetMaterialBindSubsets():
         bound = _find_material(subset.GetPrim())
@@ -180,8 +179,6 @@ def read_bindings(prim: Any, time: Any) -> Iterator[tuple[Any, NDArray[np.int64]
 
 
 def _find_material(prim: Any) -> Any:
-    from pxr import UsdShade
-
     first = None
     for purpose in (UsdShade.Tokens.full, UsdShade.Tokens.preview):
         material = UsdShade.MaterialBindingAPI(prim).ComputeBoundMaterial(purpose)[0]
@@ -275,8 +272,6 @@ class _Reader:
 
     def read_connection(self, name: str) -> None:
         """Store the texture or the primvar that an input is connected to."""
-        from pxr import UsdShade
-
         sources = self._sources(name)
         if not sources or not is_output(sources[0]):
             return
@@ -293,8 +288,6 @@ class _Reader:
 
     def read_normal_map(self) -> None:
         """Store the texture of the normal; other connections stay unsupported."""
-        from pxr import UsdShade
-
         sources = find_sources(self._shader, "normal")
         if self._shader.GetShaderId() != PREVIEW or not sources or not is_output(sources[0]):
             return

@@ -26,6 +26,8 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import Any, NoReturn
 
+from pxr import Ar, Pcp, Sdf, Tf, Usd, UsdUtils
+
 from pipeline.foreign.numbers import Malformed
 from storage.errors import TrilightError
 
@@ -48,8 +50,6 @@ def file_and_member(name: str) -> tuple[Path, str]:
 
     Brackets in folder names do not count: only those at the end of `a.usdz[b.usda]` hold a member.
     """
-    from pxr import Ar
-
     outer, member = Ar.SplitPackageRelativePathOuter(name)
     return Path(outer), str(member)
 
@@ -74,8 +74,6 @@ class OpenedStage:
         Raises:
             TrilightError: not a readable USD file, or larger than it may be.
         """
-        from pxr import Ar
-
         self.path = path.resolve()
         self.folder = (folder or self.path.parent).resolve()
         self.lost: list[str] = []
@@ -112,8 +110,6 @@ class OpenedStage:
             OutsideFile: it is on the network, outside of the folder, no plain file, or named by a
                 variable expression.
         """
-        from pxr import Ar, Sdf
-
         plain, arguments = Sdf.Layer.SplitIdentifier(asset_path)
         if arguments:
             self._refuse(plain, " with arguments for its file format; expected a name alone")
@@ -145,8 +141,6 @@ class OpenedStage:
             TrilightError: a file outside, the network, value clips, a circle, or too much of
                 something.
         """
-        from pxr import Usd
-
         self._open_all()
         for error in composition_errors(self.root, self._context, self.path.name):
             self._note_error(error)
@@ -187,8 +181,6 @@ class OpenedStage:
 
     def _note_error(self, error: Any) -> None:
         """Note an error of composition; raises TrilightError for one that makes it unreadable."""
-        from pxr import Pcp
-
         if isinstance(error, Pcp.ErrorInvalidAssetPath | Pcp.ErrorInvalidSublayerPath):
             return  # noted by `_named_layer`
         site = re.search(r"<[^<>]*>$", str(error.rootSite))
@@ -201,8 +193,6 @@ class OpenedStage:
 
     def _named_layer(self, anchor: Any, asset_path: str) -> Any:
         """Return the layer that another one names, or None with a note where it is missing."""
-        from pxr import Sdf
-
         resolved = self.resolve(anchor, asset_path)
         if resolved is None or Sdf.FileFormat.FindByExtension(resolved) is None:
             why = "is missing" if resolved is None else "is no USD file"
@@ -222,8 +212,6 @@ class OpenedStage:
         raise OutsideFile(f"{self.path.name}: names {named!r:.100}{why}.")
 
     def _open(self, resolved: str) -> Any:
-        from pxr import Sdf, Tf
-
         if resolved in self._layers:
             return self._layers[resolved]
         if len(self._layers) >= MAX_LAYERS:
@@ -283,8 +271,6 @@ def read_quietly(path: Path) -> Iterator[None]:
     Raises:
         TrilightError: as the block, or the file is broken or has a value of a wrong type.
     """
-    from pxr import Tf, UsdUtils
-
     delegate = UsdUtils.CoalescingDiagnosticDelegate()
     try:
         yield
@@ -332,8 +318,6 @@ def composition_errors(root: Any, context: Any, name: str) -> Sequence[Any]:
     Raises:
         TrilightError: too many prims, nested too deep, or not composed in time.
     """
-    from pxr import Pcp, Sdf
-
     cache = Pcp.Cache(Pcp.LayerStackIdentifier(root, None, context), "usd", True)
     _, errors = cache.ComputeLayerStack(cache.GetLayerStackIdentifier())
     waiting = [Sdf.Path.absoluteRootPath]

@@ -7,6 +7,7 @@ from typing import Any, cast, get_args
 
 import numpy as np
 from numpy.typing import NDArray
+from pxr import Gf, Usd, UsdShade, Vt
 
 from pipeline.foreign.numbers import Malformed, read_number, read_numbers
 from pipeline.foreign.picture import Wrap
@@ -101,8 +102,6 @@ def read_texture_node(shader: Any, output: str, time: Any, opened: OpenedStage) 
 
 def read_chart(shader: Any, time: Any, lost: list[str]) -> UvChart:
     """Return the texture coordinates of a shader; `st` where it states none."""
-    from pxr import UsdShade
-
     sources = find_sources(shader, "st")
     moves: list[tuple[NDArray[np.float64], tuple[float, ...]]] = []
     primvar = "st"
@@ -165,16 +164,12 @@ def _require_size(size: int, max_bytes: int, name: str) -> None:
 
 def find_sources(shader: Any, name: str) -> Any:
     """Return the attributes that produce the value of a shader's input, its material's included."""
-    from pxr import UsdShade
-
     stated = shader.GetInput(name)
     return UsdShade.Utils.GetValueProducingAttributes(stated) if stated else []
 
 
 def is_output(attribute: Any) -> bool:
     """Return whether an attribute is the output of another node."""
-    from pxr import UsdShade
-
     return bool(UsdShade.Output.IsOutput(attribute))
 
 
@@ -200,8 +195,6 @@ def convert_to_rec709(attribute: Any, stated: NDArray) -> NDArray:
 
     Colors without a space, and those declared as data, stay as they are.
     """
-    from pxr import Gf, Usd, Vt
-
     is_color = attribute.GetTypeName().scalarType.role == "Color" and stated.shape[-1:] != ()
     space = Usd.ColorSpaceAPI.ComputeColorSpace(attribute, None) if is_color else None
     ours = Gf.ColorSpace(Gf.ColorSpaceNames.LinearRec709)
