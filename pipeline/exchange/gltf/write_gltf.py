@@ -7,7 +7,9 @@ at every angle, as in Trilight; the tint gives the other channels. The base colo
 diffuse / (1 - F). Lamps are surfaces that emit (KHR_materials_emissive_strength).
 """
 
+import itertools
 import json
+import operator
 import struct
 from collections.abc import Mapping
 from pathlib import Path
@@ -67,14 +69,13 @@ def write_gltf(path: Path, scene: Scene) -> tuple[str, ...]:
 def encode_scene_glb(scene: Scene) -> bytes:
     """Return a scene as the bytes of a GLB file; its environment and rights are left out."""
     file = GlbFile()
-    parts = group_triangles(scene)
     nodes: list[dict[str, Any]] = [{"rotation": list(_TO_Y_UP), "children": []}]
     meshes = list[dict[str, Any]]()
-    for row, entry in enumerate(scene.objects):
-        primitives = [_scene_primitive(file, scene, *part[1:]) for part in parts if part[0] == row]
-        if primitives:
-            nodes.append({"name": entry.name, "mesh": len(meshes)})
-            meshes.append({"name": entry.name, "primitives": primitives})
+    for row, parts in itertools.groupby(group_triangles(scene), key=operator.itemgetter(0)):
+        name = scene.objects[row].name
+        nodes.append({"name": name, "mesh": len(meshes)})
+        primitives = [_scene_primitive(file, scene, *part[1:]) for part in parts]
+        meshes.append({"name": name, "primitives": primitives})
     cameras = []
     for view, (c2w, fov_deg) in enumerate(zip(scene.c2w, scene.fov_deg, strict=True)):
         matrix = c2w.T.astype(float).reshape(-1).tolist()  # column by column

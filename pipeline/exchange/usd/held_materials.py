@@ -36,8 +36,8 @@ from pipeline.exchange.usd.write_materials import (
 from pipeline.foreign.usd.shaders import (
     DEFAULTS,
     IOR_OF_CONSTANT_ALBEDOS,
+    ShaderReader,
     StatedMaterial,
-    note_unsupported,
     parse_color,
     reflect_head_on,
     surface_shader,
@@ -274,8 +274,9 @@ class HeldMaterial:
         node = textures[name]
         is_used_alike = all(
             each.wrap == ("repeat", "repeat")
-            and each.chart.primvar == node.chart.primvar
-            and not each.chart.is_moved
+            and each.primvar == node.primvar
+            and (each.uv_matrix == np.eye(2)).all()
+            and not each.uv_offset.any()
             and (each.scale == 1).all()
             and not each.bias.any()
             for each in textures.values()
@@ -328,7 +329,8 @@ def _read_openpbr(material: Any, time: Any, opened: OpenedStage) -> dict[str, ND
             opened.lost.append(f"{shader.GetPath()}.{name}: no finite constant; it is not read")
         else:
             values[name] = value
-    note_unsupported(shader, time, opened, ("specular_weight", "specular_color"))
+    reader = ShaderReader(shader, time, opened)
+    reader.note_unsupported(("specular_weight", "specular_color"))
     return _multiply(values)
 
 

@@ -104,7 +104,7 @@ class MeshMaterials:
         """
         stated_materials = self.stage.materials
         nodes = [node for stated in stated_materials for node in stated.textures.values()]
-        self.primvars = list(dict.fromkeys(node.chart.primvar for node in nodes))
+        self.primvars = list(dict.fromkeys(node.primvar for node in nodes))
         """Names of the sets of texture coordinates, by the numbers in slots."""
         self.materials = [self._convert(stated) for stated in stated_materials]
         """Materials by row; those of primvars are added when they are met."""
@@ -256,24 +256,20 @@ class MeshMaterials:
         if node.color_space not in ("sRGB", "raw"):
             is_srgb = has_colors(self.stage.pictures.require(node.resolved or node.named))
         channel = _CHANNELS[node.output]
+        channels = [channel] * 3 + [3] if is_grey else [0, 1, 2, 3]
         if is_grey:
-            values = np.ascontiguousarray(values[..., [channel] * 3 + [3]])
+            values = np.ascontiguousarray(values[..., channels])
             is_srgb = is_srgb and channel != 3
         picture = Picture(values=values, is_srgb=is_srgb, wrap=node.wrap)
         if (node.scale != 1).any() or node.bias.any():
-            scale = node.scale
-            bias = node.bias
-            if is_grey:
-                scale = scale[[channel] * 3 + [3]]
-                bias = bias[[channel] * 3 + [3]]
-            picture = _scale_picture(picture, scale, bias)
+            picture = _scale_picture(picture, node.scale[channels], node.bias[channels])
             if self.notes is not None and picture.values[..., :3].max() > 1:
                 self.notes.append(f"{where}: texels above 1 are clamped, but for emission")
         return Slot(
             picture=picture,
-            uv_set=self.primvars.index(node.chart.primvar),
-            uv_matrix=node.chart.matrix,
-            uv_offset=node.chart.offset,
+            uv_set=self.primvars.index(node.primvar),
+            uv_matrix=node.uv_matrix,
+            uv_offset=node.uv_offset,
             channel=channel,
         )
 

@@ -159,15 +159,13 @@ def placed_prims(
     known: dict[Any, list[str]] = {}
     skins: dict[Any, BoundSkin] = {}
     skeletons = UsdSkel.Cache()
-    visits = 0
     above_zero = Within(0, FINITE.high, low_open=True)
     meters_per_unit = read_number(UsdGeom.GetStageMetersPerUnit(stage), "metersPerUnit", above_zero)
-    for visit in _visit_prims(stage, _stage_to_world(stage, meters_per_unit), time, lost):
-        visits += 1
-        if visits > MAX_PLACED:
+    visits = _visit_prims(stage, _stage_to_world(stage, meters_per_unit), time, lost)
+    for number, visit in enumerate(visits):
+        if number >= MAX_PLACED:
             raise TrilightError(f"more than {MAX_PLACED} prims with all instances.")
         prim = visit.prim
-        to_world = visit.to_world
         kind = str(prim.GetTypeName())
         path = prim.GetPath()
         if path not in known:  # instances of one prototype have one path
@@ -176,15 +174,14 @@ def placed_prims(
                 skins |= bind_skins(prim, visit.predicate, skeletons)
         unread.update(known[path])
         if kind in kinds:
-            if not np.isfinite(to_world).all():
-                raise TrilightError(f"{prim.GetPath()}: its place is not finite.")
-            skin = find_skin(skins, prim)
+            if not np.isfinite(visit.to_world).all():
+                raise TrilightError(f"{path}: its place is not finite.")
             placed.append(
                 PlacedPrim(
                     prim=prim,
-                    to_world=to_world,
+                    to_world=visit.to_world,
                     meters_per_unit=meters_per_unit,
-                    skin=skin,
+                    skin=find_skin(skins, prim),
                     lost=lost,
                 )
             )

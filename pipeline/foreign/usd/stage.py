@@ -39,6 +39,14 @@ MAX_NOTES = 40
 MAX_MEMBERS = 10_000
 """Maximum number of members in a usdz archive."""
 
+MAX_PRIMS = 500_000
+"""Maximum number of composed prims; instances of one prototype count once."""
+MAX_DEPTH = 150
+"""Maximum nesting of prims."""
+MAX_COMPOSITION_S = 20.0
+"""Maximum CPU seconds for all prims: 500,000 of few arcs each take 4 to 10; chains of thousands of
+references, or prims of thousands of sites, take hours."""
+
 _LOOKS = (".mtlx",)
 """Suffixes of files that hold materials only; a stage is complete in shape without them."""
 
@@ -142,7 +150,7 @@ class OpenedStage:
                 something.
         """
         self._open_all()
-        for error in composition_errors(self.root, self._context, self.path.name):
+        for error in self._compose_prims():
             self._note_error(error)
         stage = Usd.Stage.Open(self.root, self._context, Usd.Stage.LoadAll)
         for layer in stage.GetUsedLayers():
@@ -177,6 +185,52 @@ class OpenedStage:
         if clipped:
             raise TrilightError(
                 f"{self.path.name}: {clipped[0]} uses value clips, which are not read; bake them."
+            )
+
+    def _compose_prims(self) -> Sequence[Any]:
+        """Compose all prims, payloads too, and return USD's errors; every file must be open.
+
+        Raises:
+            TrilightError: too many prims, nested too deep, or not composed in time.
+        """
+        cache = Pcp.Cache(Pcp.LayerStackIdentifier(self.root, None, self._context), "usd", True)
+        _, errors = cache.ComputeLayerStack(cache.GetLayerStackIdentifier())
+        waiting = [Sdf.Path.absoluteRootPath]
+        prototypes = set()
+        num_prims = 0
+        start_s = time.process_time()
+        while waiting:
+            path = waiting.pop()
+            num_prims += 1
+            self._require_bounds(path, num_prims, time.process_time() - start_s)
+            index, prim_errors = cache.ComputePrimIndex(path)
+            if index.hasAnyPayloads:
+                cache.RequestPayloads([path], [])
+                index, prim_errors = cache.ComputePrimIndex(path)
+            errors += prim_errors
+            if index.IsInstanceable():
+                prototype = Pcp.InstanceKey(index)
+                if prototype in prototypes:
+                    continue
+                prototypes.add(prototype)
+            children, _ = index.ComputePrimChildNames()
+            waiting += [path.AppendChild(child) for child in children]
+        return errors
+
+    def _require_bounds(self, path: Any, num_prims: int, elapsed_s: float) -> None:
+        name = self.path.name
+        if num_prims > MAX_PRIMS:
+            raise TrilightError(
+                f"{name}: composes more than {MAX_PRIMS} prims, the most that is read."
+            )
+        if path.pathElementCount > MAX_DEPTH:
+            raise TrilightError(
+                f"{name}: prims are nested more than {MAX_DEPTH} deep ({str(path)[:60]}...)."
+            )
+        if elapsed_s > MAX_COMPOSITION_S:
+            raise TrilightError(
+                f"{name}: {num_prims} prims took {elapsed_s:.0f} processor seconds to compose and "
+                f"more follow; expected all within {MAX_COMPOSITION_S:.0f}. Flatten the stage."
             )
 
     def _note_error(self, error: Any) -> None:
@@ -296,62 +350,3 @@ def _find_line(error: Exception) -> str:
     except UnicodeDecodeError:  # the message cites bytes of the file
         line = None
     return f" from line {line[1]} on" if line else ""
-
-
-MAX_PRIMS = 500_000
-"""Maximum number of composed prims; instances of one prototype count once."""
-MAX_DEPTH = 150
-"""Maximum nesting of prims."""
-MAX_COMPOSITION_S = 20.0
-"""Maximum CPU seconds for all prims: 500,000 of few arcs each take 4 to 10; chains of thousands of
-references, or prims of thousands of sites, take hours."""
-
-
-def composition_errors(root: Any, context: Any, name: str) -> Sequence[Any]:
-    """Compose all prims below a root layer, payloads too, and return USD's errors.
-
-    Args:
-        root: the layer; every file it names must have been checked (pipeline.foreign.usd.stage).
-        context: resolver context of the stage that will be opened.
-        name: name of the file, for messages.
-
-    Raises:
-        TrilightError: too many prims, nested too deep, or not composed in time.
-    """
-    cache = Pcp.Cache(Pcp.LayerStackIdentifier(root, None, context), "usd", True)
-    _, errors = cache.ComputeLayerStack(cache.GetLayerStackIdentifier())
-    waiting = [Sdf.Path.absoluteRootPath]
-    prototypes = set()
-    num_prims = 0
-    start_s = time.process_time()
-    while waiting:
-        path = waiting.pop()
-        num_prims += 1
-        _require_bounds(name, path, num_prims, time.process_time() - start_s)
-        index, prim_errors = cache.ComputePrimIndex(path)
-        if index.hasAnyPayloads:
-            cache.RequestPayloads([path], [])
-            index, prim_errors = cache.ComputePrimIndex(path)
-        errors += prim_errors
-        if index.IsInstanceable():
-            prototype = Pcp.InstanceKey(index)
-            if prototype in prototypes:
-                continue
-            prototypes.add(prototype)
-        children, _ = index.ComputePrimChildNames()
-        waiting += [path.AppendChild(child) for child in children]
-    return errors
-
-
-def _require_bounds(name: str, path: Any, num_prims: int, elapsed_s: float) -> None:
-    if num_prims > MAX_PRIMS:
-        raise TrilightError(f"{name}: composes more than {MAX_PRIMS} prims, the most that is read.")
-    if path.pathElementCount > MAX_DEPTH:
-        raise TrilightError(
-            f"{name}: prims are nested more than {MAX_DEPTH} deep ({str(path)[:60]}...)."
-        )
-    if elapsed_s > MAX_COMPOSITION_S:
-        raise TrilightError(
-            f"{name}: {num_prims} prims took {elapsed_s:.0f} processor seconds to compose and more "
-            f"follow; expected all within {MAX_COMPOSITION_S:.0f}. Flatten the stage."
-        )
