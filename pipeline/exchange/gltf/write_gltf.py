@@ -39,8 +39,6 @@ _TO_Y_UP = (-(0.5**0.5), 0.0, 0.0, 0.5**0.5)
 
 MOST_SPECULAR = 25.0
 """Specular factor of a mirror: 25 times the F0 = 0.04 of an ordinary dielectric."""
-_JSON = 0x4E4F534A
-_BIN = 0x004E4942
 _COMPONENTS = {"f": 5126, "u": 5125}
 """Component types of glTF accessors: float32, and unsigned 32-bit integers."""
 
@@ -243,8 +241,8 @@ class GlbFile:
         text = json.dumps(self.tree, sort_keys=True).encode()
         text += b" " * (-len(text) % 4)
         data = bytes(self._data) + bytes(-len(self._data) % 4)
-        chunks = struct.pack("<II", len(text), _JSON) + text
-        chunks += struct.pack("<II", len(data), _BIN) + data
+        chunks = struct.pack("<I4s", len(text), b"JSON") + text
+        chunks += struct.pack("<I4s", len(data), b"BIN\0") + data
         return struct.pack("<4sII", b"glTF", 2, 12 + len(chunks)) + chunks
 
     def _view(self, data: bytes) -> int:

@@ -293,7 +293,7 @@ class StageReader:
         def coordinates(number: int) -> NDArray[np.float64] | None:
             primvar = self._looks.primvars[number]
             uv = cut.read_coordinates(primvar, self._time)
-            if uv is None or not np.isfinite(uv).all():
+            if not np.isfinite(uv).all():
                 self._lost.append(f"{where}: no coordinates {primvar!r:.60}")
                 return None
             return uv[mask]

@@ -205,11 +205,6 @@ class HeldMaterial:
             name=self._where.rpartition("/")[2],
             where=self._where,
             constants={name: _fill(value) for name, value in constants.items()},
-            textures={},
-            primvars={},
-            has_strength=False,
-            lost=(),
-            has_networks=False,
         )
 
     def _find_exact(self, stated: StatedMaterial) -> tuple[StatedMaterial, dict[str, Texture]]:

@@ -9,12 +9,13 @@ errors of `_NOT_AS_WRITTEN` mean that a layer is not as export writes it.
 Only child processes with limits import this (pipeline.isolation): native code parses the file.
 """
 
+import contextlib
 import dataclasses
 import json
 from collections import defaultdict
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from pathlib import Path
-from typing import Any, TypeVar
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -55,8 +56,6 @@ from storage.records.scene import OBJECT_KINDS, Scene, SceneObject
 from storage.records.scene_file import scene_digest, scene_provenance
 from storage.records.texture import CONSTANT, TEXTURED, MapSource, Texture
 
-Read = TypeVar("Read")
-
 MAX_FRAMES = 10_000
 """Maximum number of scenes in a stage with time samples."""
 
@@ -67,7 +66,8 @@ def usd_keys(path: Path, folder: Path | None = None) -> list[str]:
     Raises:
         TrilightError: the file is unusable (pipeline.foreign.usd.stage).
     """
-    return _read_file(path, lambda: _keys(OpenedStage(path, folder)))
+    with _name_errors(path):
+        return _keys(OpenedStage(path, folder))
 
 
 def read_usd(path: Path, key: str | None = None, folder: Path | None = None) -> LoadedScene:
@@ -81,14 +81,16 @@ def read_usd(path: Path, key: str | None = None, folder: Path | None = None) -> 
     Raises:
         TrilightError: the file is unusable, lacks the scene, or a `Scene` cannot hold it.
     """
-    return _read_file(path, lambda: _read(OpenedStage(path, folder), key))
+    with _name_errors(path):
+        return _read(OpenedStage(path, folder), key)
 
 
-def _read_file(path: Path, read: Callable[[], Read]) -> Read:
-    """Return the result of `read` for a file, whose name begins every message."""
+@contextlib.contextmanager
+def _name_errors(path: Path) -> Iterator[None]:
+    """Begin every message on a file with its name."""
     try:
         with read_quietly(path):
-            return read()
+            yield
     except (TrilightError, Rejected) as error:
         message = error.message if isinstance(error, Rejected) else str(error)
         if isinstance(error, TrilightError) and message.startswith(path.name):

@@ -104,10 +104,6 @@ class GltfDocument:
             raise Malformed(f"indices are of type {elements.dtype} x {elements.shape[1]}")
         return elements[:, 0].astype(np.int64)
 
-    def count(self, index: Any) -> int:
-        """Return the number of values of an accessor."""
-        return read_count(entry(self.tree, "accessors", index), "count")
-
     def instances(self, placed: PlacedNode) -> NDArray[np.float64]:
         """Return the matrices [N, 4, 4] of all instances of a node's mesh."""
         attributes = extension(placed.node, INSTANCING).get("attributes", {})

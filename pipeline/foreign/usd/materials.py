@@ -69,11 +69,15 @@ def usd_textured_mesh(source: UsdSource, decode: Decode, *, emission: bool = Fal
     if (material == looks.plain).all() and (tint == _UNBOUND).all():
         raise Rejected("no_materials", "the stage has no materials and no display colors")
     sets = looks.primvars or ["st"]
+    uv = [
+        np.stack([cut.read_coordinates(name, time) for name in sets], axis=1)
+        for cut in cuts.values()
+    ]
     return TexturedMesh(
         mesh=source.mesh,
         material=material,
         materials=tuple(looks.materials),
-        uv=np.concatenate([cut.read_coordinate_sets(sets, time) for cut in cuts.values()]),
+        uv=np.concatenate(uv),
         color=None if (tint == 1).all() else tint,
     )
 

@@ -161,8 +161,14 @@ def placed_prims(
     skeletons = UsdSkel.Cache()
     above_zero = Within(0, FINITE.high, low_open=True)
     meters_per_unit = read_number(UsdGeom.GetStageMetersPerUnit(stage), "metersPerUnit", above_zero)
-    visits = _visit_prims(stage, _stage_to_world(stage, meters_per_unit), time, lost)
-    for number, visit in enumerate(visits):
+    base = _stage_to_world(stage, meters_per_unit)
+    root = _Visit(
+        prim=stage.GetPseudoRoot(),
+        to_world=base,
+        origin=base,
+        predicate=Usd.TraverseInstanceProxies(),
+    )
+    for number, visit in enumerate(_visit_below(_visit_children(root), time, lost)):
         if number >= MAX_PLACED:
             raise TrilightError(f"more than {MAX_PLACED} prims with all instances.")
         prim = visit.prim
@@ -203,32 +209,19 @@ class _Visit:
 
     prim: Any
     to_world: NDArray[np.float64]  # of its parent until its own transform is applied
-    origin: NDArray[
-        np.float64
-    ]  # start of `!resetXformStack!`: that of the stage, or of an instance
+    origin: NDArray[np.float64]  # start of `!resetXformStack!`: of the stage, or of an instance
     purpose: str = "default"
     is_render_shown: bool = True  # VisibilityAPI's answer for the purpose `render`
     predicate: Any = None  # selects the children to visit
 
 
-def _visit_prims(
-    stage: Any, base: NDArray[np.float64], time: Any, lost: list[str]
+def _visit_below(
+    visits: Iterator[_Visit], time: Any, lost: list[str], depth: int = 1
 ) -> Iterator[_Visit]:
-    """Yield the visible prims of a stage with world transforms, in the order of the tree."""
-    root = _Visit(
-        prim=stage.GetPseudoRoot(),
-        to_world=base,
-        origin=base,
-        predicate=Usd.TraverseInstanceProxies(),
-    )
-    levels = [_visit_children(root)]
-    while levels:
-        above = next(levels[-1], None)
-        if above is None:
-            levels.pop()
-            continue
+    """Yield the visible ones of prims and of all below them, placed, in the order of the tree."""
+    for above in visits:
         prim = above.prim
-        if len(levels) > MAX_NESTED:
+        if depth > MAX_NESTED:
             raise TrilightError(
                 f"{prim.GetPath()}: nested more than {MAX_NESTED} deep, prototypes counted."
             )
@@ -244,9 +237,8 @@ def _visit_prims(
             yield visit
         is_instancer = prim.IsA(UsdGeom.PointInstancer)
         if is_shown or not is_instancer:
-            levels.append(
-                _visit_instances(visit, time, lost) if is_instancer else _visit_children(visit)
-            )
+            below = _visit_instances(visit, time, lost) if is_instancer else _visit_children(visit)
+            yield from _visit_below(below, time, lost, depth + 1)
 
 
 def _visit_children(above: _Visit) -> Iterator[_Visit]:

@@ -97,21 +97,12 @@ class CutMesh:
             )
         return fitting
 
-    def read_coordinates(self, primvar: str, time: Any) -> NDArray[np.float64] | None:
-        """Return texture coordinates [T, 3, 2], perhaps not finite; None where one is missing."""
+    def read_coordinates(self, primvar: str, time: Any) -> NDArray[np.float64]:
+        """Return texture coordinates [T, 3, 2], perhaps not finite; NaN where one is missing."""
         values = self.read_primvar(primvar, time)
         if values is None or values.ndim != 3 or values.shape[2] < 2:
-            return None
+            return np.full((len(self.corners), 3, 2), np.nan)
         return np.asarray(values[..., :2], np.float64)
-
-    def read_coordinate_sets(self, primvars: Sequence[str], time: Any) -> NDArray[np.float64]:
-        """Return the values [T, S, 3, 2] of primvars at corners; NaN where there are none."""
-        uv = np.full((len(self.corners), len(primvars), 3, 2), np.nan)
-        for row, name in enumerate(primvars):
-            values = self.read_coordinates(name, time)
-            if values is not None:
-                uv[:, row] = values
-        return uv
 
 
 def cut_mesh(placed: PlacedPrim, time: Any, max_faces: int | None = None) -> CutMesh:

@@ -5,7 +5,7 @@ An input is a constant, a texture, or a primvar of the mesh.
 """
 
 from collections.abc import Collection, Iterator, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import Any
 
 import numpy as np
@@ -119,15 +119,15 @@ class StatedMaterial:
     """Path of its shader, for notes."""
     constants: Mapping[str, NDArray[np.float32]]
     """Values [3] of all inputs by name in UsdPreviewSurface; fallbacks for primvars."""
-    textures: Mapping[str, TextureNode]
+    textures: Mapping[str, TextureNode] = field(default_factory=dict)
     """Textures by name of the input; they override constants."""
-    primvars: Mapping[str, str]
+    primvars: Mapping[str, str] = field(default_factory=dict)
     """Names of primvars by name of the input; they override constants."""
-    has_strength: bool
+    has_strength: bool = False
     """True where emission is multiplied with `strength`."""
-    lost: tuple[str, ...]
+    lost: tuple[str, ...] = ()
     """Names of unsupported inputs that have an effect."""
-    has_networks: bool
+    has_networks: bool = False
     """True where nodes that are not read, or values that are not finite, feed an input."""
 
     @property
