@@ -133,18 +133,15 @@ def read_source(path: Path, limits: ReadLimits, root: Path | None = None) -> Sou
     _check_start(data, suffix, limits.max_faces)
     gltf: GltfDocument | None = None
     materials = MaterialFiles()
-    keep = limits.with_materials
+    bytes_left = limits.max_bytes - len(data)
     folder = SourceFolder(path.parent, root or path.parent)
     if suffix in (".glb", ".gltf"):
         gltf = open_gltf(data, suffix, folder, limits)
         materials = gltf.pictures
-    elif suffix in (".obj", ".ply") and keep:
-        bytes_left = limits.max_bytes - len(data)
-        if suffix == ".obj":
-            normal_maps = limits.with_normal_maps
-            materials = obj_files(data, folder, bytes_left, normal_maps=normal_maps)
-        else:
-            materials = folder.read_all(list_ply_pictures(data), bytes_left)
+    elif suffix == ".obj" and limits.with_materials:
+        materials = obj_files(data, folder, bytes_left, normal_maps=limits.with_normal_maps)
+    elif suffix == ".ply" and limits.with_materials:
+        materials = folder.read_all(list_ply_pictures(data), bytes_left)
     digest = hashlib.sha256(data)
     buffers = {} if gltf is None else gltf.buffers
     for files in (buffers, materials.data):

@@ -211,7 +211,6 @@ class GlbFile:
             "asset": {"version": "2.0", "generator": "trilight"},
             "scene": 0,
             "scenes": [{"nodes": [0]}],
-            "nodes": [{"mesh": 0}],
             "accessors": [],
             "bufferViews": [],
         }

@@ -48,6 +48,7 @@ from storage.records.exr import decode_exr
 from storage.records.material import (
     PUBLISHED_COLUMNS,
     UndeclaredColumn,
+    column_places,
     declared_column,
     default_rows,
     laid_out,
@@ -216,21 +217,19 @@ def _read_written_rows(opened: OpenedStage) -> dict[str, NDArray[np.float32]]:
     root = _find_root(opened.root, None)
     if root is None:
         return {}
-    try:
+    with contextlib.suppress(UndeclaredColumn, *_NOT_AS_WRITTEN):
         scene = _read_scene(root, opened)
         prims = _list_by_row(root.nameChildren["Materials"], layout.material_name)
         of_preview = scene.materials.copy()
+        places = column_places()
         for row, prim in enumerate(prims):
             inputs = prim.nameChildren[PREVIEW].attributes
-            for column, part in laid_out():
-                if column.name in PREVIEW_INPUTS:
-                    of_preview[row, part] = inputs[f"inputs:{PREVIEW_INPUTS[column.name]}"].default
+            for column, name in PREVIEW_INPUTS.items():
+                of_preview[row, places[column]] = inputs[f"inputs:{name}"].default
         for rows in (scene.materials, of_preview):
             digest = scene_digest(dataclasses.replace(scene, materials=rows))
             if digest == root.attributes[layout.DIGEST].default:
                 return {str(prim.path): rows[row] for row, prim in enumerate(prims)}
-    except (UndeclaredColumn, *_NOT_AS_WRITTEN):
-        pass
     return {}
 
 

@@ -185,7 +185,10 @@ class MeshMaterials:
         return np.array(rows, np.int64)[index.reshape(-1)]
 
     def _convert(self, stated: StatedMaterial) -> SourceMaterial:
-        is_lit = any(_glow(stated, "emissiveColor" in stated.textures))
+        glows = (
+            "emissiveColor" in stated.textures or _read_constant(stated, "emissiveColor").max() > 0
+        )
+        is_lit = glows and _read_strength(stated) > 0
         lost = name_unsupported(stated)
         if is_lit or "emissiveColor" in stated.primvars:
             lost = ("emission", *lost)
@@ -216,8 +219,9 @@ class MeshMaterials:
             slot = self._slot(stated, name)
             is_tint = slot is not None or (name in stated.primvars and name == "diffuseColor")
             value = np.ones(3) if is_tint else _read_constant(stated, name)
-            glow = name == "emissiveColor"
-            fields[factor] = _glow(stated, is_tint) if glow else _factor(name, value)
+            if name == "emissiveColor":
+                value = value.astype(float) * _read_strength(stated)
+            fields[factor] = _factor(name, value)
             fields[picture] = slot
         return dataclasses.replace(material, **fields)
 
@@ -319,14 +323,6 @@ def _factor(name: str, value: NDArray) -> float | RGB:
     if name not in _COLORS:
         return float(value[0])
     red, green, blue = np.maximum(value, 0).tolist()
-    return red, green, blue
-
-
-def _glow(stated: StatedMaterial, has_picture: bool) -> RGB:
-    """Return the emission, or the factor of its picture."""
-    strength = _read_strength(stated)
-    value = np.ones(3) if has_picture else _read_constant(stated, "emissiveColor")
-    red, green, blue = (strength * channel for channel in np.maximum(value, 0).tolist())
     return red, green, blue
 
 

@@ -11,7 +11,7 @@ import dataclasses
 import hashlib
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
-from functools import cached_property, partial
+from functools import cached_property
 from pathlib import Path
 from typing import Any
 
@@ -117,15 +117,6 @@ def read_stage_materials(stage: UsdStage, max_bytes: int, read: ReadMaterial) ->
     return StageMaterials(
         materials=tuple(materials), bindings=bindings, pictures=_read_pictures(nodes, max_bytes)
     )
-
-
-def _read_strictly(stage: UsdStage, material: Any, *, normals: bool) -> StatedMaterial:
-    """Return the inputs of a material; a shader that is not understood is refused."""
-    stated = read_material(material, stage.time, stage.opened, normals=normals)
-    if stated is None:
-        name = str(material.GetPath())
-        raise TrilightError(f"{name!r:.100} has no shader that is understood")
-    return stated
 
 
 def _drop_ior_texture(stage: UsdStage, stated: StatedMaterial) -> StatedMaterial:
@@ -257,7 +248,15 @@ class UsdSource:
         """
         if not self._limits.with_materials:
             return Rejected("no_materials", "materials were not asked for")
-        read = partial(_read_strictly, self.stage, normals=self._limits.with_normal_maps)
+
+        def read(material: Any) -> StatedMaterial:
+            normals = self._limits.with_normal_maps
+            stated = read_material(material, self.stage.time, self.stage.opened, normals=normals)
+            if stated is None:
+                name = str(material.GetPath())
+                raise TrilightError(f"{name!r:.100} has no shader that is understood")
+            return stated
+
         try:
             with _reject_errors(self._path):
                 return read_stage_materials(self.stage, bytes_left, read)
