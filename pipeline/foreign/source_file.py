@@ -95,7 +95,7 @@ class SourceFile:
     @property
     def unread(self) -> tuple[str, ...]:
         """Return sentences on contents of the file that were not read, each once."""
-        usd = () if self.usd is None else self.usd.stage.opened.notes
+        usd = () if self.usd is None else self.usd.opened.notes
         gltf = () if self.gltf is None else self.gltf.unread
         return tuple(dict.fromkeys((*usd, *gltf, *self.notes)))
 

@@ -33,7 +33,7 @@ from pipeline.exchange.usd.foreign_lights import (
 from pipeline.exchange.usd.held_materials import HeldMaterial, keep_exact, read_columns
 from pipeline.foreign.numbers import read_number
 from pipeline.foreign.usd.materials import MeshMaterials
-from pipeline.foreign.usd.object_source import UsdStage, read_stage_materials
+from pipeline.foreign.usd.object_source import read_stage_materials
 from pipeline.foreign.usd.placed import DOMES, SOLIDS, PlacedPrim, placed_prims
 from pipeline.foreign.usd.polygons import CutMesh, as_array, cut_mesh
 from pipeline.foreign.usd.shaders import StatedMaterial, read_material
@@ -109,11 +109,11 @@ class StageReader:
         stage: Any,
         time: Any,
         opened: OpenedStage,
-        written: Mapping[str, NDArray[np.float32]],
+        written: Mapping[str, Mapping[str, NDArray[np.float32]]],
     ) -> None:
         """Read all materials of a Usd.Stage; `opened.lost` receives notes on losses.
 
-        `written` has material rows as Trilight wrote them, by the paths of their prims, if known.
+        `written` has columns as Trilight wrote them, by the paths of materials, if known.
 
         Raises:
             Rejected: a picture is outside of the folder, or too large.
@@ -125,12 +125,11 @@ class StageReader:
         self._written = written
         self._converter = PartConverter(self._lost)
         self._placed = sorted(placed_prims(stage, time, self._lost), key=_read_row)
-        meshes = tuple(each for each in self._placed if each.prim.GetTypeName() in _MESHES)
-        usd_stage = UsdStage(opened=opened, composed=stage, meshes=meshes, time=time)
+        meshes = [each for each in self._placed if each.prim.GetTypeName() in _MESHES]
         # of each material: name of its prim, added columns, and exact columns if Trilight wrote it
         self._extras: list[tuple[str, dict[str, Any], dict[str, Texture] | None]] = []
         self._looks = MeshMaterials(
-            read_stage_materials(usd_stage, _MAX_PICTURE_BYTES, self._read),
+            read_stage_materials(meshes, time, _MAX_PICTURE_BYTES, self._read),
             lambda data, name: decode_values(data, name, self._lost),
             time,
             emission=True,

@@ -108,24 +108,21 @@ class HeldMaterial:
         self,
         material: Any,
         columns: Mapping[str, NDArray[np.float32]],
-        written: Mapping[str, NDArray[np.float32]],
+        written: Mapping[str, Mapping[str, NDArray[np.float32]]],
         time: Any,
         opened: OpenedStage,
     ) -> None:
         """Read the values of a UsdShade.Material, whose exact columns are known.
 
-        `written` has material rows as Trilight wrote them, by the paths of their prims, where
-        known; the notes of `opened` receive what is lost.
+        `written` has the columns as Trilight wrote them, by the paths of materials, where known;
+        the notes of `opened` receive what is lost.
         """
         prim = material.GetPrim()
-        row = written.get(str(prim.GetPath()))
         root = prim.GetParent().GetParent()
         self._where = str(prim.GetPath())
         self._shader = surface_shader(material)
         self._columns = columns
-        self._written = (
-            {} if row is None else {name: row[part] for name, part in column_places().items()}
-        )
+        self._written = written.get(self._where, {})
         self._time = time
         self._opened = opened
         self._maps: dict[str, tuple[str, MapSource]] = {}

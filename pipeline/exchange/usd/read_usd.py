@@ -119,7 +119,7 @@ def _read(opened: OpenedStage, key: str | None) -> LoadedScene:
     if frames and key is None:
         opened.lost.append(f"time codes other than {chosen} of {len(frames)}")
     time = Usd.TimeCode(float(chosen)) if chosen else Usd.TimeCode.EarliestTime()
-    scene = StageReader(stage, time, opened, _read_written_rows(opened)).scene()
+    scene = StageReader(stage, time, opened, _read_written_columns(opened)).scene()
     return LoadedScene(scene=scene, notes=opened.notes)
 
 
@@ -208,8 +208,8 @@ def _read_exact(opened: OpenedStage, key: str | None = None) -> Scene | None:
         return None
 
 
-def _read_written_rows(opened: OpenedStage) -> dict[str, NDArray[np.float32]]:
-    """Return the material rows that Trilight wrote, by the paths of their prims; else none.
+def _read_written_columns(opened: OpenedStage) -> dict[str, dict[str, NDArray[np.float32]]]:
+    """Return the columns that Trilight wrote, by the paths of materials; else none.
 
     The digest of the scene tells whether the attributes still are what was written, or the preview
     shaders. It cannot where the meshes were changed too.
@@ -229,7 +229,10 @@ def _read_written_rows(opened: OpenedStage) -> dict[str, NDArray[np.float32]]:
         for rows in (scene.materials, of_preview):
             digest = scene_digest(dataclasses.replace(scene, materials=rows))
             if digest == root.attributes[layout.DIGEST].default:
-                return {str(prim.path): rows[row] for row, prim in enumerate(prims)}
+                return {
+                    str(prim.path): {name: rows[row, part] for name, part in places.items()}
+                    for row, prim in enumerate(prims)
+                }
     return {}
 
 

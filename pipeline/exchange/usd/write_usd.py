@@ -327,11 +327,11 @@ _PADDING_ID = 0x1986
 """Identifier of the extra field that aligns the bytes of a zip member; readers skip it."""
 
 
-def encode_usdz(layer: bytes, files: Mapping[str, bytes] | None = None) -> bytes:
+def encode_usdz(layer: bytes, files: Mapping[str, bytes]) -> bytes:
     """Return the `.usdz` archive of a `.usdc` layer and its files, without time stamps."""
     stream = io.BytesIO()
     with zipfile.ZipFile(stream, "w", zipfile.ZIP_STORED) as archive:
-        for name, data in {_LAYER_NAME: layer, **(files or {})}.items():
+        for name, data in {_LAYER_NAME: layer, **files}.items():
             entry = zipfile.ZipInfo(name, date_time=(1980, 1, 1, 0, 0, 0))
             begin = stream.tell() + _HEADER_BYTES + len(name)
             padding = -(begin + 4) % _ALIGNMENT

@@ -21,7 +21,7 @@ from pipeline.foreign.material import (
     with_normal_map,
 )
 from pipeline.foreign.picture import Decode, Picture, has_colors
-from pipeline.foreign.usd.object_source import StageMaterials, UsdSource, name_unsupported
+from pipeline.foreign.usd.object_source import TIME, StageMaterials, UsdSource, name_unsupported
 from pipeline.foreign.usd.polygons import CutMesh
 from pipeline.foreign.usd.shaders import (
     IOR_OF_CONSTANT_ALBEDOS,
@@ -57,8 +57,7 @@ def usd_textured_mesh(source: UsdSource, decode: Decode, *, emission: bool = Fal
         Rejected: no_materials, materials_unreadable, no_texture_coordinates, or as reading a
             picture.
     """
-    time = source.stage.time
-    looks = MeshMaterials(source.materials, decode, time, emission=emission)
+    looks = MeshMaterials(source.materials, decode, TIME, emission=emission)
     if len(looks.primvars) > MOST_UV_SETS:
         count = len(looks.primvars)
         raise Rejected("no_texture_coordinates", f"textures lie on {count} sets of them")
@@ -70,7 +69,7 @@ def usd_textured_mesh(source: UsdSource, decode: Decode, *, emission: bool = Fal
         raise Rejected("no_materials", "the stage has no materials and no display colors")
     sets = looks.primvars or ["st"]
     uv = [
-        np.stack([cut.read_coordinates(name, time) for name in sets], axis=1)
+        np.stack([cut.read_coordinates(name, TIME) for name in sets], axis=1)
         for cut in cuts.values()
     ]
     return TexturedMesh(

@@ -143,7 +143,7 @@ class OpenedStage:
         return resolved or None
 
     def compose(self) -> Any:
-        """Return the composed stage; all of its files have been checked.
+        """Return the composed stage; all of its files have been checked, and its prims stay valid.
 
         Raises:
             TrilightError: a file outside, the network, value clips, a circle, or too much of
@@ -152,7 +152,7 @@ class OpenedStage:
         self._open_all()
         for error in self._compose_prims():
             self._note_error(error)
-        stage = Usd.Stage.Open(self.root, self._context, Usd.Stage.LoadAll)
+        self._composed = stage = Usd.Stage.Open(self.root, self._context, Usd.Stage.LoadAll)
         for layer in stage.GetUsedLayers():
             real = file_and_member(layer.realPath)[0].resolve()
             if not layer.anonymous and not real.is_relative_to(self.folder):
