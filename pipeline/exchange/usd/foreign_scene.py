@@ -191,11 +191,8 @@ class StageReader:
         """Return pose [4, 4] and full angle in degrees of a camera; None for an unusable one."""
         time = self._time
         camera = UsdGeom.Camera(placed.prim)
-        lens = (
-            camera.GetFocalLengthAttr(),
-            camera.GetHorizontalApertureAttr(),
-            camera.GetVerticalApertureAttr(),
-        )
+        names = ("focalLength", "horizontalAperture", "verticalAperture")
+        lens = map(placed.prim.GetAttribute, names)
         focal, wide, high = (read_number(each.Get(time), str(each.GetPath())) for each in lens)
         pose = rigid_pose(placed.to_world)
         if camera.GetProjectionAttr().Get(time) != "perspective" or pose is None or not focal > 0:
