@@ -86,6 +86,11 @@ class MetricStatement:
     judged: Mapping[str, JudgedShare]
     """Records by width in pixels."""
 
+    def center_db(self, measures: ErrorMeasures, resolution: int, spp: float) -> float:
+        """Return the weighted mean in dB, without a shift."""
+        terms = terms_of(measures, resolution, spp)
+        return self.intercept + sum(self.weights[name] * terms[name] for name in terms)
+
 
 @dataclass(frozen=True, kw_only=True)
 class CalibratedStatement:
@@ -120,9 +125,7 @@ class CalibratedStatement:
         for name, measured in measures.items():
             metric = self.metrics[name]
             is_empty = name == "object" and not measured.hits
-            terms = terms_of(measured, resolution, spp)
-            mean_db = metric.intercept + sum(metric.weights[each] * terms[each] for each in terms)
-            center_db = MAX_DB if is_empty else mean_db
+            center_db = MAX_DB if is_empty else metric.center_db(measured, resolution, spp)
             for result, shifts in ((bound, metric.bound), (expected, metric.expected)):
                 shift_db = 0.0 if is_empty else shifts[group]
                 result[_FIELDS[name]] = min(MAX_DB, center_db + shift_db)
