@@ -323,15 +323,11 @@ def test_a_manifest_that_is_not_there_is_named(server: Site) -> None:
         open_dataset("http://127.0.0.1:1/data")
 
 
-def patience(monkeypatch: pytest.MonkeyPatch, **limits: float) -> None:
-    monkeypatch.setattr(retries, "PATIENCE", Patience(**limits))
-
-
 def test_a_server_that_trickles_is_left(
     server: Site, cache: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """One byte every 20 ms is never silent, and moves on at every look."""
-    patience(monkeypatch, window_s=0.5, least_bytes_per_s=1000.0)
+    monkeypatch.setattr(retries, "PATIENCE", Patience(window_s=0.5, least_bytes_per_s=1000.0))
     server.always[PATH] = Fault(trickle=(1, 0.02))
     begun_s = time.monotonic()
     with pytest.raises(TrilightError, match=r"too slow, \d+ bytes in .* at least 1000 a second"):
@@ -357,7 +353,7 @@ def test_a_slow_steady_link_is_waited_for(
 ) -> None:
     """Many windows long, and broken off more often than there are tries."""
     size = local.shards_of("train")[0].num_bytes
-    patience(monkeypatch, window_s=0.25, least_bytes_per_s=10.0)
+    monkeypatch.setattr(retries, "PATIENCE", Patience(window_s=0.25, least_bytes_per_s=10.0))
     step = size // 40
     server.faults[PATH] = [Fault(cut_after=step, trickle=(step // 4, 0.02))] * (2 * TRIES)
     server.faults[PATH] += [Fault(trickle=(step, 0.02))]

@@ -32,6 +32,7 @@ from storage.seeds import rng_for
 from tests.command_line import run_program
 from tests.for_each import case, for_each
 from tests.model.kit import tensors_of, tiny_config
+from tests.train.data.test_augment import EVERYTHING
 from tests.train.kit import plain_run, take
 from tests.train.toy import toy_sample, write_toy_dataset
 from train.data.augment import augment_scene
@@ -248,14 +249,8 @@ def test_drawn_views_are_those_of_the_whole_sample_to_the_bit(
         sample = dataclasses.replace(sample, radiance_rgb=exact, lights_rgb=exact[:, None])
     members = encode_sample(sample, profile)
     whole, stored = decode_sample("1", members), stored_sample("1", members)
-    settings = AugmentationSettings(
-        mirror=True,
-        channels=True,
-        vertex_order=True,
-        light_scale=3.0,
-        light_mix=2.0 if lights_apart else 1.0,
-        rotation="uniform",
-    )
+    light_mix = 2.0 if lights_apart else 1.0
+    settings = dataclasses.replace(EVERYTHING, translation=0.0, light_mix=light_mix)
     for seed, resolution in enumerate((16, 16, 8, 16)):
         full = training_scene(whole, resolution, lights_apart=lights_apart)
         drawn = scene_of_views(stored, [0, 2], resolution, per_light=lights_apart)
