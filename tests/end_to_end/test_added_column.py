@@ -162,10 +162,9 @@ def test_the_shipped_network_gives_the_same_bytes_and_says_what_it_does_not_read
     coated.materials[FLOOR, -1] = 0.9
     with pytest.warns(UserWarning, match="does not read coat"):
         shown = renderer.render(coated, 16)
-    with declared():
-        with warnings.catch_warnings():
-            warnings.simplefilter("error")
-            assert np.array_equal(renderer.render(tiny_scene(), 16), shown)
+    with declared(), warnings.catch_warnings():
+        warnings.simplefilter("error")
+        assert np.array_equal(renderer.render(tiny_scene(), 16), shown)
 
 
 def test_the_path_tracer_says_what_it_does_not_read(monkeypatch: pytest.MonkeyPatch) -> None:

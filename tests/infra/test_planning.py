@@ -193,16 +193,13 @@ def test_each_finding_comes_before_the_next_look() -> None:
     assert told == ["machine", "disk"]
 
 
-CONFINED = [
-    ("auto", 7, "ok", "Landlock 7, seccomp"),
-    ("off", 7, "slower", "TRILIGHT_CONFINE=off"),
-    ("auto", 0, "slower", "seccomp"),
-    ("required", 0, "missing", "seccomp"),
-]
-
-
 def test_what_confines_children_is_said(monkeypatch: pytest.MonkeyPatch) -> None:
-    for word, version, state, said in CONFINED:
+    for word, version, state, said in [
+        ("auto", 7, "ok", "Landlock 7, seccomp"),
+        ("off", 7, "slower", "TRILIGHT_CONFINE=off"),
+        ("auto", 0, "slower", "seccomp"),
+        ("required", 0, "missing", "seccomp"),
+    ]:
         with case(said):
             monkeypatch.setenv("TRILIGHT_CONFINE", word)
             for module in (doctor, confinement):

@@ -417,13 +417,10 @@ def test_a_black_sky_is_none() -> None:
         assert (batch.skies is not None) == is_there
 
 
-LENGTHS = (5, 9, 1)
-
-
 @for_each("family", FAMILIES)
 def test_a_packed_batch_is_the_padded_one(family: str, monkeypatch: pytest.MonkeyPatch) -> None:
     """On a card the kernel is torch's; here its slow twin, sequence after sequence, no mask."""
-    model, batch = awake(tiny_config(family)), batch_of(*LENGTHS)
+    model, batch = awake(tiny_config(family)), batch_of(5, 9, 1)
     padded = picture_and_gradients(model, batch)
     monkeypatch.setattr(positions, "supports_packed", lambda *_: True)
     monkeypatch.setattr("torch.nn.attention.varlen.varlen_attn", _attend_each)

@@ -406,11 +406,6 @@ def reference(request: pytest.FixtureRequest, shared: Path) -> Path:
     return found_in(shared, request.param)
 
 
-@pytest.fixture(scope="module")
-def base(shared: Path) -> Path:
-    return found_in(shared, FILES[0])
-
-
 def test_export_gives_back_what_was_published(reference: Path) -> None:
     """All but the texture encoder bit by bit; that one as a function, by the test above."""
     tensors, metadata = load_file(reference), read_tensors(reference)[1]
@@ -450,10 +445,10 @@ def test_outputs_are_the_published_ones(reference: Path, capsys: pytest.CaptureF
 
 
 def test_a_pixel_that_differs_is_in_both_differences_and_nan_fails(
-    base: Path, tmp_path: Path, capsys: pytest.CaptureFixture
+    shared: Path, tmp_path: Path, capsys: pytest.CaptureFixture
 ) -> None:
     """In the first or the last scene: neither comparison may stop at the other's result."""
-    name = "output.log10_radiance_bvchw"
+    base, name = found_in(shared, FILES[0]), "output.log10_radiance_bvchw"
     for place in (0, -1):
         expected = load_file(base)[name].float()
         expected[(place,) * 5] += 1e-6

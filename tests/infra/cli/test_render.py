@@ -34,7 +34,7 @@ from storage.records.sample import Sample, encode_sample
 from storage.records.scene import Scene
 from storage.records.scene_file import encode_scene, scene_digest
 from storage.settings.overrides import option_words
-from tests.command_line import trilight
+from tests.command_line import expect_json, expect_mistake, expect_output
 from tests.crash import CrashingRenderer
 from tests.for_each import case
 from tests.infra.child_here import use_processes
@@ -52,9 +52,7 @@ SMALL = (*FEW, "--noise-floor", "90")
 
 def printed(*words: str | Path) -> str:
     """Return what a render says, in one line: long paths break it even on a wide screen."""
-    ended = trilight(["render", *map(str, words)], env={"COLUMNS": "400"})
-    assert ended.exit_code == 0, ended.exception
-    return " ".join(ended.stdout.split())
+    return " ".join(expect_output("render", *words, COLUMNS="400").split())
 
 
 def render(*words: str | Path) -> dict[str, Any]:
@@ -63,14 +61,7 @@ def render(*words: str | Path) -> dict[str, Any]:
 
 
 def rendered(*words: str | Path) -> dict[str, Any]:
-    ended = trilight(["render", *map(str, words), "--json"])
-    assert ended.exit_code == 0, ended.exception
-    return dict(json.loads(ended.output))
-
-
-def mistake(*words: str | Path) -> str:
-    """Return the one line that a mistake becomes."""
-    return trilight(["render", *map(str, words)]).mistake
+    return expect_json("render", *words)
 
 
 def header(path: Path) -> dict[str, Any]:
@@ -428,20 +419,8 @@ def test_refusals_are_one_line(
         to = [] if "--out" in words else ["--out", "x.exr"]
         wide = [] if "--resolution" in words else ["--resolution", "32"]
         with case(line):
-            assert message in mistake(*of, *words, *to, *wide)
+            assert message in expect_mistake("render", *of, *words, *to, *wide)
     assert not Path("x.exr").exists()
-
-
-BAD_SOURCES = {
-    "absent.json": "no such file",
-    "https://me:secret@host/a.json": "https://host/a.json: only files of this",
-    "simplecache::https://host/a.tar::0": "only files of this machine",
-    "absent.tar::../x": "no shard and key",
-    "set": "a folder; expected a scene",
-    "text.safetensors": "text.safetensors: safetensors: the header claims",
-    "train-000000.tar": "expected .*train-000000.tar::KEY",
-    "train-000000.tar::000000013": "no sample 000000013; expected one of its 2: 0000000",
-}
 
 
 def test_a_bad_source_is_one_line(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -449,7 +428,16 @@ def test_a_bad_source_is_one_line(tmp_path: Path, monkeypatch: pytest.MonkeyPatc
     Path("set").mkdir()
     Path("text.safetensors").write_text("no scene")
     _shard(tmp_path / "train-000000.tar", tiny_scene())
-    for source, message in BAD_SOURCES.items():
+    for source, message in {
+        "absent.json": "no such file",
+        "https://me:secret@host/a.json": "https://host/a.json: only files of this",
+        "simplecache::https://host/a.tar::0": "only files of this machine",
+        "absent.tar::../x": "no shard and key",
+        "set": "a folder; expected a scene",
+        "text.safetensors": "text.safetensors: safetensors: the header claims",
+        "train-000000.tar": "expected .*train-000000.tar::KEY",
+        "train-000000.tar::000000013": "no sample 000000013; expected one of its 2: 0000000",
+    }.items():
         with case(source), pytest.raises(TrilightError, match=message) as caught:
             load_source(scene_source(source))
         assert "\n" not in str(caught.value), source
@@ -471,7 +459,9 @@ def test_no_engine_takes_a_vertex_beyond_the_farthest_position(
     shard = _shard(tmp_path / "train-000000.tar", tiny_scene(vertex_positions=positions))
     sources: tuple[str | Path, ...] = (described, f"{shard}::000000012")
     for engine, source in itertools.product(("mitsuba", "neural"), sources):
-        told = mistake(source, "--engine", engine, "--out", tmp_path / "x.exr", *SMALL)
+        told = expect_mistake(
+            "render", source, "--engine", engine, "--out", tmp_path / "x.exr", *SMALL
+        )
         assert "vertex_positions[0, 0] is " in told and "expected from -10000 to 10000 m" in told
     assert not (tmp_path / "x.exr").exists()
 
@@ -482,5 +472,5 @@ def test_a_crash_in_native_code_is_one_line(
     """In a real child, which loads no renderer to be quick."""
     use_processes(monkeypatch)
     monkeypatch.setattr(path_tracer, "RenderWorker", CrashingRenderer)
-    told = mistake(source, "--out", tmp_path / "x.exr", *SMALL)
+    told = expect_mistake("render", source, "--out", tmp_path / "x.exr", *SMALL)
     assert told.startswith("tiny.safetensors: rendering failed (crashed_signal_11")

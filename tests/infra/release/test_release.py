@@ -28,7 +28,7 @@ from pipeline.documents.checksums import SUMS, published_files
 from storage.dataset.dataset import Dataset
 from storage.dataset.verify import verify_dataset
 from storage.errors import TrilightError
-from tests.command_line import run_program, trilight
+from tests.command_line import expect_output, run_program
 from tests.conftest import ROOT
 from tests.http_server import Handler, running
 from tests.pipeline.documents.dataset_by_hand import (
@@ -106,7 +106,7 @@ def test_sums_are_of_what_is_uploaded(tmp_path: Path, capsys: pytest.CaptureFixt
     lines = (root / SUMS).read_text().splitlines()
     assert {line.split("  ")[1] for line in lines} >= {"manifest.json", "train-000000.tar"}
     assert not (root / "report.html").exists()
-    assert trilight(["inspect", str(root), "--scenes", "1"]).exit_code == 0
+    expect_output("inspect", root, "--scenes", "1")
     lines = (root / SUMS).read_text().splitlines()
     assert "report.html" in {line.split("  ")[1] for line in lines}, "sums went stale"
     for line in lines:
@@ -222,10 +222,9 @@ def test_the_limits_of_the_hub(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) 
 
 def test_a_dry_run_sends_nothing(dataset: Dataset) -> None:
     words = ["push", str(dataset.folder.root), "ada/my_set-1.0"]
-    result = trilight([*words, "--private", "--dry-run"])
-    assert result.exit_code == 0, result.exception
-    assert "Would be uploaded" in result.output
-    assert f"Next: trilight {' '.join(words)} --private" in result.output
+    said = expect_output(*words, "--private", "--dry-run")
+    assert "Would be uploaded" in said
+    assert f"Next: trilight {' '.join(words)} --private" in said
 
 
 LARGE = (".tar", ".safetensors")

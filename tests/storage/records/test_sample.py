@@ -180,22 +180,19 @@ def test_the_digest_of_scenes_does_not_know_the_profile(tmp_path: Path) -> None:
     assert len(list(after.read_scenes(first))) == first.num_samples
 
 
-PLAIN = b"the arrays of a scene" * 100
-HOSTILE: list[tuple[dict[str, bytes], str]] = [
-    ({}, "is missing"),
-    ({"scene.safetensors": PLAIN, **pack_arrays(PLAIN, "compact")}, "there in two forms"),
-    ({"scene.safetensors.gz": PLAIN}, "damaged"),
-    ({"scene.safetensors.gz": gzip.compress(PLAIN)[:-9]}, "cut short"),
-    ({"scene.safetensors.gz": gzip.compress(PLAIN)[:-8] + b"\0" * 8}, "damaged"),
-    ({"scene.safetensors.gz": gzip.compress(PLAIN) * 2}, "after its end"),
-]
-
-
 def test_hostile_arrays_are_refused_and_a_bomb_before_it_goes_off(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     """Of a member that inflates beyond the limit nothing more than the limit is unpacked."""
-    for members, message in HOSTILE:
+    plain = b"the arrays of a scene" * 100
+    for members, message in [
+        ({}, "is missing"),
+        ({"scene.safetensors": plain, **pack_arrays(plain, "compact")}, "there in two forms"),
+        ({"scene.safetensors.gz": plain}, "damaged"),
+        ({"scene.safetensors.gz": gzip.compress(plain)[:-9]}, "cut short"),
+        ({"scene.safetensors.gz": gzip.compress(plain)[:-8] + b"\0" * 8}, "damaged"),
+        ({"scene.safetensors.gz": gzip.compress(plain) * 2}, "after its end"),
+    ]:
         with case(message), pytest.raises(TrilightError, match=message):
             unpack_arrays(members)
     monkeypatch.setattr("storage.records.profiles.MAX_ARRAY_BYTES", 1 << 20)
