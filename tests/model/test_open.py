@@ -346,16 +346,6 @@ def test_wrong_published_tensors_are_listed(name: str, tensor: Tensor | None, me
         load_published_weights(tensors, config)
 
 
-WIDTH = 5
-
-
-def published_layer(patch: int) -> tuple[Tensor, Tensor]:
-    generator = torch.Generator().manual_seed(patch)
-    inputs = TEXTURE_CHANNELS * patch**2
-    weight = torch.randn(WIDTH, inputs, generator=generator, dtype=torch.float64)
-    return weight, torch.randn(WIDTH, generator=generator, dtype=torch.float64)
-
-
 def texture(material_TM: Tensor, patch: int) -> Tensor:
     """Return the published input [T, 13 P P], cell by cell."""
     pictures = torch.zeros(len(material_TM), TEXTURE_CHANNELS, patch, patch, dtype=torch.float64)
@@ -370,7 +360,10 @@ def texture(material_TM: Tensor, patch: int) -> Tensor:
 
 @for_each(("patch", "cells"), [(1, 1), (8, 43), (32, 559)])
 def test_a_folded_layer_is_the_unfolded_one(patch: int, cells: int) -> None:
-    weight, bias = published_layer(patch)
+    generator = torch.Generator().manual_seed(patch)
+    inputs = TEXTURE_CHANNELS * patch**2
+    weight = torch.randn(5, inputs, generator=generator, dtype=torch.float64)
+    bias = torch.randn(5, generator=generator, dtype=torch.float64)
     material = torch.rand(4, 10, generator=torch.Generator().manual_seed(0), dtype=torch.float64)
     pictures = texture(material, patch)
     assert int((pictures[0, : patch**2] != 0).sum()) == cells

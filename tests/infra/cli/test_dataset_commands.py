@@ -5,7 +5,6 @@ import json
 import os
 import shlex
 from pathlib import Path
-from typing import Any
 from unittest import mock
 
 import numpy as np
@@ -324,10 +323,6 @@ def test_the_facts_are_the_last_figures_that_are_numbers_and_damage_is_named(
             run_facts(tmp_path / "run")
 
 
-def convert(*words: str | Path) -> dict[str, Any]:
-    return expect_json("convert", *words)
-
-
 def loaded(path: Path, key: str = "") -> Scene:
     return load_source(scene_source(f"{path}::{key}" if key else str(path))).scene
 
@@ -336,23 +331,23 @@ def test_a_sample_and_a_whole_shard(tmp_path: Path) -> None:
     shard = tmp_path / "train-000000.tar"
     samples = {key: encode_sample(tiny_sample(key)) for key in ("000000003", "000000005")}
     write_shard(shard, samples.items())
-    convert(f"{shard}::000000005", tmp_path / "one.usdz")
+    expect_json("convert", f"{shard}::000000005", tmp_path / "one.usdz")
     assert encode_scene(loaded(tmp_path / "one.usdz")) == encode_scene(tiny_scene())
-    convert(shard, tmp_path / "all.usdc")
+    expect_json("convert", shard, tmp_path / "all.usdc")
     assert loaded(tmp_path / "all.usdc", "000000003").num_triangles == 3
-    found = convert(tmp_path / "all.usdc", tmp_path / "each.safetensors")
+    found = expect_json("convert", tmp_path / "all.usdc", tmp_path / "each.safetensors")
     assert [Path(path).name for path in found["files"]] == [
         "each.000000003.safetensors", "each.000000005.safetensors",
     ]  # fmt: skip
     assert encode_scene(loaded(Path(found["files"][1]))) == encode_scene(tiny_scene())
     # HDF5 takes pictures along, of a shard and of HDF5; a scene without them has none there
-    convert(f"{shard}::000000003", tmp_path / "a.h5")
-    convert(tmp_path / "a.h5", tmp_path / "b.h5")
+    expect_json("convert", f"{shard}::000000003", tmp_path / "a.h5")
+    expect_json("convert", tmp_path / "a.h5", tmp_path / "b.h5")
     for name in ("a.h5", "b.h5"):
         stored_rgb = read_renderformer_h5(tmp_path / name).radiance_rgb
         assert stored_rgb is not None
         assert np.array_equal(stored_rgb, tiny_sample().radiance_rgb)
-    convert(tmp_path / "one.usdz", tmp_path / "c.h5")
+    expect_json("convert", tmp_path / "one.usdz", tmp_path / "c.h5")
     assert read_renderformer_h5(tmp_path / "c.h5").radiance_rgb is None
 
 
@@ -361,9 +356,9 @@ def test_a_strangers_stage_within_a_budget(tmp_path: Path, monkeypatch: pytest.M
     stage = write_stage(tmp_path, sphere=True)
     for budget, message in (("0", "from 1 to"), ("20", "emitters take")):
         assert message in expect_mistake("convert", stage, tmp_path / "a.json", "--budget", budget)
-    fewer = convert(stage, tmp_path / "few.safetensors", "--budget", "600")
+    fewer = expect_json("convert", stage, tmp_path / "few.safetensors", "--budget", "600")
     use_processes(monkeypatch)
-    whole = convert(stage, tmp_path / "whole.safetensors")
+    whole = expect_json("convert", stage, tmp_path / "whole.safetensors")
     assert loaded(tmp_path / "whole.safetensors").environment is not None, "its DomeLight"
     assert fewer["triangles"] <= 600 < whole["triangles"]
     assert any("reduced to" in note for note in fewer["notes"])

@@ -57,11 +57,7 @@ def printed(*words: str | Path) -> str:
 
 def render(*words: str | Path) -> dict[str, Any]:
     """Return what `trilight render --json` prints of a small picture."""
-    return rendered(*words, *SMALL)
-
-
-def rendered(*words: str | Path) -> dict[str, Any]:
-    return expect_json("render", *words)
+    return expect_json("render", *words, *SMALL)
 
 
 def header(path: Path) -> dict[str, Any]:
@@ -346,7 +342,7 @@ def test_a_preview_says_that_its_error_is_unknown(source: Path, tmp_path: Path) 
     found = header(out)
     assert found["spp"] == 3 and json.loads(found["settings"])["denoiser"] == "fast"
     assert not [name for name in found if "noise_floor" in name]
-    assert rendered(*words)["spp"] == 3
+    assert expect_json("render", *words)["spp"] == 3
     assert "3, not denoised" in printed(*words, "--denoiser", "off")
 
 
@@ -364,7 +360,7 @@ def test_what_is_chosen_is_said_made_and_recorded(source: Path, tmp_path: Path) 
     assert json.loads(recorded["settings"])["spp"] == recorded["spp"]
     for option, value in (("--seconds", "1e-9"), ("--seconds", "0.05"), ("--error", "0")):
         with case(f"{option} {value}"):
-            found = rendered(*words, option, value)
+            found = expect_json("render", *words, option, value)
             assert found["chosen_for"] == f"{option} {value}".replace("1e-9", "1e-09")
             assert found["choice"].startswith(found["chosen_for"])
             assert ("nothing is as quick" in found["choice"]) == (value == "1e-9")
@@ -372,7 +368,7 @@ def test_what_is_chosen_is_said_made_and_recorded(source: Path, tmp_path: Path) 
             assert "noise_floor_db" not in found
     orbit = (source, "--out", tmp_path / "turn", "--orbit", "2", *words[3:], "--seconds", "1e-9")
     for kept in (False, True):
-        for picture in rendered(*orbit)["pictures"]:
+        for picture in expect_json("render", *orbit)["pictures"]:
             assert (picture["kept"], picture["picture_seconds"] is None) == (kept, kept)
 
 

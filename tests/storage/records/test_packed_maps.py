@@ -368,11 +368,6 @@ def test_directions_and_places_are_inverse() -> None:
     assert relative[0] == pytest.approx(1, abs=1e-6)
 
 
-def _texel(texture: Texture, row: int, column: int) -> np.ndarray:
-    height, width, _ = texture.texels.shape
-    return texture.linear(texture.texels[row % height, column % width]).astype(np.float64)
-
-
 def _slow(texture: Texture, u: float, v: float) -> np.ndarray:
     """Return the sum over all texels, each weighted by its tents in u and v."""
     height, width, channels = texture.texels.shape
@@ -381,7 +376,8 @@ def _slow(texture: Texture, u: float, v: float) -> np.ndarray:
         for column in range(-width, 3 * width):
             across = max(0.0, 1 - abs((v % 1) * height - (row + 0.5)))
             along = max(0.0, 1 - abs((u % 1) * width - (column + 0.5)))
-            total += across * along * _texel(texture, row, column)
+            texel = texture.linear(texture.texels[row % height, column % width])
+            total += across * along * texel.astype(np.float64)
     return total
 
 
