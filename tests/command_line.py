@@ -2,11 +2,13 @@
 
 import contextlib
 import io
+import json
 import os
 import subprocess
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 from unittest import mock
 
 from cyclopts import CycloptsError
@@ -60,6 +62,23 @@ def trilight(words: Sequence[str], env: Mapping[str, str] | None = None) -> Ende
         except SystemExit as end:
             code = int(end.code or 0)
     return Ended(code, out.getvalue(), errors.getvalue(), caught)
+
+
+def expect_output(*words: str | Path, **variables: str) -> str:
+    """Run a command that has to end well, with further variables; return what it prints."""
+    ended = trilight([*map(str, words)], variables)
+    assert ended.exit_code == 0, ended.exception
+    return ended.output
+
+
+def expect_json(*words: str | Path) -> dict[str, Any]:
+    """Return what a command prints as JSON."""
+    return dict(json.loads(expect_output(*words, "--json")))
+
+
+def expect_mistake(*words: str | Path) -> str:
+    """Return the one line that a mistake ends in."""
+    return trilight([*map(str, words)]).mistake
 
 
 def run_program(

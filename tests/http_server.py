@@ -172,13 +172,7 @@ def running(handler: type[Handler], **given: object) -> Iterator[str]:
 class _SiteHandler(Handler):
     site: Site
 
-    def do_HEAD(self) -> None:
-        self._answer()
-
     def do_GET(self) -> None:
-        self._answer()
-
-    def _answer(self) -> None:
         site = self.site
         request = Request(kind=self.command, path=self.path, headers=dict(self.headers))
         with site.lock:
@@ -192,16 +186,16 @@ class _SiteHandler(Handler):
             with site.lock:
                 site.busy -= 1
 
+    do_HEAD = do_GET
+
     def _reply(self, path: str, fault: Fault) -> None:
         data = self.site.content(path)
         if fault.silent:
             self.site.closing.wait(20)
             self.close_connection = True
         elif fault.status or data is None or path in self.site.moved:
-            self.send_response(fault.status or (302 if path in self.site.moved else 404))
-            self.send_header("Location", self.site.moved.get(path, "/"))
-            self.send_header("Content-Length", "0")
-            self.end_headers()
+            status = fault.status or (302 if path in self.site.moved else 404)
+            self.reply(status, b"", Location=self.site.moved.get(path, "/"))
         else:
             self._send(path, bytearray(data), fault)
 

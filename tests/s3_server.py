@@ -7,7 +7,7 @@ import threading
 import time
 import urllib.request
 from collections.abc import Iterator
-from contextlib import contextmanager, suppress
+from contextlib import suppress
 
 import pytest
 
@@ -55,9 +55,11 @@ class Line:
             end.close()
 
 
-@contextmanager
-def s3_server() -> Iterator[int]:
-    """Run the server; gives its port on the loopback."""
+@pytest.fixture(scope="session")
+def moto() -> Iterator[int]:
+    """Run the server for all tests of a folder; returns its port on the loopback."""
+    pytest.importorskip("s3fs", reason="needs the package s3fs (setup-all)")
+    pytest.importorskip("moto", reason="needs the package moto with its server (setup-all)")
     with socket.socket() as free:
         free.bind(("127.0.0.1", 0))
         port = int(free.getsockname()[1])
@@ -70,15 +72,6 @@ def s3_server() -> Iterator[int]:
     finally:
         server.kill()
         server.wait()
-
-
-@pytest.fixture(scope="session")
-def moto() -> Iterator[int]:
-    """Run the server for all tests of a folder; returns its port."""
-    pytest.importorskip("s3fs", reason="needs the package s3fs (setup-all)")
-    pytest.importorskip("moto", reason="needs the package moto with its server (setup-all)")
-    with s3_server() as port:
-        yield port
 
 
 def control(port: int, what: str, data: bytes = b"") -> None:

@@ -8,6 +8,7 @@ import dataclasses
 import gzip
 import json
 from collections.abc import Callable, Iterator, Mapping, Sequence
+from functools import partial
 from typing import Any
 
 import numpy as np
@@ -113,55 +114,42 @@ def _other(value: Any) -> Any:
     return value + 1
 
 
-def _change_record(path: tuple[Any, ...]) -> Change:
-    def change(members: Members) -> None:
-        record = json.loads(members[RECORD])
-        place = record
-        for step in path[:-1]:
-            place = place[step]
-        place[path[-1]] = _other(place[path[-1]])
-        members[RECORD] = json.dumps(record).encode()
-
-    return change
+def _change_record(path: tuple[Any, ...], members: Members) -> None:
+    record = json.loads(members[RECORD])
+    place = record
+    for step in path[:-1]:
+        place = place[step]
+    place[path[-1]] = _other(place[path[-1]])
+    members[RECORD] = json.dumps(record).encode()
 
 
-def _other_map(name: str) -> Change:
-    """Return what puts a map of the same form and other content in the place of one."""
-
-    def change(members: Members) -> None:
-        data = bytearray(gzip.decompress(members[name]))
-        data[-1] ^= 1
-        members[name] = gzip.compress(data)
-
-    return change
+def _other_map(name: str, members: Members) -> None:
+    """Put a map of the same form and other content in the place of one."""
+    data = bytearray(gzip.decompress(members[name]))
+    data[-1] ^= 1
+    members[name] = gzip.compress(data)
 
 
-def _change_array(name: str) -> Change:
-    def change(members: Members) -> None:
-        arrays = dict(load(members[ARRAYS]))
-        changed = arrays[name].copy()
-        # the middle, since the last row of a camera's pose is constant; by little, so that an
-        # index still points somewhere
-        place = tuple(size // 2 for size in changed.shape)
-        if name.endswith("_textures"):  # of the floor: lamps are hidden, and their look with them
-            place = (0,) * changed.ndim
-        changed[place] = changed[place] - 1 if changed[place] else 1
-        members[ARRAYS] = save({**arrays, name: changed})
-
-    return change
+def _change_array(name: str, members: Members) -> None:
+    arrays = dict(load(members[ARRAYS]))
+    changed = arrays[name].copy()
+    # the middle, since the last row of a camera's pose is constant; by little, so that an
+    # index still points somewhere
+    place = tuple(size // 2 for size in changed.shape)
+    if name.endswith("_textures"):  # of the floor: lamps are hidden, and their look with them
+        place = (0,) * changed.ndim
+    changed[place] = changed[place] - 1 if changed[place] else 1
+    members[ARRAYS] = save({**arrays, name: changed})
 
 
 def _brighter_picture(members: Members) -> None:
     members["1.exr"] = encode_exr(decode_exr(members["1.exr"]) * np.float32(2))
 
 
-def _brighter_parts(what: str, names: Sequence[str]) -> Change:
-    def change(members: Members) -> None:
-        parts = decode_parts_exr(members[f"1.{what}.exr"], names, (_PIXELS, _PIXELS), 2)
-        brighter = {name: 2 * part for name, part in parts.items()}
-        members[f"1.{what}.exr"] = encode_parts_exr(brighter)
-
-    return change
+def _brighter_parts(what: str, names: Sequence[str], members: Members) -> None:
+    parts = decode_parts_exr(members[f"1.{what}.exr"], names, (_PIXELS, _PIXELS), 2)
+    brighter = {name: 2 * part for name, part in parts.items()}
+    members[f"1.{what}.exr"] = encode_parts_exr(brighter)
 
 
 def _other_objects(members: Members) -> None:
@@ -172,15 +160,16 @@ def _other_objects(members: Members) -> None:
 
 def _changes() -> dict[str, Change]:
     changes: dict[str, Change] = {
-        f"{RECORD} {'.'.join(map(str, path))}": _change_record(path)
+        f"{RECORD} {'.'.join(map(str, path))}": partial(_change_record, path)
         for path in _leaves(json.loads(MEMBERS[RECORD]))
     }
-    changes |= {f"{ARRAYS} {name}": _change_array(name) for name in sorted(load(MEMBERS[ARRAYS]))}
-    changes |= {name: _other_map(name) for name in filter(MAP_NAME.fullmatch, MEMBERS)}
+    for name in sorted(load(MEMBERS[ARRAYS])):
+        changes[f"{ARRAYS} {name}"] = partial(_change_array, name)
+    changes |= {name: partial(_other_map, name) for name in filter(MAP_NAME.fullmatch, MEMBERS)}
     return changes | {
         "1.exr": _brighter_picture,
-        "1.lights.exr": _brighter_parts("lights", ("",)),
-        "1.parts.exr": _brighter_parts("parts", _PARTS),
+        "1.lights.exr": partial(_brighter_parts, "lights", ("",)),
+        "1.parts.exr": partial(_brighter_parts, "parts", _PARTS),
         "1.passes.exr": _other_objects,
     }
 

@@ -1,8 +1,6 @@
 """A material column that is declared outside of the product goes through all of it."""
 
-import contextlib
 import dataclasses
-import itertools
 import warnings
 from collections.abc import Iterator
 from pathlib import Path
@@ -22,7 +20,6 @@ from pipeline.renders.preview import PreviewSettings
 from scene_templates.families import DEFAULT_FAMILIES
 from scene_templates.settings import SceneSettings
 from storage.dataset.dataset import Dataset
-from storage.dataset.training_data import open_training_data
 from storage.errors import TrilightError
 from storage.records.material import EMISSION, PUBLISHED_COLUMNS
 from storage.records.scene import Scene
@@ -32,12 +29,9 @@ from tests.infra.child_here import use_children_here
 from tests.model.kit import awake, tiny_config
 from tests.pipeline.scenes.small_pool import first_scene, small_pool
 from tests.scenes_by_hand import FLOOR, tiny_scene
-from tests.train.kit import TINY_MODEL, tiny_run, trained
+from tests.train.kit import TINY_MODEL, take, tiny_run, trained
 from tests.train.toy import toy_sample, write_toy_dataset
 from train.data.augment import permute_channels, scale_light
-from train.data.bad_samples import BadSampleCounter
-from train.data.loader import load_batches
-from train.data.order import RankSlice
 from train.data.scenes import training_scene
 from train.loop.train_state import new_state
 from train.settings import TrainSettings
@@ -106,17 +100,7 @@ def test_a_draw_outside_of_the_range_is_named(number: float) -> None:
 
 
 def test_the_stream_shows_what_was_composed(data: Dataset) -> None:
-    settings = dataclasses.replace(coated_run(), scenes_per_step=4)
-    batches = load_batches(
-        open_training_data([str(data.folder.root)]).split("train"),
-        settings,
-        0,
-        rank_slice=RankSlice(rank=0, world_size=1),
-        workers=1,
-        unusable=BadSampleCounter(0),
-    )
-    with contextlib.closing(batches):
-        (batch,) = itertools.islice(batches, 1)
+    (batch,) = take(data, dataclasses.replace(coated_run(), scenes_per_step=4), 1)
     assert {scene.key for scene in batch} == {f"{index:09d}" for index in range(4)}
     for shown in batch:
         scene = composed(int(shown.key))
@@ -178,10 +162,9 @@ def test_the_shipped_network_gives_the_same_bytes_and_says_what_it_does_not_read
     coated.materials[FLOOR, -1] = 0.9
     with pytest.warns(UserWarning, match="does not read coat"):
         shown = renderer.render(coated, 16)
-    with declared():
-        with warnings.catch_warnings():
-            warnings.simplefilter("error")
-            assert np.array_equal(renderer.render(tiny_scene(), 16), shown)
+    with declared(), warnings.catch_warnings():
+        warnings.simplefilter("error")
+        assert np.array_equal(renderer.render(tiny_scene(), 16), shown)
 
 
 def test_the_path_tracer_says_what_it_does_not_read(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -7,7 +7,7 @@ import signal
 import socket
 import subprocess
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from pathlib import Path
 
 import pytest
@@ -45,13 +45,6 @@ def _started(words: tuple[str, ...], folder: Path) -> "subprocess.Popen[str]":
     )
 
 
-@pytest.fixture
-def silent_url() -> Iterator[str]:
-    """Return the URL of a server that takes connections and never answers."""
-    with socket.create_server(("127.0.0.1", 0)) as server:
-        yield f"http://127.0.0.1:{server.getsockname()[1]}/set"
-
-
 def _leave(words: tuple[str, ...], folder: Path, begun: Callable[[], bool]) -> None:
     """Interrupt a command that has spoken once something has begun, and read how it leaves."""
     run = _started(words, folder)
@@ -69,13 +62,13 @@ def _leave(words: tuple[str, ...], folder: Path, begun: Callable[[], bool]) -> N
 
 @pytest.mark.slow("kills")
 @for_each("name", LONG)
-def test_words_come_first_and_ctrl_c_is_answered(
-    name: str, silent_url: str, tmp_path: Path
-) -> None:
+def test_words_come_first_and_ctrl_c_is_answered(name: str, tmp_path: Path) -> None:
     (tmp_path / "scene.json").write_text(SCENE)
-    # verify has nothing slow to import: only a wait outlasts the signal's way
-    words = tuple(silent_url if word == "SILENT" else word for word in LONG[name])
-    _leave(words, tmp_path, lambda: True)
+    with socket.create_server(("127.0.0.1", 0)) as server:  # takes connections, and never answers
+        url = f"http://127.0.0.1:{server.getsockname()[1]}/set"
+        # verify has nothing slow to import: only a wait outlasts the signal's way
+        words = tuple(url if word == "SILENT" else word for word in LONG[name])
+        _leave(words, tmp_path, lambda: True)
 
 
 def test_plan_leaves_no_scenes_behind_at_ctrl_c(tmp_path: Path) -> None:

@@ -18,7 +18,7 @@ from storage.dataset.layout import DatasetFolder
 from storage.records.lights import num_light_pictures, sum_of_lights
 from storage.records.objects import read_failures
 from storage.records.passes.pictures import view_passes
-from tests.command_line import run_program, trilight
+from tests.command_line import expect_output, run_program
 from tests.conftest import ROOT
 from tests.end_to_end.conftest import Trilight
 from tests.end_to_end.production_kit import SIXTEEN_SAMPLES
@@ -183,8 +183,7 @@ ONE_VIEW = ("--set", "scenes.num_views=1")
 
 def _generate(out: Path, *words: str) -> None:
     fewer = ["--resolution", "32", "--set", "splits.scenes_per_shard=2", *SIXTEEN_SAMPLES]
-    result = trilight(["generate", *words, "--objects", "builtin:6", *fewer, "--out", str(out)])
-    assert result.exit_code == 0, result.exception
+    expect_output("generate", *words, "--objects", "builtin:6", *fewer, "--out", out)
 
 
 @pytest.mark.slow("commands")
@@ -195,8 +194,7 @@ def test_objects_alone_from_the_preset_to_the_exports(
     made = tmp_path / "views"
     views = ["--set", "scenes.num_views=12", "--set", "scenes.skies.maps.height=16"]
     _generate(made, "object-views", "--scenes", "2", *views)
-    result = trilight(["verify", str(made)])
-    assert result.exit_code == 0, result.exception
+    expect_output("verify", made)
     for sample in open_dataset(str(made)).samples("train"):
         assert stands_alone(sample.scene)
         assert [row.kind for row in sample.scene.objects] == ["object"]
@@ -208,8 +206,7 @@ def test_objects_alone_from_the_preset_to_the_exports(
         seen = np.linalg.norm(sample.scene.vertex_positions, axis=1)
         assert seen.max() == pytest.approx(0.5, rel=0.05)
     out = tmp_path / "nerfstudio"
-    result = trilight(["export", str(made), "--form", "nerfstudio", "--out", str(out)])
-    assert result.exit_code == 0, result.exception
+    expect_output("export", made, "--form", "nerfstudio", "--out", out)
     for sample in open_dataset(str(made)).samples("train"):
         for view, rgba in nerfstudio_pictures(out / sample.key, sample).items():
             covered = view_passes(
@@ -223,7 +220,7 @@ def test_objects_alone_from_the_preset_to_the_exports(
 def test_the_page_relights_a_scene_one_light_at_a_time(tmp_path: Path) -> None:
     skies = ["--set", "scenes.skies.share=1", "--set", "scenes.skies.maps.height=16"]
     _generate(tmp_path / "data/olat", "olat", "--scenes", "1", *ONE_VIEW, *skies)
-    assert trilight(["verify", str(tmp_path / "data/olat")]).exit_code == 0
+    expect_output("verify", tmp_path / "data/olat")
     (block,) = re.findall(
         r"```python\n(.*?)```", (ROOT / "docs/how-to/olat.md").read_text(), re.DOTALL
     )

@@ -3,7 +3,6 @@
 import contextlib
 import shlex
 import subprocess
-import time
 from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
@@ -38,7 +37,6 @@ DRAWING = ("--use-angle=swiftshader", "--enable-unsafe-swiftshader")
 """WebGL without a graphics card."""
 
 DESKTOP, PHONE = (1280, 900), (390, 844)
-PATIENCE_S = 120.0
 
 
 def viewed(source: Path) -> contextlib.AbstractContextManager[str]:
@@ -93,10 +91,8 @@ def told(page: Browser, engine: str) -> dict[str, Any]:
 
 
 def until_done(page: Browser, engine: str) -> None:
-    deadline = time.monotonic() + PATIENCE_S
-    while told(page, engine).get("state") not in ("done", "failed"):
-        assert time.monotonic() < deadline, page.run("document.body.innerText")
-        time.sleep(0.1)
+    state = f"viewer.pictures.told.get('{engine}')?.state"
+    page.until(f"['done', 'failed'].includes({state})")
     assert told(page, engine)["state"] == "done", told(page, engine)
 
 

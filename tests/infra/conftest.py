@@ -26,18 +26,10 @@ def source(tmp_path: Path) -> Path:
 
 def write_network(path: Path, max_triangles: int | None = None, bias: float = 0.3) -> Path:
     """Write a network of the size `smoke` that nobody trained: its pictures are a pattern."""
-    import torch
-
     from model.config import SIZES
     from model.weights import TrainedRange, encode_weights
-    from tests.model.kit import awake
+    from tests.model.test_inference import network
 
-    model = awake(SIZES["smoke"](), torch.float32)
-    last = model.decoder.head.last
-    assert last.bias is not None
-    with torch.no_grad():
-        last.weight *= 0.1
-        last.bias.fill_(bias)
     known = None if max_triangles is None else TrainedRange(max_triangles=max_triangles)
-    path.write_bytes(encode_weights(model, known))
+    path.write_bytes(encode_weights(network(SIZES["smoke"](), bias), known))
     return path

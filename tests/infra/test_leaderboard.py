@@ -325,17 +325,14 @@ def test_pictures_are_shown_as_they_are_at_their_one_width(folder: Path) -> None
     assert after.digest(*SHOWN[0]) != before and after.digest(*SHOWN[1]) == one.digest(*SHOWN[1])
 
 
-BAD_PICTURES: list[tuple[bytes, str]] = [
-    (encoded(picture(0)[:8]), ": 16 x 8 pixels; expected 8 x 8 or 16 x 16"),
-    (encoded(picture(0, 8)), " has 8"),
-    (b"\x76\x2f\x31\x01 cut", ": no readable OpenEXR picture of channels R, G"),
-    (encode_channels({"Y": picture(0)[..., 0].copy()}), ": no readable OpenEXR picture"),
-]
-
-
 def test_what_is_no_picture_of_the_set_is_said(folder: Path, tmp_path: Path) -> None:
     third = folder / picture_name(*SHOWN[2])
-    for data, said in BAD_PICTURES:
+    for data, said in [
+        (encoded(picture(0)[:8]), ": 16 x 8 pixels; expected 8 x 8 or 16 x 16"),
+        (encoded(picture(0, 8)), " has 8"),
+        (b"\x76\x2f\x31\x01 cut", ": no readable OpenEXR picture of channels R, G"),
+        (encode_channels({"Y": picture(0)[..., 0].copy()}), ": no readable OpenEXR picture"),
+    ]:
         with case(said):
             third.write_bytes(data)
             assert f"{third.name}{said}" in refusal(folder)
@@ -382,16 +379,13 @@ def test_rows_come_back_and_the_later_of_two_counts(tmp_path: Path) -> None:
     assert path.read_bytes() == whole
 
 
-OTHERS = [
-    ('{"set": "another"}\n', r"are of the set another, and this set is set a.*another --out"),
-    ("nothing\n", "not the rows of a leaderboard.*another --out, or delete the file"),
-    ('{"set": "set a"}\n{"width": 64}\n', "not the rows of a leaderboard"),
-    ("[" * 100_000 + "\n", "not the rows of a leaderboard"),
-]
-
-
 def test_a_file_of_something_else_is_refused(tmp_path: Path) -> None:
-    for text, said in OTHERS:
+    for text, said in [
+        ('{"set": "another"}\n', r"are of the set another, and this set is set a.*another --out"),
+        ("nothing\n", "not the rows of a leaderboard.*another --out, or delete the file"),
+        ('{"set": "set a"}\n{"width": 64}\n', "not the rows of a leaderboard"),
+        ("[" * 100_000 + "\n", "not the rows of a leaderboard"),
+    ]:
         with case(text):
             (tmp_path / "rows.jsonl").write_text(text)
             with pytest.raises(TrilightError, match=said):

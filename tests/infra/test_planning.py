@@ -4,6 +4,7 @@ import dataclasses
 import os
 import re
 from pathlib import Path
+from unittest import mock
 
 import pytest
 
@@ -72,25 +73,16 @@ def test_two_million_scenes_come_with_warnings() -> None:
     assert fewer.notes == ()
 
 
-class _Clock:
-    """Stands still while nobody works."""
-
-    now = 0.0
-
-    def monotonic(self) -> float:
-        return self.now
-
-
 def test_what_is_measured_are_the_first_scenes_of_the_dataset_in_order(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """Ten scenes reach the third shard, which is for validation. The clock moves on by 1000 s for
     the first scene, which a prediction leaves out, and by its number for each other one."""
-    clock = _Clock()
+    clock = mock.Mock(**{"monotonic.return_value": 0.0})
     monkeypatch.setattr("pipeline.generation.pipeline.time", clock)
 
     def work(scene: int) -> None:
-        clock.now += scene or 1000
+        clock.monotonic.return_value += scene or 1000
 
     scenes = without_rendering(monkeypatch, work)
     order = tiny_order(out=str(tmp_path / "set"), scenes=24)
@@ -193,16 +185,13 @@ def test_each_finding_comes_before_the_next_look() -> None:
     assert told == ["machine", "disk"]
 
 
-CONFINED = [
-    ("auto", 7, "ok", "Landlock 7, seccomp"),
-    ("off", 7, "slower", "TRILIGHT_CONFINE=off"),
-    ("auto", 0, "slower", "seccomp"),
-    ("required", 0, "missing", "seccomp"),
-]
-
-
 def test_what_confines_children_is_said(monkeypatch: pytest.MonkeyPatch) -> None:
-    for word, version, state, said in CONFINED:
+    for word, version, state, said in [
+        ("auto", 7, "ok", "Landlock 7, seccomp"),
+        ("off", 7, "slower", "TRILIGHT_CONFINE=off"),
+        ("auto", 0, "slower", "seccomp"),
+        ("required", 0, "missing", "seccomp"),
+    ]:
         with case(said):
             monkeypatch.setenv("TRILIGHT_CONFINE", word)
             for module in (doctor, confinement):

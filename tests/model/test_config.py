@@ -7,6 +7,7 @@ import copy
 import dataclasses
 import itertools
 import math
+from typing import Any
 from unittest import mock
 
 import numpy as np
@@ -50,28 +51,36 @@ def test_base_has_the_published_parameters_but_for_the_texture_encoder() -> None
     assert abs(got - (205_170_000 - 768 * (13 * 32 * 32 - 10))) < 5_000
 
 
+LINEAR, DPT, HITS = tiny_config(), tiny_config("dpt"), hits_config()
+
+
 @for_each(
-    ("head", "changes", "message"),
+    ("config", "changes", "message"),
     [
-        ("linear", {"width": 50}, "heads of equal width"),
-        ("linear", {"rope_num_freqs": 2}, "rope_num_freqs 2; expected at most 1"),
-        ("linear", {"rope_num_freqs": 0}, "from 1"),
-        ("linear", {"rope_max_freq": 0.5}, "from 1"),
-        ("linear", {"dpt_features": 4}, "dpt fields beside a linear head"),
-        ("linear", {"demodulated": True}, "hit_rays 0 with view_stage bundles; expected 1 or"),
-        ("linear", {"hit_rays": 1}, "hit_rays 1 with view_stage bundles; expected 0, or demodu"),
-        ("linear", {"head": "mlp"}, "head is 'mlp'; expected dpt or linear"),
-        ("linear", {"head": "dpt", "dpt_features": 4}, "four of each"),
-        ("dpt", {"dpt_taps": (0, 1, 2, 3)}, "dpt_taps .* expected layers below 2"),
-        ("dpt", {"dpt_features": 3}, "dpt_features 3; expected an even number"),
-        ("dpt", {"patch_px": 4}, "patch_px 4 with a dpt head"),
+        (LINEAR, {"width": 50}, "heads of equal width"),
+        (LINEAR, {"rope_num_freqs": 2}, "rope_num_freqs 2; expected at most 1"),
+        (LINEAR, {"rope_num_freqs": 0}, "from 1"),
+        (LINEAR, {"rope_max_freq": 0.5}, "from 1"),
+        (LINEAR, {"dpt_features": 4}, "dpt fields beside a linear head"),
+        (LINEAR, {"demodulated": True}, "hit_rays 0 with view_stage bundles; expected 1 or"),
+        (LINEAR, {"hit_rays": 1}, "hit_rays 1 with view_stage bundles; expected 0, or demodu"),
+        (LINEAR, {"head": "mlp"}, "head is 'mlp'; expected dpt or linear"),
+        (LINEAR, {"head": "dpt", "dpt_features": 4}, "four of each"),
+        (DPT, {"dpt_taps": (0, 1, 2, 3)}, "dpt_taps .* expected layers below 2"),
+        (DPT, {"dpt_features": 3}, "dpt_features 3; expected an even number"),
+        (DPT, {"patch_px": 4}, "patch_px 4 with a dpt head"),
+        (HITS, {"hit_rays": 0}, "hit_rays 0 with view_stage hits"),
+        (HITS, {"pixel_width": 0}, "pixel_width 0"),
+        (HITS, {"hit_anchors": 12}, "a multiple of 8"),
+        (HITS, {"patch_px": 4}, "patch_px 4"),
+        (HITS, {"view_stage": "bundles"}, "hit_anchors 8 with view_stage bundles; expected 0"),
     ],
 )
 def test_a_contradictory_config_is_refused(
-    head: str, changes: dict[str, object], message: str
+    config: ModelConfig, changes: dict[str, Any], message: str
 ) -> None:
     with pytest.raises(TrilightError, match=message):
-        ModelConfig(**vars(tiny_config(head)) | changes)
+        dataclasses.replace(config, **changes)
 
 
 REPAIRED = tiny_config(patch_px=4, demodulated=True, hit_rays=1)
@@ -408,13 +417,10 @@ def test_a_black_sky_is_none() -> None:
         assert (batch.skies is not None) == is_there
 
 
-LENGTHS = (5, 9, 1)
-
-
 @for_each("family", FAMILIES)
 def test_a_packed_batch_is_the_padded_one(family: str, monkeypatch: pytest.MonkeyPatch) -> None:
     """On a card the kernel is torch's; here its slow twin, sequence after sequence, no mask."""
-    model, batch = awake(tiny_config(family)), batch_of(*LENGTHS)
+    model, batch = awake(tiny_config(family)), batch_of(5, 9, 1)
     padded = picture_and_gradients(model, batch)
     monkeypatch.setattr(positions, "supports_packed", lambda *_: True)
     monkeypatch.setattr("torch.nn.attention.varlen.varlen_attn", _attend_each)

@@ -58,14 +58,14 @@ def many_lights(count: int) -> Scene:
     return join([FLOOR, *row_of_lamps(count)])
 
 
-def network() -> RenderFormer:
-    """Return a small network whose radiance stays below a hundred."""
-    model = awake(tiny_config(), torch.float32)
+def network(config: ModelConfig | None = None, bias: float = 0.3) -> RenderFormer:
+    """Return a network, by default a small one, whose radiance stays below a hundred."""
+    model = awake(config or tiny_config(), torch.float32)
     last = model.decoder.head.last
     assert last.bias is not None
     with torch.no_grad():
         last.weight *= 0.1
-        last.bias.fill_(0.3)
+        last.bias.fill_(bias)
     return model
 
 

@@ -346,16 +346,6 @@ def test_wrong_published_tensors_are_listed(name: str, tensor: Tensor | None, me
         load_published_weights(tensors, config)
 
 
-WIDTH = 5
-
-
-def published_layer(patch: int) -> tuple[Tensor, Tensor]:
-    generator = torch.Generator().manual_seed(patch)
-    inputs = TEXTURE_CHANNELS * patch**2
-    weight = torch.randn(WIDTH, inputs, generator=generator, dtype=torch.float64)
-    return weight, torch.randn(WIDTH, generator=generator, dtype=torch.float64)
-
-
 def texture(material_TM: Tensor, patch: int) -> Tensor:
     """Return the published input [T, 13 P P], cell by cell."""
     pictures = torch.zeros(len(material_TM), TEXTURE_CHANNELS, patch, patch, dtype=torch.float64)
@@ -370,7 +360,10 @@ def texture(material_TM: Tensor, patch: int) -> Tensor:
 
 @for_each(("patch", "cells"), [(1, 1), (8, 43), (32, 559)])
 def test_a_folded_layer_is_the_unfolded_one(patch: int, cells: int) -> None:
-    weight, bias = published_layer(patch)
+    generator = torch.Generator().manual_seed(patch)
+    inputs = TEXTURE_CHANNELS * patch**2
+    weight = torch.randn(5, inputs, generator=generator, dtype=torch.float64)
+    bias = torch.randn(5, generator=generator, dtype=torch.float64)
     material = torch.rand(4, 10, generator=torch.Generator().manual_seed(0), dtype=torch.float64)
     pictures = texture(material, patch)
     assert int((pictures[0, : patch**2] != 0).sum()) == cells
@@ -404,11 +397,6 @@ def found_in(shared: Path, name: str) -> Path:
 @pytest.fixture(scope="module", params=FILES)
 def reference(request: pytest.FixtureRequest, shared: Path) -> Path:
     return found_in(shared, request.param)
-
-
-@pytest.fixture(scope="module")
-def base(shared: Path) -> Path:
-    return found_in(shared, FILES[0])
 
 
 def test_export_gives_back_what_was_published(reference: Path) -> None:
@@ -450,10 +438,10 @@ def test_outputs_are_the_published_ones(reference: Path, capsys: pytest.CaptureF
 
 
 def test_a_pixel_that_differs_is_in_both_differences_and_nan_fails(
-    base: Path, tmp_path: Path, capsys: pytest.CaptureFixture
+    shared: Path, tmp_path: Path, capsys: pytest.CaptureFixture
 ) -> None:
     """In the first or the last scene: neither comparison may stop at the other's result."""
-    name = "output.log10_radiance_bvchw"
+    base, name = found_in(shared, FILES[0]), "output.log10_radiance_bvchw"
     for place in (0, -1):
         expected = load_file(base)[name].float()
         expected[(place,) * 5] += 1e-6

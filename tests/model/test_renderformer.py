@@ -29,7 +29,7 @@ from model.positions import (
     world_rotation,
 )
 from model.renderformer import RenderFormer, radiance
-from model.scene_tensors import SceneTensors, batch_scenes
+from model.scene_tensors import batch_scenes
 from model.view_decoder import bundle_rays, ray_directions, unbundle
 from storage.conventions import camera_rays
 from storage.errors import TrilightError
@@ -94,7 +94,11 @@ def test_translating_the_world_changes_neither_context_nor_picture(
 ) -> None:
     model = model_for(family)
     scene = random_scene(9)
-    moved = translated(scene, torch.tensor([distance, -2 * distance, 0.5], dtype=torch.float64))
+    offset = torch.tensor([distance, -2 * distance, 0.5], dtype=torch.float64)
+    poses = scene.c2w_V44.clone()
+    poses[:, :3, 3] += offset
+    triangles = scene.triangles_T33 + offset
+    moved = dataclasses.replace(scene, triangles_T33=triangles, c2w_V44=poses)
     with torch.no_grad():
         context, context_moved = (
             model.encoder(batch, model.encode(batch).places)
@@ -105,12 +109,6 @@ def test_translating_the_world_changes_neither_context_nor_picture(
     torch.testing.assert_close(
         render(model, moved), render(model, scene), rtol=0, atol=TIGHT * distance
     )
-
-
-def translated(scene: SceneTensors, offset: Tensor) -> SceneTensors:
-    poses = scene.c2w_V44.clone()
-    poses[:, :3, 3] += offset
-    return dataclasses.replace(scene, triangles_T33=scene.triangles_T33 + offset, c2w_V44=poses)
 
 
 def test_gradients_are_those_of_finite_differences() -> None:

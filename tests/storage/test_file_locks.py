@@ -25,9 +25,9 @@ from storage.dataset.layout import DatasetFolder
 from storage.errors import EnvironmentFailure, TrilightError
 from storage.file_locks import describe_holder, hold_lock, is_locked
 from storage.remote.shard_cache import ShardCache
-from storage.remote.url import RemoteUrl, parse_url
 from tests.conftest import ROOT
 from tests.for_each import for_each
+from tests.storage.remote.cache_readers import remote
 from train.folder import RunFolder, claim_run
 from train.loop.distributed import DistributedContext
 
@@ -155,8 +155,7 @@ def test_without_locks_everything_goes_on_after_one_warning(
         pass
     shard = tmp_path / "shard"
     shard.write_bytes(b"bytes")
-    url = parse_url("http://127.0.0.1/a.tar", what="shard")
-    assert isinstance(url, RemoteUrl)
+    url = remote("http://127.0.0.1/a.tar")
     cache.keep(shard, url, "0" * 64)
     with cache.open(url, num_bytes=5, sha256="0" * 64) as stream:
         assert stream.read() == b"bytes"

@@ -174,14 +174,7 @@ def test_views_are_traced_after_the_symmetries_and_lack_inputs_by_chance(dataset
         assert (traced.pixels_VRRC[..., 0] > 0)[lit].float().mean() > 0.95
 
 
-MAPS_AUGMENTATION = AugmentationSettings(
-    rotation="uniform",
-    mirror=True,
-    channels=True,
-    vertex_order=True,
-    light_scale=2.0,
-    withheld_inputs=0.3,
-)
+MAPS_AUGMENTATION = dataclasses.replace(HITS_AUGMENTATION, light_scale=2.0)
 
 
 def _scene_of_maps(index: int) -> Scene:

@@ -29,7 +29,7 @@ from storage.dataset.training_data import NO_MANIFEST
 from storage.errors import TrilightError
 from storage.records.safe_read import safetensors_header
 from storage.remote import retries
-from tests.command_line import trilight
+from tests.command_line import expect_output
 from tests.for_each import for_each
 from tests.http_server import Fault, Site, serve
 from tests.train.kit import TINY_MODEL, Heard, Killed, flip_a_bit, tiny_run, trained
@@ -232,8 +232,7 @@ def test_data_without_a_validation_split_trains_and_says_so(
     assert again.folder.weights.read_bytes() == weights
     data = ["--data", str(dataset.folder.root), "--split", "validation", "--most-scenes", "1"]
     data += ["--tracer-views", "0"]
-    done = trilight(["evaluate", str(out), *data, "--out", str(tmp_path / "page")])
-    assert done.exit_code == 0, done.output
+    expect_output("evaluate", out, *data, "--out", tmp_path / "page")
 
 
 class Poison(Heard):
@@ -288,12 +287,7 @@ def test_a_second_stage_begins_with_the_first(dataset: Dataset, tmp_path: Path) 
     with pytest.raises(TrilightError, match="or --set from_weights=true to begin with those"):
         trained(tiny_run(), dataset, tmp_path / "third", start=StartOptions(begin_with=place))
     with pytest.raises(TrilightError, match="no such file or folder"):
-        trained(
-            second,
-            dataset,
-            tmp_path / "third",
-            start=StartOptions(begin_with=str(tmp_path / "none")),
-        )
+        trained(second, dataset, tmp_path / "third", start=StartOptions(begin_with=f"{place}/no"))
 
 
 def test_a_run_without_the_weights_it_asks_for_does_not_begin(

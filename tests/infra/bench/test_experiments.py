@@ -241,11 +241,8 @@ def test_methods_come_nearer_with_samples_and_with_what_is_traced(
     assert not found["32 px, network builtin:"].intervals and len(found) == 10
 
 
-RATE = {"learning_rate": 1e-3}
-
-
 def test_sides_differ_in_what_is_asked_for_alone_and_a_scene_is_one_cluster_of_seeds() -> None:
-    options = BenchOptions(changes={"scenes_per_step": 2}, set_b=RATE)
+    options = BenchOptions(changes={"scenes_per_step": 2}, set_b={"learning_rate": 1e-3})
     a, b = (settings_of(side, 3, TINY, options) for side in (SIDE_A, SIDE_B))
     assert a != b and dataclasses.replace(a, learning_rate=1e-3) == b
     assert (a.seed, a.num_steps, a.scenes_per_step) == (3, TINY.steps, 2)

@@ -185,7 +185,11 @@ def test_too_little_memory_is_one_sentence(tmp_path: Path) -> None:
 
 def test_completion_installs_and_completes(tmp_path: Path) -> None:
     """In a home of its own; the shell itself asks for the names of presets."""
-    path = f"{_bin(tmp_path)}:{os.environ['PATH']}"
+    program = tmp_path / "bin" / "trilight"  # the command of this checkout
+    program.parent.mkdir()
+    program.write_text(f'#!/bin/sh\nexec {sys.executable} -m trilight "$@"\n')
+    program.chmod(0o755)
+    path = f"{program.parent}:{os.environ['PATH']}"
     for shell, typed in COMPLETED.items():
         script = tmp_path / f"completion of {shell}"
         words = ["--install-completion", "--shell", shell, "--output", str(script)]
@@ -198,15 +202,6 @@ def test_completion_installs_and_completes(tmp_path: Path) -> None:
                 asked = [shell, "-c", typed.replace("FILE", shlex.quote(str(script)))]
                 completed = run_program(asked, HOME=str(tmp_path), PATH=path)
                 assert completed.stdout.split() == ["pretrain-256"]
-
-
-def _bin(folder: Path) -> Path:
-    """Return a folder with the command of this checkout."""
-    program = folder / "bin" / "trilight"
-    program.parent.mkdir()
-    program.write_text(f'#!/bin/sh\nexec {sys.executable} -m trilight "$@"\n')
-    program.chmod(0o755)
-    return program.parent
 
 
 WORDS: dict[Any, tuple[str | tuple[str, ...], Any]] = {

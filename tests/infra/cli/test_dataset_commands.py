@@ -5,7 +5,6 @@ import json
 import os
 import shlex
 from pathlib import Path
-from typing import Any
 from unittest import mock
 
 import numpy as np
@@ -32,11 +31,10 @@ from storage.dataset.shard import write_shard
 from storage.digests import sha256_hex
 from storage.errors import TrilightError
 from storage.records.passes.pictures import decode_passes_exr, passes_exr
-from storage.records.profiles import Profile
 from storage.records.sample import PartFloor, encode_sample
 from storage.records.scene import Scene
 from storage.records.scene_file import encode_scene
-from tests.command_line import trilight
+from tests.command_line import expect_json, expect_mistake, expect_output, trilight
 from tests.crash import crash
 from tests.extensions_kit import room_for_extensions, written
 from tests.for_each import case
@@ -57,26 +55,15 @@ from tests.scenes_by_hand import tiny_sample, tiny_scene
 pytestmark = pytest.mark.usefixtures("bare_reports", "children_here")
 
 
-def refused(*words: str | Path) -> str:
-    """Return the one line that a mistake ends in."""
-    return trilight([*map(str, words)]).mistake
-
-
-def inspect(*arguments: str | Path) -> str:
-    result = trilight(["inspect", *(str(argument) for argument in arguments)])
-    assert result.exit_code == 0, result.output
-    return result.output
-
-
 def test_the_report_stands_in_the_dataset(tmp_path: Path) -> None:
     five_scenes(tmp_path)
-    printed = inspect(tmp_path)
+    printed = expect_output("inspect", tmp_path)
     assert "5 (1 test, 4 train)" in printed
     assert "report.html" in printed.replace("\n", "")  # a long path is wrapped
     assert (tmp_path / "report.html").exists()
     assert (tmp_path / "contact_sheet.png").exists()
     assert len(list((tmp_path / "report").iterdir())) == 5
-    read = json.loads(inspect(tmp_path, "--json"))
+    read = expect_json("inspect", tmp_path)
     assert read["distributions"]["quantities"]["objects_per_scene"]["max"] == 2
     assert read["licences"] == {"CC-BY-4.0": 1, "CC0-1.0": 3}
     assert read["rejections"][0] == ["scenes", "no_room", 2]
@@ -84,16 +71,16 @@ def test_the_report_stands_in_the_dataset(tmp_path: Path) -> None:
 
 def test_a_run_is_summed_up_and_the_command_that_shows_it_named(tmp_path: Path) -> None:
     write_run(tmp_path / "my run")
-    printed = inspect(tmp_path / "my run")
+    printed = expect_output("inspect", tmp_path / "my run")
     assert f"tensorboard --logdir '{tmp_path}/my run'" in printed and "steps planned" in printed
-    assert json.loads(inspect(tmp_path / "my run", "--json"))["steps"] == 12
+    assert expect_json("inspect", tmp_path / "my run")["steps"] == 12
     rows = [line.split() for line in printed.splitlines()]
     assert ["finished", "no"] in rows and ["training", "loss", "0.08333"] in rows
     place = f"'{tmp_path}/my run'"
     resume = f"To resume: trilight train tiny --like {place} --out {place} --resume, with the same"
     assert f"{resume} --data as before." in printed
     (tmp_path / "my run/summary.json").write_text("{}")
-    assert "To resume" not in inspect(tmp_path / "my run")
+    assert "To resume" not in expect_output("inspect", tmp_path / "my run")
 
 
 def test_a_dataset_that_is_read_only_stays_as_it_is(
@@ -103,9 +90,9 @@ def test_a_dataset_that_is_read_only_stays_as_it_is(
     before = {path: path.read_bytes() for path in (tmp_path / "set").iterdir()}
     # the superuser may write anywhere, so that permissions alone would not do
     monkeypatch.setattr("os.access", lambda path, mode: not mode & os.W_OK)
-    printed = inspect(tmp_path / "set")
+    printed = expect_output("inspect", tmp_path / "set")
     assert "5 (1 test, 4 train)" in printed and "--out" in printed
-    inspect(tmp_path / "set", "--out", tmp_path / "out")
+    expect_output("inspect", tmp_path / "set", "--out", tmp_path / "out")
     assert {path: path.read_bytes() for path in (tmp_path / "set").iterdir()} == before
     written = sorted(path.name for path in (tmp_path / "out").iterdir())
     assert written == ["contact_sheet.png", "report", "report.html"]
@@ -121,8 +108,10 @@ def test_parts_show_with_their_floors(tmp_path: Path) -> None:
     views = tuple(dataclasses.replace(view, parts=floors) for view in made.views)
     whole = dataclasses.replace(made, parts_rgb=parts, views=views)
     write_dataset(tmp_path, {"train-000000.tar": [whole]})
-    assert "stated error, indirect median 38.2 dB" in " ".join(inspect(tmp_path).split())
-    read = json.loads(inspect(tmp_path, "--json"))
+    assert "stated error, indirect median 38.2 dB" in " ".join(
+        expect_output("inspect", tmp_path).split()
+    )
+    read = expect_json("inspect", tmp_path)
     assert read["part_noise_floor_db"] == {"direct": [47.5] * 2, "indirect": [38.25] * 2}
     (page,) = (tmp_path / "report").glob("*.html")
     assert "view 1, indirect" in page.read_text() and "38.25" in page.read_text()
@@ -130,59 +119,56 @@ def test_parts_show_with_their_floors(tmp_path: Path) -> None:
 
 def test_an_empty_dataset_and_a_damaged_shard_are_one_sentence(tmp_path: Path) -> None:
     write_dataset(tmp_path, {})
-    assert "the dataset is empty" in refused("inspect", tmp_path)
+    assert "the dataset is empty" in expect_mistake("inspect", tmp_path)
     assert not (tmp_path / "report.html").exists()
     dataset = five_scenes(tmp_path / "my set")
     name = dataset.manifest.shards[0].name
     path = dataset.folder.shard(name)
     data = path.read_bytes()
     path.write_bytes(data[:600] + bytes(len(data) - 1200) + data[-600:])
-    assert f"{name}: " in refused("inspect", tmp_path / "my set"), "of the same length"
+    assert f"{name}: " in expect_mistake("inspect", tmp_path / "my set"), "of the same length"
     path.write_bytes(data[:2000])
-    said = refused("inspect", tmp_path / "my set")
+    said = expect_mistake("inspect", tmp_path / "my set")
     assert said.startswith(f"{name}: 2000 bytes; expected ")
     assert f"`trilight verify '{tmp_path}/my set'` says how" in said
 
 
-def shards(*arguments: str | Path) -> str:
-    result = trilight(["shards", *(str(argument) for argument in arguments)])
-    if result.exception is not None:
-        raise result.exception
-    return result.output
-
-
 def test_merge_select_and_reshard(tmp_path: Path) -> None:
     a, b = finished(tmp_path / "a", scenes(0)), finished(tmp_path / "b", scenes(1), seed=1)
-    printed = shards("merge", a, b, "--out", tmp_path / "ab")
+    printed = expect_output("shards", "merge", a, b, "--out", tmp_path / "ab")
     assert "12 (4 test, 8 train)" in printed and "trilight verify" in printed
     chosen = ("--split", "train", "--template", "plane", "--min-noise-floor", "36.5")
-    shards("select", tmp_path / "ab", "--out", tmp_path / "c", *chosen)
+    expect_output("shards", "select", tmp_path / "ab", "--out", tmp_path / "c", *chosen)
     c = open_dataset(str(tmp_path / "c"))
     keys = [key for shard in c.manifest.shards for key in c.keys(shard)]
     assert keys == ["000000003", "000000009"]
     where = 'template == "plane" and min(noise_floor_db) >= 36.5 and split == "train"'
-    listed = shards("list", tmp_path / "ab", "--where", where)
+    listed = expect_output("shards", "list", tmp_path / "ab", "--where", where)
     assert "2 of 12 scenes" in listed and "000000009 train" in listed
     words = shlex.split(listed.partition("Next: trilight shards ")[2])
-    shards(*words)  # as it is printed
+    expect_output("shards", *words)  # as it is printed
     assert open_dataset(f"{tmp_path / 'ab'}-selected").manifest.num_samples == 2
-    rows = json.loads(shards("list", tmp_path / "ab", "--where", where, "--json"))
+    rows = expect_json("shards", "list", tmp_path / "ab", "--where", where)
     assert [row["key"] for row in rows["scenes"]] == ["000000003", "000000009"]
-    assert "0 of 12 scenes" in shards("list", tmp_path / "ab", "--where", "max(coverage) > 2")
+    assert "0 of 12 scenes" in expect_output(
+        "shards", "list", tmp_path / "ab", "--where", "max(coverage) > 2"
+    )
     size = ("--scenes-per-shard", "5", "--json")
-    outcome = json.loads(shards("reshard", tmp_path / "ab", "--out", tmp_path / "d", *size))
+    outcome = json.loads(
+        expect_output("shards", "reshard", tmp_path / "ab", "--out", tmp_path / "d", *size)
+    )
     assert outcome["scenes_by_split"] == {"test": 4, "train": 8}
     assert outcome["dataset_digest"] == open_dataset(str(tmp_path / "d")).digest
     out = ("--out", tmp_path / "e")
-    assert "1 dataset; expected at least 2" in refused("shards", "merge", a, *out)
+    assert "1 dataset; expected at least 2" in expect_mistake("shards", "merge", a, *out)
     lacking = "expected --where, --split, --template or --min-noise-floor"
-    assert lacking in refused("shards", "select", a, *out)
+    assert lacking in expect_mistake("shards", "select", a, *out)
     assert not (tmp_path / "e").exists()
 
 
 def test_a_bad_derived_shard_is_made_of_its_sources_again(tmp_path: Path) -> None:
     a, b = finished(tmp_path / "a", scenes(0)), finished(tmp_path / "b", scenes(1), seed=1)
-    shards("merge", a, b, "--out", tmp_path / "ab")
+    expect_output("shards", "merge", a, b, "--out", tmp_path / "ab")
     (tmp_path / "ab" / "train-000001.tar").unlink()
     found = trilight(["verify", str(tmp_path / "ab")])
     assert found.exit_code == 1
@@ -337,50 +323,31 @@ def test_the_facts_are_the_last_figures_that_are_numbers_and_damage_is_named(
             run_facts(tmp_path / "run")
 
 
-PROFILE: Profile = "lossless"
-
-
-def said(*words: str | Path) -> dict[str, Any]:
-    """Return what a command prints as JSON."""
-    result = trilight([*map(str, words), "--json"])
-    assert result.exit_code == 0, result.exception
-    return dict(json.loads(result.output))
-
-
-def convert(*words: str | Path) -> dict[str, Any]:
-    return said("convert", *words)
-
-
 def loaded(path: Path, key: str = "") -> Scene:
     return load_source(scene_source(f"{path}::{key}" if key else str(path))).scene
 
 
-@pytest.fixture
-def shard(tmp_path: Path) -> Path:
-    path = tmp_path / "train-000000.tar"
-    samples = {key: encode_sample(tiny_sample(key), PROFILE) for key in ("000000003", "000000005")}
-    write_shard(path, samples.items())
-    return path
-
-
-def test_a_sample_and_a_whole_shard(tmp_path: Path, shard: Path) -> None:
-    convert(f"{shard}::000000005", tmp_path / "one.usdz")
+def test_a_sample_and_a_whole_shard(tmp_path: Path) -> None:
+    shard = tmp_path / "train-000000.tar"
+    samples = {key: encode_sample(tiny_sample(key)) for key in ("000000003", "000000005")}
+    write_shard(shard, samples.items())
+    expect_json("convert", f"{shard}::000000005", tmp_path / "one.usdz")
     assert encode_scene(loaded(tmp_path / "one.usdz")) == encode_scene(tiny_scene())
-    convert(shard, tmp_path / "all.usdc")
+    expect_json("convert", shard, tmp_path / "all.usdc")
     assert loaded(tmp_path / "all.usdc", "000000003").num_triangles == 3
-    found = convert(tmp_path / "all.usdc", tmp_path / "each.safetensors")
+    found = expect_json("convert", tmp_path / "all.usdc", tmp_path / "each.safetensors")
     assert [Path(path).name for path in found["files"]] == [
         "each.000000003.safetensors", "each.000000005.safetensors",
     ]  # fmt: skip
     assert encode_scene(loaded(Path(found["files"][1]))) == encode_scene(tiny_scene())
     # HDF5 takes pictures along, of a shard and of HDF5; a scene without them has none there
-    convert(f"{shard}::000000003", tmp_path / "a.h5")
-    convert(tmp_path / "a.h5", tmp_path / "b.h5")
+    expect_json("convert", f"{shard}::000000003", tmp_path / "a.h5")
+    expect_json("convert", tmp_path / "a.h5", tmp_path / "b.h5")
     for name in ("a.h5", "b.h5"):
         stored_rgb = read_renderformer_h5(tmp_path / name).radiance_rgb
         assert stored_rgb is not None
         assert np.array_equal(stored_rgb, tiny_sample().radiance_rgb)
-    convert(tmp_path / "one.usdz", tmp_path / "c.h5")
+    expect_json("convert", tmp_path / "one.usdz", tmp_path / "c.h5")
     assert read_renderformer_h5(tmp_path / "c.h5").radiance_rgb is None
 
 
@@ -388,25 +355,14 @@ def test_a_strangers_stage_within_a_budget(tmp_path: Path, monkeypatch: pytest.M
     """A child that is confined can read the stage and write its scene, as for a user."""
     stage = write_stage(tmp_path, sphere=True)
     for budget, message in (("0", "from 1 to"), ("20", "emitters take")):
-        assert message in refused("convert", stage, tmp_path / "a.json", "--budget", budget)
-    fewer = convert(stage, tmp_path / "few.safetensors", "--budget", "600")
+        assert message in expect_mistake("convert", stage, tmp_path / "a.json", "--budget", budget)
+    fewer = expect_json("convert", stage, tmp_path / "few.safetensors", "--budget", "600")
     use_processes(monkeypatch)
-    whole = convert(stage, tmp_path / "whole.safetensors")
+    whole = expect_json("convert", stage, tmp_path / "whole.safetensors")
     assert loaded(tmp_path / "whole.safetensors").environment is not None, "its DomeLight"
     assert fewer["triangles"] <= 600 < whole["triangles"]
     assert any("reduced to" in note for note in fewer["notes"])
     loaded(tmp_path / "few.safetensors").check()
-
-
-MISTAKES = (
-    ("absent.usda", "a.json", "no such file"),
-    ("a.txt", "a.json", "cannot be read as a scene"),
-    ("a.usda", "a.obj", "cannot be written as a scene"),
-    ("broken.usda", "a.json", "not readable as USD"),
-    ("empty.h5", "a.usda", "not a readable HDF5 file"),
-    ("https://x.y/a.usda", "a.json", "only files of this machine"),
-    ("meshless.json", "a.usda", "absent.obj"),
-)
 
 
 def test_mistakes(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -419,9 +375,17 @@ def test_mistakes(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     meshless.write_text(meshless.read_text().replace("templates/", "absent.obj/"))
     monkeypatch.chdir(tmp_path)
     before = set(tmp_path.iterdir())
-    for source, target, message in MISTAKES:
+    for source, target, message in (
+        ("absent.usda", "a.json", "no such file"),
+        ("a.txt", "a.json", "cannot be read as a scene"),
+        ("a.usda", "a.obj", "cannot be written as a scene"),
+        ("broken.usda", "a.json", "not readable as USD"),
+        ("empty.h5", "a.usda", "not a readable HDF5 file"),
+        ("https://x.y/a.usda", "a.json", "only files of this machine"),
+        ("meshless.json", "a.usda", "absent.obj"),
+    ):
         with case(source):
-            assert message in refused("convert", source, target)
+            assert message in expect_mistake("convert", source, target)
         assert set(tmp_path.iterdir()) == before, source
 
 
@@ -431,7 +395,7 @@ def test_a_crash_in_native_code_is_one_line(
     stage = write_stage(tmp_path)
     use_processes(monkeypatch)
     monkeypatch.setattr(reader, "source_keys", crash)
-    told = refused("convert", stage, tmp_path / "a.json")
+    told = expect_mistake("convert", stage, tmp_path / "a.json")
     assert "stage.usda: could not be read (crashed_signal_11" in told
 
 
@@ -447,7 +411,7 @@ def test_passes_are_of_the_views_that_are_named(dataset: Path, tmp_path: Path) -
     """Of a dataset, of one scene of it, and of the file of a scene; what is not there is named."""
     out = tmp_path / "out"
     words = ("--passes", "normal,depth", "--passes", "object", "--device", "cpu", "--out", out)
-    found = said("passes", dataset, *words)
+    found = expect_json("passes", dataset, *words)
     assert found["passes"] == ["object", "depth_axis_m", "shading_normal"]
     assert [Path(path).name for path in found["files"]] == [
         f"{scene:09d}.{view}.passes.exr" for scene in (2, 0, 1) for view in range(2)
@@ -456,7 +420,7 @@ def test_passes_are_of_the_views_that_are_named(dataset: Path, tmp_path: Path) -
     data = (out / "000000002.1.passes.exr").read_bytes()
     assert data == passes_exr(furnished(["a"]), names, view=1, resolution=16)
     one = ("--scene", "1", "--view", "1", "--resolution", "8", "--rays-a-side", "2")
-    (path,) = said("passes", dataset, *one, "--out", tmp_path / "one")["files"]
+    (path,) = expect_json("passes", dataset, *one, "--out", tmp_path / "one")["files"]
     assert Path(path).name == "000000001.1.passes.exr"
     assert set(decode_passes_exr(Path(path).read_bytes(), 8)) == {
         *("object", "coverage", "depth_axis_m", "shading_normal")
@@ -464,7 +428,7 @@ def test_passes_are_of_the_views_that_are_named(dataset: Path, tmp_path: Path) -
     file = tmp_path / "floor.safetensors"
     file.write_bytes(encode_scene(tiny_scene()))
     options = ("--view", "0", "--passes", "triangle", "--device", "cpu")
-    found = said("passes", file, *options, "--out", tmp_path)
+    found = expect_json("passes", file, *options, "--out", tmp_path)
     assert found["files"] == [str(tmp_path / "floor.0.passes.exr")]
     data = (tmp_path / "floor.0.passes.exr").read_bytes()
     assert data == passes_exr(tiny_scene(), ["triangle"], view=0, resolution=256)
@@ -474,7 +438,9 @@ def test_passes_are_of_the_views_that_are_named(dataset: Path, tmp_path: Path) -
         ("--passes", "dept", "did you mean depth?"),
         ("--passes", "motion_px", "another moment"),
     ):
-        assert message in refused("passes", dataset, option, value, "--out", tmp_path / "none")
+        assert message in expect_mistake(
+            "passes", dataset, option, value, "--out", tmp_path / "none"
+        )
     assert not (tmp_path / "none").exists()
 
 
@@ -484,7 +450,7 @@ def test_passes_take_a_gpu_that_passes_the_probe(
     """Here LLVM stands for it; without one `gpu` is refused, and a failed probe is a note."""
     monkeypatch.setenv("CUDA_VISIBLE_DEVICES", "")
     words = ("passes", dataset, "--scene", "1", "--view", "1", "--passes", "object")
-    told = refused(*words, "--device", "gpu", "--out", tmp_path / "none")
+    told = expect_mistake(*words, "--device", "gpu", "--out", tmp_path / "none")
     assert "--device is gpu, and no NVIDIA GPU is visible here" in told
     assert not (tmp_path / "none").exists()
     traced = []
@@ -492,7 +458,7 @@ def test_passes_take_a_gpu_that_passes_the_probe(
         monkeypatch.setattr(passes_command, "choose_gpu", lambda *_, device, found=found: found)
         with monkeypatch.context() as patched:
             patched.setattr(passes_command, "Surfaces", lambda scene: traced.append(scene))
-            notes = said(*words, "--out", tmp_path / "out")["notes"]
+            notes = expect_json(*words, "--out", tmp_path / "out")["notes"]
         assert ("see trilight doctor" in str(notes)) == bool(found[1])
         assert len(traced) == bool(found[1])
 
@@ -501,7 +467,7 @@ def test_a_size_is_described() -> None:
     text = trilight(["model", "base"]).stdout
     for word in ("194.96 M", "692.7 GFLOP", "memory, bfloat16", "cross-attention"):
         assert word in text
-    found = said("model", "large", "--views", "4", "--resolution", "512")
+    found = expect_json("model", "large", "--views", "4", "--resolution", "512")
     assert sum(found["parameters"].values()) == 483_266_819
     assert found["workload"] == {"resolution": 512, "triangles": 1536, "views": 4}
     assert found["config"]["window_bundles"] == 8
@@ -513,11 +479,11 @@ def test_a_checkpoint_is_described_and_published(tmp_path: Path) -> None:
     path = tmp_path / "model.safetensors"
     path.write_bytes(encode_weights(model))
     target = tmp_path / "published"
-    found = said("model", path, "--publish", target, "--resolution", "64")
+    found = expect_json("model", path, "--publish", target, "--resolution", "64")
     assert found["config"]["window_bundles"] == 8
     again = open_network(str(target))
     for (name, a), b in zip(again.named_parameters(), model.parameters(), strict=True):
         assert torch.equal(a, b), name
     path.write_bytes(encode_weights(awake(tiny_config(), torch.float32)))
-    assert "head linear" in refused("model", str(path), "--publish", str(tmp_path / "out"))
+    assert "head linear" in expect_mistake("model", str(path), "--publish", str(tmp_path / "out"))
     assert not (tmp_path / "out").exists()

@@ -33,7 +33,7 @@ from storage.records.sample import Sample, encode_sample
 from storage.records.scene import Scene
 from storage.records.scene_file import encode_scene, scene_digest
 from storage.settings.overrides import option_words
-from tests.command_line import trilight
+from tests.command_line import expect_json, expect_mistake, expect_output
 from tests.crash import CrashingRenderer
 from tests.for_each import case
 from tests.infra.child_here import use_processes
@@ -51,25 +51,12 @@ SMALL = (*FEW, "--noise-floor", "90")
 
 def printed(*words: str | Path) -> str:
     """Return what a render says, in one line: long paths break it even on a wide screen."""
-    ended = trilight(["render", *map(str, words)], env={"COLUMNS": "400"})
-    assert ended.exit_code == 0, ended.exception
-    return " ".join(ended.stdout.split())
+    return " ".join(expect_output("render", *words, COLUMNS="400").split())
 
 
 def render(*words: str | Path) -> dict[str, Any]:
     """Return what `trilight render --json` prints of a small picture."""
-    return rendered(*words, *SMALL)
-
-
-def rendered(*words: str | Path) -> dict[str, Any]:
-    ended = trilight(["render", *map(str, words), "--json"])
-    assert ended.exit_code == 0, ended.exception
-    return dict(json.loads(ended.output))
-
-
-def mistake(*words: str | Path) -> str:
-    """Return the one line that a mistake becomes."""
-    return trilight(["render", *map(str, words)]).mistake
+    return expect_json("render", *words, *SMALL)
 
 
 def header(path: Path) -> dict[str, Any]:
@@ -354,7 +341,7 @@ def test_a_preview_says_that_its_error_is_unknown(source: Path, tmp_path: Path) 
     found = header(out)
     assert found["spp"] == 3 and json.loads(found["settings"])["denoiser"] == "fast"
     assert not [name for name in found if "noise_floor" in name]
-    assert rendered(*words)["spp"] == 3
+    assert expect_json("render", *words)["spp"] == 3
     assert "3, not denoised" in printed(*words, "--denoiser", "off")
 
 
@@ -372,7 +359,7 @@ def test_what_is_chosen_is_said_made_and_recorded(source: Path, tmp_path: Path) 
     assert json.loads(recorded["settings"])["spp"] == recorded["spp"]
     for option, value in (("--seconds", "1e-9"), ("--seconds", "0.05"), ("--error", "0")):
         with case(f"{option} {value}"):
-            found = rendered(*words, option, value)
+            found = expect_json("render", *words, option, value)
             assert found["chosen_for"] == f"{option} {value}".replace("1e-9", "1e-09")
             assert found["choice"].startswith(found["chosen_for"])
             assert ("nothing is as quick" in found["choice"]) == (value == "1e-9")
@@ -380,7 +367,7 @@ def test_what_is_chosen_is_said_made_and_recorded(source: Path, tmp_path: Path) 
             assert "noise_floor_db" not in found
     orbit = (source, "--out", tmp_path / "turn", "--orbit", "2", *words[3:], "--seconds", "1e-9")
     for kept in (False, True):
-        for picture in rendered(*orbit)["pictures"]:
+        for picture in expect_json("render", *orbit)["pictures"]:
             assert (picture["kept"], picture["picture_seconds"] is None) == (kept, kept)
 
 
@@ -427,20 +414,8 @@ def test_refusals_are_one_line(
         to = [] if "--out" in words else ["--out", "x.exr"]
         wide = [] if "--resolution" in words else ["--resolution", "32"]
         with case(line):
-            assert message in mistake(*of, *words, *to, *wide)
+            assert message in expect_mistake("render", *of, *words, *to, *wide)
     assert not Path("x.exr").exists()
-
-
-BAD_SOURCES = {
-    "absent.json": "no such file",
-    "https://me:secret@host/a.json": "https://host/a.json: only files of this",
-    "simplecache::https://host/a.tar::0": "only files of this machine",
-    "absent.tar::../x": "no shard and key",
-    "set": "a folder; expected a scene",
-    "text.safetensors": "text.safetensors: safetensors: the header claims",
-    "train-000000.tar": "expected .*train-000000.tar::KEY",
-    "train-000000.tar::000000013": "no sample 000000013; expected one of its 2: 0000000",
-}
 
 
 def test_a_bad_source_is_one_line(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -448,7 +423,16 @@ def test_a_bad_source_is_one_line(tmp_path: Path, monkeypatch: pytest.MonkeyPatc
     Path("set").mkdir()
     Path("text.safetensors").write_text("no scene")
     _shard(tmp_path / "train-000000.tar", tiny_scene())
-    for source, message in BAD_SOURCES.items():
+    for source, message in {
+        "absent.json": "no such file",
+        "https://me:secret@host/a.json": "https://host/a.json: only files of this",
+        "simplecache::https://host/a.tar::0": "only files of this machine",
+        "absent.tar::../x": "no shard and key",
+        "set": "a folder; expected a scene",
+        "text.safetensors": "text.safetensors: safetensors: the header claims",
+        "train-000000.tar": "expected .*train-000000.tar::KEY",
+        "train-000000.tar::000000013": "no sample 000000013; expected one of its 2: 0000000",
+    }.items():
         with case(source), pytest.raises(TrilightError, match=message) as caught:
             load_source(scene_source(source))
         assert "\n" not in str(caught.value), source
@@ -470,7 +454,9 @@ def test_no_engine_takes_a_vertex_beyond_the_farthest_position(
     shard = _shard(tmp_path / "train-000000.tar", tiny_scene(vertex_positions=positions))
     sources: tuple[str | Path, ...] = (described, f"{shard}::000000012")
     for engine, source in itertools.product(("mitsuba", "neural"), sources):
-        told = mistake(source, "--engine", engine, "--out", tmp_path / "x.exr", *SMALL)
+        told = expect_mistake(
+            "render", source, "--engine", engine, "--out", tmp_path / "x.exr", *SMALL
+        )
         assert "vertex_positions[0, 0] is " in told and "expected from -10000 to 10000 m" in told
     assert not (tmp_path / "x.exr").exists()
 
@@ -481,5 +467,5 @@ def test_a_crash_in_native_code_is_one_line(
     """In a real child, which loads no renderer to be quick."""
     use_processes(monkeypatch)
     monkeypatch.setattr(path_tracer, "RenderWorker", CrashingRenderer)
-    told = mistake(source, "--out", tmp_path / "x.exr", *SMALL)
+    told = expect_mistake("render", source, "--out", tmp_path / "x.exr", *SMALL)
     assert told.startswith("tiny.safetensors: rendering failed (crashed_signal_11")

@@ -84,21 +84,18 @@ def test_mistakes_and_the_first_words_come_before_torch(tmp_path: Path) -> None:
     assert "train needs PyTorch, which is not installed" in said["steps"]
 
 
-@pytest.fixture
-def command(tmp_path: Path) -> list[str]:
-    """The words of a run without end, in a folder with a blank in its name."""
-    data = write_toy_dataset(tmp_path / "the data", train=4, validation=0, resolution=16)
-    words = ["train", "smoke", "--data", str(data.folder.root)]
-    words += ["--out", str(tmp_path / "my runs" / "first"), "--device", "cpu"]
-    words += ["--set", "checkpoint_every=50000", "--steps", "100000"]
-    return words + [part for name, value in TINY.items() for part in ("--set", f"{name}={value}")]
-
-
 def test_a_run_that_is_stopped_says_what_goes_on(
-    command: list[str], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """Typed again as printed; real processes that are stopped are those of test_processes."""
+    """Typed again as printed; real processes that are stopped are those of test_processes.
+
+    A run without end, in a folder with a blank in its name.
+    """
     out = tmp_path / "my runs" / "first"
+    data = write_toy_dataset(tmp_path / "the data", train=4, validation=0, resolution=16)
+    command = ["train", "smoke", "--data", str(data.folder.root), "--out", str(out)]
+    command += ["--device", "cpu", "--set", "checkpoint_every=50000", "--steps", "100000"]
+    command += [part for name, value in TINY.items() for part in ("--set", f"{name}={value}")]
     monkeypatch.setattr(sys, "argv", ["trilight", *command, "--resume"])
     advance = _BarProgress.advance
     steps: list[int] = []

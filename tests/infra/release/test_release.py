@@ -5,8 +5,7 @@ import hashlib
 import json
 import os
 import sys
-from collections.abc import Iterator, Mapping, Sequence
-from contextlib import contextmanager
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -26,21 +25,20 @@ from infra.release.__main__ import (
 from infra.release.push_to_hub import kind_of, planned_upload, require_within_limits
 from model.open import open_network
 from pipeline.documents.checksums import SUMS, published_files
-from storage.dataset.dataset import Dataset, open_dataset
+from storage.dataset.dataset import Dataset
 from storage.dataset.verify import verify_dataset
-from storage.digests import sha256_hex
 from storage.errors import TrilightError
-from tests.command_line import run_program, trilight
+from tests.command_line import expect_output, run_program
 from tests.conftest import ROOT
 from tests.http_server import Handler, running
 from tests.pipeline.documents.dataset_by_hand import (
-    edit_manifest,
     five_scenes,
     furnished,
     read,
     sample,
     write_dataset,
 )
+from tests.storage.dataset.test_verify import opened
 
 
 def beside(key: str, network_db: float) -> SceneComparison:
@@ -108,7 +106,7 @@ def test_sums_are_of_what_is_uploaded(tmp_path: Path, capsys: pytest.CaptureFixt
     lines = (root / SUMS).read_text().splitlines()
     assert {line.split("  ")[1] for line in lines} >= {"manifest.json", "train-000000.tar"}
     assert not (root / "report.html").exists()
-    assert trilight(["inspect", str(root), "--scenes", "1"]).exit_code == 0
+    expect_output("inspect", root, "--scenes", "1")
     lines = (root / SUMS).read_text().splitlines()
     assert "report.html" in {line.split("  ")[1] for line in lines}, "sums went stale"
     for line in lines:
@@ -124,9 +122,7 @@ TOKEN = "hf_mine"
 
 @pytest.fixture
 def dataset(tmp_path: Path) -> Dataset:
-    five = five_scenes(tmp_path / "set")
-    digest = sha256_hex(five.folder.objects_lock.read_bytes())
-    made = open_dataset(str(edit_manifest(five, objects_lock_sha256=digest)))
+    made = opened(five_scenes(tmp_path / "set"))
     (made.folder.root / "README.md").write_text("# A set\n")
     logs = made.folder.root / "logs"
     logs.mkdir(exist_ok=True)
@@ -159,9 +155,9 @@ def pushed(
 
 
 def test_the_hub_gets_every_file_and_reads_as_it_was(dataset: Dataset, tmp_path: Path) -> None:
-    there = tmp_path / "hub"
+    there, made = tmp_path / "hub", list[dict[str, Any]]()
     there.mkdir()
-    with hub_for_uploads(there, TOKEN) as (url, made):
+    with running(_Hub, root=there, token=TOKEN, made=made) as url:
         words = [str(dataset.folder.root), "ada/set", "--json"]
         asked = [("hf_other", words), (TOKEN, [*words, "--private"]), (TOKEN, words)]
         refused, public, result = pushed(asked, settings_of(url, TOKEN, tmp_path / "home"), there)
@@ -226,10 +222,9 @@ def test_the_limits_of_the_hub(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) 
 
 def test_a_dry_run_sends_nothing(dataset: Dataset) -> None:
     words = ["push", str(dataset.folder.root), "ada/my_set-1.0"]
-    result = trilight([*words, "--private", "--dry-run"])
-    assert result.exit_code == 0, result.exception
-    assert "Would be uploaded" in result.output
-    assert f"Next: trilight {' '.join(words)} --private" in result.output
+    said = expect_output(*words, "--private", "--dry-run")
+    assert "Would be uploaded" in said
+    assert f"Next: trilight {' '.join(words)} --private" in said
 
 
 LARGE = (".tar", ".safetensors")
@@ -240,6 +235,7 @@ class _Hub(Handler):
     root: Path
     token: str
     made: list[dict[str, Any]]
+    """Repositories that it was asked to make."""
 
     def do_GET(self) -> None:
         self.reply_json({"id": "ada/set", "sha": "0" * 40, "siblings": [], "private": False})
@@ -304,14 +300,6 @@ class _Hub(Handler):
             place = self.root / value["path"]
             place.parent.mkdir(parents=True, exist_ok=True)
             place.write_bytes(data)
-
-
-@contextmanager
-def hub_for_uploads(root: Path, token: str) -> Iterator[tuple[str, list[dict[str, Any]]]]:
-    """Run the server; returns its URL and what repositories it was asked to make."""
-    made: list[dict[str, Any]] = []
-    with running(_Hub, root=root, token=token, made=made) as url:
-        yield url, made
 
 
 def settings_of(url: str, token: str, home: Path) -> dict[str, str]:

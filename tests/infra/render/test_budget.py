@@ -213,20 +213,17 @@ def _record(**changes: Any) -> bytes:
     return json.dumps(settings_record(costs_of_here()) | changes).encode()
 
 
-DAMAGED = [
-    (b"", "not JSON"),
-    (b"[" * 100_000, "not JSON"),
-    (b"[1, 2]", "expected"),
-    (_record(rows=[]), "is missing; expected each part at each width"),
-    (_record().replace(b'"width": 64', b'"width": 63.5', 1), "expected a whole number"),
-    (_record().replace(b'"serial_s": 1', b'"serial_s": -1', 1), "expected a number from 0"),
-    (_record(more=1), "does not exist"),
-]
-
-
 @pytest.mark.usefixtures("cache")
 def test_damaged_costs_are_not_used() -> None:
-    for data, said in DAMAGED:
+    for data, said in [
+        (b"", "not JSON"),
+        (b"[" * 100_000, "not JSON"),
+        (b"[1, 2]", "expected"),
+        (_record(rows=[]), "is missing; expected each part at each width"),
+        (_record().replace(b'"width": 64', b'"width": 63.5', 1), "expected a whole number"),
+        (_record().replace(b'"serial_s": 1', b'"serial_s": -1', 1), "expected a number from 0"),
+        (_record(more=1), "does not exist"),
+    ]:
         with case(said):
             path = machine_costs_path()
             path.parent.mkdir(parents=True, exist_ok=True)

@@ -84,17 +84,14 @@ def frame(name: str, key: str | None, error: float) -> Frame:
     )
 
 
-FRAMES: list[tuple[tuple[str, str | None], tuple[str, str | None], bool]] = [
-    (("a.safetensors", None), ("a.safetensors", None), True),
-    (("stage.usda", "1"), ("stage.usda", "2"), True),
-    (("s.tar", "000000001"), ("s.tar", "000000001"), True),
-    (("s.tar", "000000001"), ("s.tar", "000000002"), False),
-    (("0.h5", None), ("1.h5", None), False),
-]
-
-
 def test_only_frames_of_one_scene_or_stage_flicker() -> None:
-    for before, now, goes_on in FRAMES:
+    for before, now, goes_on in [
+        (("a.safetensors", None), ("a.safetensors", None), True),
+        (("stage.usda", "1"), ("stage.usda", "2"), True),
+        (("s.tar", "000000001"), ("s.tar", "000000001"), True),
+        (("s.tar", "000000001"), ("s.tar", "000000002"), False),
+        (("0.h5", None), ("1.h5", None), False),
+    ]:
         with case((before, now, goes_on)):
             found = flicker(frame(*before, 0.1), frame(*now, 0.2))
             assert (found is not None) == goes_on

@@ -61,11 +61,9 @@ Pairs = list[tuple[SceneSource, Camera | int]]
 
 
 @pytest.fixture
-def turn(tmp_path: Path) -> Pairs:
-    path = tmp_path / "tiny.safetensors"
-    path.write_bytes(encode_scene(tiny_scene()))
+def turn(source: Path) -> Pairs:
     cameras = orbit(tiny_scene(), Camera.of_scene(tiny_scene(), 0), 4, 360)
-    return pair_cameras([SceneSource(path=path, key=None)], cameras)
+    return pair_cameras([SceneSource(path=source, key=None)], cameras)
 
 
 def run(

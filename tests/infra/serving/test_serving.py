@@ -1,6 +1,5 @@
 """`make serve`: its password, its parts that end together, and the form of its training."""
 
-import contextlib
 import dataclasses
 import json
 import os
@@ -11,7 +10,6 @@ import subprocess
 import sys
 import time
 import tomllib
-from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 from unittest import mock
@@ -111,9 +109,17 @@ def test_a_port_of_somebody_else_is_refused(monkeypatch: pytest.MonkeyPatch) -> 
 
 def test_an_answer_counts_only_while_our_server_lives(tmp_path: Path) -> None:
     """A server that cannot bind ends while a stranger answers for it."""
+
+    class Healthy(http_server.Handler):
+        def do_GET(self) -> None:
+            self.reply(200, b"")
+
     ends = mock.Mock(poll=mock.Mock(side_effect=[None, *[1] * 9]))
-    with healthy_server() as url, pytest.raises(TrilightError, match="did not start: it ended"):
-        wait_until_healthy(url, ends, tmp_path / "log")
+    with (
+        http_server.running(Healthy) as url,
+        pytest.raises(TrilightError, match="did not start: it ended"),
+    ):
+        wait_until_healthy(f"{url}/api", ends, tmp_path / "log")
 
 
 def test_a_slow_server_is_waited_for_with_signs_of_life(
@@ -128,16 +134,6 @@ def test_a_slow_server_is_waited_for_with_signs_of_life(
     ):
         wait_until_healthy("http://127.0.0.1:9", server, tmp_path / "log", said.append)
     assert said and "still starting" in said[0]
-
-
-@contextlib.contextmanager
-def healthy_server() -> Iterator[str]:
-    class Healthy(http_server.Handler):
-        def do_GET(self) -> None:
-            self.reply(200, b"")
-
-    with http_server.running(Healthy) as url:
-        yield f"{url}/api"
 
 
 def test_wrong_variables_are_named(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -283,9 +279,6 @@ def test_the_password_is_no_argument_and_is_not_said(
     assert said.splitlines()[0].startswith("starting Prefect's server at http://my-host:4200")
 
 
-SECOND_STAGES = sorted(name for name in TRAINING_PRESETS if training_preset(name).from_weights)
-
-
 def _parameters(**given: Any) -> dict[str, Any]:
     """Return what the flow is called with where nothing else is filled in."""
     plain = {field.name: field.default for field in describe_fields(TrainOptions)}
@@ -313,19 +306,16 @@ def test_the_form_has_every_run_and_every_setting() -> None:
     ]  # fmt: skip
 
 
-WRONG_FORMS: list[tuple[dict[str, Any], str]] = [
-    ({"run": "pretain"}, "run"),
-    ({"changes": {"warm_up": 3}}, "changes.warm_up"),
-    ({"changes": {"model": {"width": 0}}}, "changes.model.width"),
-    ({"changes": {"betas": [0.9, 1.0]}}, "changes.betas: expected numbers from 0 to below 1"),
-]
-
-
 def test_a_wrong_form_is_refused_before_a_run_exists() -> None:
-    for parameters, message in WRONG_FORMS:
-        with case(parameters):
-            with pytest.raises(ParameterTypeError, match=message):
-                train_model.validate_parameters(parameters)
+    wrong: list[tuple[dict[str, Any], str]] = [
+        ({"run": "pretain"}, "run"),
+        ({"changes": {"warm_up": 3}}, "changes.warm_up"),
+        ({"changes": {"model": {"width": 0}}}, "changes.model.width"),
+        ({"changes": {"betas": [0.9, 1.0]}}, "changes.betas: expected numbers from 0 to below 1"),
+    ]
+    for parameters, message in wrong:
+        with case(parameters), pytest.raises(ParameterTypeError, match=message):
+            train_model.validate_parameters(parameters)
 
 
 def test_laws_between_settings_are_checked_before_the_command() -> None:
@@ -338,7 +328,7 @@ def test_laws_between_settings_are_checked_before_the_command() -> None:
 
 
 def test_a_second_stage_begins_with_the_first() -> None:
-    for run in SECOND_STAGES:
+    for run in sorted(name for name in TRAINING_PRESETS if training_preset(name).from_weights):
         with case(run):
             form = RunChanges(**{"loss": {"perceptual_weight": 0.1}, "num_steps": 9000})
             given = {"run": run, "begin_with": "runs/pretrain", "lpips": "hub", "changes": form}

@@ -29,26 +29,18 @@ def build(project: Path, site: Path) -> subprocess.CompletedProcess[str]:
     )
 
 
-@pytest.fixture(scope="module")
-def site(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    folder = tmp_path_factory.mktemp("docs") / "site"
-    done = build(ROOT, folder)
-    assert done.returncode == 0, done.stdout + done.stderr
-    return folder
-
-
 @pytest.mark.slow("packaging")
-def test_every_page_is_built_and_in_the_navigation(site: Path) -> None:
+def test_every_page_is_built_and_nothing_is_fetched_from_a_server(tmp_path: Path) -> None:
+    """Every page is in the navigation; files beside docs are pages too."""
+    site = tmp_path / "site"
+    done = build(ROOT, site)
+    assert done.returncode == 0, done.stdout + done.stderr
     shown = (site / "index.html").read_text()
     for page in (ROOT / "docs").rglob("*.md"):
         name = "index.md" if page.name == "README.md" else page.name
         uri = page.relative_to(ROOT / "docs").with_name(name).with_suffix(".html").as_posix()
         assert (site / uri).exists(), uri
         assert f'href="{uri}"' in shown or uri == "index.html", uri
-
-
-@pytest.mark.slow("packaging")
-def test_nothing_is_fetched_from_a_server(site: Path) -> None:
     pages = list(site.rglob("*.html"))
     assert len(pages) > 60
     for page in pages:
@@ -56,12 +48,8 @@ def test_nothing_is_fetched_from_a_server(site: Path) -> None:
     index = (site / "search" / "search_index.js").read_text()
     assert "var __index" in index[:20]
     assert "results/studies.html" not in index  # a row's words would hide the pages for users
-
-
-@pytest.mark.slow("packaging")
-def test_files_beside_docs_are_pages_too(site: Path) -> None:
-    page = (site / "how-to" / "servers-and-clusters.html").read_text()
-    assert 'href="../source/infra/slurm/generate.sbatch.html"' in page
+    servers = (site / "how-to" / "servers-and-clusters.html").read_text()
+    assert 'href="../source/infra/slurm/generate.sbatch.html"' in servers
     assert "SHARDS_PER_TASK" in (site / "source/infra/slurm/generate.sbatch.html").read_text()
 
 

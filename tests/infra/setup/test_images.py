@@ -34,6 +34,11 @@ BIN = Path(sys.executable).parent
 DOCKERFILES = sorted(IMAGES.glob("*.Dockerfile"))
 
 
+@pytest.fixture(scope="module")
+def services() -> Any:
+    return yaml.safe_load((IMAGES / "compose.yaml").read_text())["services"]
+
+
 def test_dockerfiles_pass_hadolint() -> None:
     assert DOCKERFILES
     for path in DOCKERFILES:
@@ -65,7 +70,7 @@ def test_manifests_validate() -> None:
     assert all(path.name in done.stdout for path in paths), done.stdout
 
 
-def test_every_container_has_a_home_that_it_may_write() -> None:
+def test_every_container_has_a_home_that_it_may_write(services: Any) -> None:
     """Volumes take what is written: /tmp is the home of everything that needs one."""
     found = containers()
     assert len(found) == 4
@@ -73,8 +78,7 @@ def test_every_container_has_a_home_that_it_may_write() -> None:
         assert container["imagePullPolicy"] == "IfNotPresent", name  # no registry has the image
         assert "/tmp" in {mount["mountPath"] for mount in container["volumeMounts"]}, name
         assert {"name": "HOME", "value": "/tmp"} in container["env"], name
-    compose = yaml.safe_load((IMAGES / "compose.yaml").read_text())
-    ours = {name: row for name, row in compose["services"].items() if "trilight" in row["image"]}
+    ours = {name: row for name, row in services.items() if "trilight" in row["image"]}
     assert set(ours) == {"server", "worker", "deploy"}
     for name, service in ours.items():
         assert service["tmpfs"] == ["/tmp"], name
@@ -86,10 +90,11 @@ def _deploying() -> dict[str, Any]:
     return job
 
 
-def test_nobody_can_start_a_server_without_a_password_or_a_pool_that_offers_commands() -> None:
+def test_nobody_can_start_a_server_without_a_password_or_a_pool_that_offers_commands(
+    services: Any,
+) -> None:
     """A worker would make a pool that is not there, and Prefect's own offers everything."""
-    compose = yaml.safe_load((IMAGES / "compose.yaml").read_text())["services"]
-    commands = {name: shlex.split(str(compose[name]["command"])) for name in ("server", "worker")}
+    commands = {name: shlex.split(str(services[name]["command"])) for name in ("server", "worker")}
     for name, _, container in containers()[:-1]:
         commands[f"kubernetes {name}"] = container["command"]
     for name, command in commands.items():
@@ -97,18 +102,17 @@ def test_nobody_can_start_a_server_without_a_password_or_a_pool_that_offers_comm
             assert command[:3] == ["python", "-m", "pipeline.flows.guarded_server"], name
         if "worker" in name:
             assert "--no-create-pool-if-not-found" in command and "--type" not in command, name
-    for words in (compose["deploy"]["command"].split(), _deploying()["command"]):
+    for words in (services["deploy"]["command"].split(), _deploying()["command"]):
         assert words[:3] == ["python", "-m", deployments.__name__]
         assert len(words) == 5 and words[4].endswith(".json")  # the pool's own template
 
 
-def test_no_password_stands_in_a_file_and_every_port_is_on_loopback() -> None:
+def test_no_password_stands_in_a_file_and_every_port_is_on_loopback(services: Any) -> None:
     """And workers hold no key that administers the store."""
-    compose = yaml.safe_load((IMAGES / "compose.yaml").read_text())
-    environments = {name: str(row["environment"]) for name, row in compose["services"].items()}
+    environments = {name: str(row["environment"]) for name, row in services.items()}
     root = {name for name, text in environments.items() if "STORE_ROOT_PASSWORD" in text}
     assert root == {"store", "bucket"}
-    for name, service in compose["services"].items():
+    for name, service in services.items():
         assert all(port.startswith("127.0.0.1:") for port in service.get("ports", ())), name
         for key, value in service.get("environment", {}).items():
             if any(word in key for word in ("PASSWORD", "AUTH", "CONNECTION_URL", "KEY", "AWS")):
@@ -116,14 +120,14 @@ def test_no_password_stands_in_a_file_and_every_port_is_on_loopback() -> None:
                 assert "${" in value and ":?" in value, f"{name}: {key}"
     for line in (IMAGES / "passwords.example").read_text().splitlines():
         assert line.endswith("=")
-    assert "PREFECT_SERVER_API_AUTH_STRING" in compose["services"]["server"]["environment"]
+    assert "PREFECT_SERVER_API_AUTH_STRING" in services["server"]["environment"]
     # where they are, no copy of the checkout takes them along
     for name in (".dockerignore", ".gitignore"):
         lines = {line.strip("/") for line in (ROOT / name).read_text().splitlines()}
         assert {".env", "**/.env", "prefect.toml"} <= lines, name
 
 
-def test_images_can_write_buckets_and_locks_hold_each_other() -> None:
+def test_images_can_write_buckets_and_locks_hold_each_other(services: Any) -> None:
     locked = {
         name: set(_read_lock(ROOT / f"requirements/{name}.txt"))
         for name in ("dataset", "served", "all")
@@ -132,13 +136,8 @@ def test_images_can_write_buckets_and_locks_hold_each_other() -> None:
     assert {pin.partition("==")[0] for pin in locked["served"]} >= {"s3fs", "gcsfs"}
     for path in IMAGES.glob("*.Dockerfile"):
         assert " served" in path.read_text().partition("install.sh /opt/venv/bin/python")[2], path
-    compose = yaml.safe_load((IMAGES / "compose.yaml").read_text())
     names = {"AWS_ACCESS_KEY_ID", "AWS_SECRET_ACCESS_KEY", "AWS_ENDPOINT_URL"}
-    has = {
-        name
-        for name, row in compose["services"].items()
-        if names <= set(row.get("environment", {}))
-    }
+    has = {name for name, row in services.items() if names <= set(row.get("environment", {}))}
     assert has == {"worker"}  # who needs no key has none
     (source,) = containers()[-1][2]["envFrom"]
     assert source["secretRef"]["name"] == "trilight-bucket"
@@ -162,10 +161,9 @@ def test_flows_write_to_volumes_whatever_their_form_says() -> None:
     assert mounts == {"/data", "/cache", "/tmp"}
 
 
-def test_what_makes_the_limits_is_told_how_many_cards_there_are() -> None:
+def test_what_makes_the_limits_is_told_how_many_cards_there_are(services: Any) -> None:
     """Where they are made, there is no card."""
-    compose = yaml.safe_load((IMAGES / "compose.yaml").read_text())["services"]["deploy"]
-    assert "TRILIGHT_CARDS" in compose["environment"]
+    assert "TRILIGHT_CARDS" in services["deploy"]["environment"]
     assert "TRILIGHT_CARDS" in {row["name"] for row in _deploying()["env"]}
 
 
@@ -285,11 +283,6 @@ CONFINED = {
     "capabilities": {"drop": ["ALL"]},
 }
 CLOSED = {"podSelector": {}, "policyTypes": ["Ingress", "Egress"]}
-
-
-@pytest.fixture(scope="module")
-def services() -> Any:
-    return yaml.safe_load((IMAGES / "compose.yaml").read_text())["services"]
 
 
 def of_kind(kind: str) -> list[dict[str, Any]]:

@@ -29,29 +29,25 @@ def tree(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return folder
 
 
-PREFIXED = [
-    ("from storage.errors import Rejected", "from trilight.storage.errors import Rejected"),
-    ("if x:\n    from train import run", "if x:\n    from trilight.train import run"),
-    ("import model.config as c, os", "import trilight.model.config as c, os"),
-    ("é = 1; from infra import cli", "é = 1; from trilight.infra import cli"),
-    ("from pipeline.a import (\n    b,\n)", "from trilight.pipeline.a import (\n    b,\n)"),
-    ("from trilight.extend import Scene", "from trilight.extend import Scene"),
-    ("from model_zoo import storage", "from model_zoo import storage"),
-    ("text = 'from storage import scene'", "text = 'from storage import scene'"),
-]  # fmt: skip
-
-
 def test_imports_get_the_prefix_and_nothing_else_does() -> None:
-    for source, expected in PREFIXED:
+    for source, expected in [
+        ("from storage.errors import Rejected", "from trilight.storage.errors import Rejected"),
+        ("if x:\n    from train import run", "if x:\n    from trilight.train import run"),
+        ("import model.config as c, os", "import trilight.model.config as c, os"),
+        ("é = 1; from infra import cli", "é = 1; from trilight.infra import cli"),
+        ("from pipeline.a import (\n    b,\n)", "from trilight.pipeline.a import (\n    b,\n)"),
+        ("from trilight.extend import Scene", "from trilight.extend import Scene"),
+        ("from model_zoo import storage", "from model_zoo import storage"),
+        ("text = 'from storage import scene'", "text = 'from storage import scene'"),
+    ]:  # fmt: skip
         with case(source):
             assert with_prefix(source) == expected
 
 
 def test_an_import_that_binds_a_package_of_ours_is_refused() -> None:
     for source in ["import storage", "import os, model.config"]:
-        with case(source):
-            with pytest.raises(SyntaxError, match="cannot get a prefix; use from"):
-                with_prefix(source)
+        with case(source), pytest.raises(SyntaxError, match="cannot get a prefix; use from"):
+            with_prefix(source)
 
 
 AT_THE_TOP = re.compile(rf"^\s*(?:from|import) (?:{'|'.join((*PACKAGES, 'tests'))})\b", re.M)

@@ -16,7 +16,7 @@ import pytest
 from pipeline.executors import slurm_and_kubernetes as arrays
 from pipeline.flows import submission
 from pipeline.flows.submission import RunStatus, SubmittedRun
-from tests.command_line import trilight
+from tests.command_line import expect_json, trilight
 from tests.conftest import ROOT
 from tests.infra.slurm.fake_slurm import commands_in
 
@@ -166,9 +166,7 @@ def tools(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
 
 def test_the_printed_commands_do_what_submitting_does(tools: Path) -> None:
     words = ["submit", "kubernetes", "smoke", "--out", "s3://sets/mine", "--files", "my jobs"]
-    dry = trilight([*words, "--dry-run", "--json"])
-    assert dry.exit_code == 0, dry.output
-    said = json.loads(dry.stdout)
+    said = expect_json(*words, "--dry-run")
     assert said["array"] == "0-5" and not said["submitted"] and not (tools / "asked").exists()
     assert all((tools / file).is_file() for file in said["files"])
     printed = trilight([*words, "--dry-run"]).stdout.splitlines()

@@ -177,17 +177,15 @@ def test_pictures_of_one_place_are_judged_by_the_target_and_else_by_the_traced_o
     easel.cancel_all()
 
 
-MEANINGLESS: list[dict[str, Any]] = [
-    {"engine": "none"}, {"resolution": 12}, {"resolution": 8192}, {"resolution": "16"},
-    {"resolution": True}, {"view": 2}, {"view": -1}, {"view": "0"}, {"fov": 0}, {"fov": None},
-    {"fov": float("inf")}, {"c2w": [0] * 16}, {"c2w": [1] * 3}, {"c2w": ["x"] * 16},
-    {"c2w": [-1, 0, 0, 0, 0, 1, 0, 0, 0, 0, 1, 0, 0, 0, 0, 1]}, {"edits": [1]},
-    {"error_db": 99},
-]  # fmt: skip
-
-
 def test_a_wish_that_means_nothing_is_refused() -> None:
-    for changes in MEANINGLESS:
+    meaningless: list[dict[str, Any]] = [
+        {"engine": "none"}, {"resolution": 12}, {"resolution": 8192}, {"resolution": "16"},
+        {"resolution": True}, {"view": 2}, {"view": -1}, {"view": "0"}, {"fov": 0}, {"fov": None},
+        {"fov": float("inf")}, {"c2w": [0] * 16}, {"c2w": [1] * 3}, {"c2w": ["x"] * 16},
+        {"c2w": [-1, 0, 0, 0, 0, 1, 0, 0, 0, 0, 1, 0, 0, 0, 0, 1]}, {"edits": [1]},
+        {"error_db": 99},
+    ]  # fmt: skip
+    for changes in meaningless:
         with case(changes):
             with pytest.raises(TrilightError):
                 parse_picture_options({**request(), **changes}, {"traced": None}, 2)
@@ -217,15 +215,14 @@ def test_the_page_of_a_scene_is_told_all_of_it() -> None:
 
 def test_a_scene_is_saved_with_its_changes_and_nothing_is_written_here() -> None:
     for form in [".glb", ".usda", ".safetensors", ".h5"]:
-        with case(form):
-            with served(room_of({"traced": GreyRenderer(0.4)})) as asker:
-                edits = {"lamps": {"1": {"gain": 2}}}
-                plain = asker.ask("api/export", {"form": form})
-                changed = asker.ask("api/export", {"form": form, "edits": edits})
-                assert plain[0] == changed[0] == 200
-                assert len(changed[1]) > 500 and changed[1] != plain[1]
-                for bad in ("../x.usda", ".exe", "", None, ".json"):
-                    assert asker.ask("api/export", {"form": bad})[0] == 422
+        with case(form), served(room_of({"traced": GreyRenderer(0.4)})) as asker:
+            edits = {"lamps": {"1": {"gain": 2}}}
+            plain = asker.ask("api/export", {"form": form})
+            changed = asker.ask("api/export", {"form": form, "edits": edits})
+            assert plain[0] == changed[0] == 200
+            assert len(changed[1]) > 500 and changed[1] != plain[1]
+            for bad in ("../x.usda", ".exe", "", None, ".json"):
+                assert asker.ask("api/export", {"form": bad})[0] == 422
     textured = room_of({}, scene=textured_scene())  # in more files than one
     assert textured._is_offered(".usdz") and not textured._is_offered(".usda")
 
@@ -254,24 +251,21 @@ def test_a_material_takes_the_place_of_its_texture() -> None:
     assert len(scene.textures) == 2, "the scene that was read stays as it is"
 
 
-WRONG_EDITS: list[tuple[dict[str, Any], str]] = [
-    ({"lamps": {"0": {}}}, "no light"),
-    ({"lamps": {"-1": {}}}, "no light"),
-    ({"lamps": {"1": {"move": [0, 0, 1e9]}}}, "move"),
-    ({"lamps": {"1": {"gain": 0}}}, "gain"),
-    ({"lamps": {"1": 3}}, "lamps"),
-    ({"materials": {"7": {}}}, "no material 7"),
-    ({"materials": {"0": {"diffuse": [2, 0, 0]}}}, "diffuse"),
-    ({"materials": {"0": {"diffuse": [0.9, 0.9, 0.9]}}}, "diffuse \\+ specular"),
-    ({"materials": {"0": {"roughness": -1}}}, "roughness"),
-]
-
-
 def test_what_means_nothing_is_refused() -> None:
-    for edits, says in WRONG_EDITS:
-        with case(edits):
-            with pytest.raises(TrilightError, match=says):
-                apply_edits(tiny_scene(), edits)
+    wrong: list[tuple[dict[str, Any], str]] = [
+        ({"lamps": {"0": {}}}, "no light"),
+        ({"lamps": {"-1": {}}}, "no light"),
+        ({"lamps": {"1": {"move": [0, 0, 1e9]}}}, "move"),
+        ({"lamps": {"1": {"gain": 0}}}, "gain"),
+        ({"lamps": {"1": 3}}, "lamps"),
+        ({"materials": {"7": {}}}, "no material 7"),
+        ({"materials": {"0": {"diffuse": [2, 0, 0]}}}, "diffuse"),
+        ({"materials": {"0": {"diffuse": [0.9, 0.9, 0.9]}}}, "diffuse \\+ specular"),
+        ({"materials": {"0": {"roughness": -1}}}, "roughness"),
+    ]
+    for edits, says in wrong:
+        with case(edits), pytest.raises(TrilightError, match=says):
+            apply_edits(tiny_scene(), edits)
 
 
 def parts(scene: Scene) -> tuple[dict[str, Any], np.ndarray, np.ndarray, np.ndarray]:

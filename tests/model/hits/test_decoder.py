@@ -37,7 +37,7 @@ from storage.records.material import EMISSION
 from storage.records.scene import Scene
 from tests.for_each import for_each
 from tests.model.hits.kit import FLOOR, WALL, corner, lit_scene, textured, traced
-from tests.model.kit import awake, hits_config
+from tests.model.kit import awake, hits_config, picture_and_gradients, render
 from tests.pipeline.renders.scene_kit import join, material, quad, sphere
 from tests.sky_maps import constant, one_sun, smooth
 
@@ -55,12 +55,6 @@ def tensors(scene: Scene, config: ModelConfig | None = None) -> SceneTensors:
 
 def in_double(batch: SceneBatch) -> SceneBatch:
     return map_tensors(batch, lambda each: each.double() if each.is_floating_point() else each)
-
-
-@torch.no_grad()
-def picture(model: RenderFormer, *scenes: SceneTensors) -> Tensor:
-    shown: Tensor = model(batch_scenes(scenes), PX)
-    return shown
 
 
 def test_anchors_around_a_part_are_those_beside_it() -> None:
@@ -132,19 +126,15 @@ def test_all_views_at_once_are_the_views_one_by_one(monkeypatch: pytest.MonkeyPa
     What a bias of keys is told is zero but for rounding, hence a least scale for all.
     """
     model, batch = network().double(), in_double(batch_scenes([tensors(corner())] * 2))
-    results = []
-    for _ in range(2):
-        model.zero_grad()
-        shown = model(batch, PX)
-        shown.square().sum().backward()
-        grads = [weight.grad for weight in model.parameters() if weight.grad is not None]
-        results.append([shown.detach(), *(grad.clone() for grad in grads)])
-        monkeypatch.setattr(decoder, "_blocks", lambda *_: [slice(None)])
-    least = 1e-6 * max(float(grad.abs().max()) for grad in results[0][1:])
-    assert least > 0
-    for one_by_one, at_once in zip(*results, strict=True):
-        scale = max(least, float(one_by_one.abs().max()))
-        assert float((at_once - one_by_one).abs().max()) <= 1e-12 * scale  # thousands of roundings
+    one_by_one = picture_and_gradients(model, batch)
+    monkeypatch.setattr(decoder, "_blocks", lambda *_: [slice(None)])
+    at_once = picture_and_gradients(model, batch)
+    sizes = {name: float(value.abs().max()) for name, value in one_by_one.items()}
+    least = 1e-6 * max(size for name, size in sizes.items() if name != "picture")
+    assert least > 0 and at_once.keys() == one_by_one.keys()
+    for name, size in sizes.items():
+        apart = float((at_once[name] - one_by_one[name]).abs().max())
+        assert apart <= 1e-12 * max(least, size), name  # thousands of roundings
 
 
 def test_before_any_training_what_was_traced_is_passed_on() -> None:
@@ -153,7 +143,7 @@ def test_before_any_training_what_was_traced_is_passed_on() -> None:
     model.initialize(torch.Generator().manual_seed(0))
     scene = corner()
     inputs = traced(scene, PX, shades_each_ray=True)
-    shown = radiance(picture(model, tensors(scene))[0, 0]).numpy()
+    shown = radiance(render(model, tensors(scene))[0, 0]).numpy()
     known = inputs.pixels[..., Channel.SHOWN_DIFFUSE] + inputs.pixels[..., Channel.DIRECT_SPECULAR]
     known = known + inputs.pixels[..., Channel.MIRRORED]
     assert (shown >= known * (1 - 1e-4) - 1e-5).all()
@@ -168,7 +158,7 @@ def test_the_picture_scales_with_the_lamps(tokens: bool) -> None:
     materials[:, EMISSION] *= np.array([8.0, 4.0, 2.0], np.float32)
     brighter = dataclasses.replace(scene, materials=materials)
     model = network(scene_tokens=tokens)
-    one, other = (radiance(picture(model, tensors(each))[0, 0]) for each in (scene, brighter))
+    one, other = (radiance(render(model, tensors(each))[0, 0]) for each in (scene, brighter))
     # colours change the odds with which lamps are drawn; one lamp leaves nothing to draw
     torch.testing.assert_close(other, one * torch.tensor([8.0, 4.0, 2.0]), rtol=2e-3, atol=1e-4)
 
@@ -184,18 +174,18 @@ def test_pictures_of_a_batch_are_those_of_the_scenes_alone() -> None:
     )
     scenes = [tensors(small), with_traced(fewer, PX, hits_config(), 0)]
     model = network()
-    together = picture(model, *scenes)
+    together = render(model, *scenes)
     for index, scene in enumerate(scenes):
-        torch.testing.assert_close(together[index], picture(model, scene)[0], rtol=1e-3, atol=1e-5)
+        torch.testing.assert_close(together[index], render(model, scene)[0], rtol=1e-3, atol=1e-5)
 
 
 def test_what_comes_traced_is_what_the_network_traces_itself() -> None:
     scene, model = corner(), network()
     plain = scene_tensors(scene)
-    assert torch.equal(picture(model, plain), picture(model, tensors(scene)))
+    assert torch.equal(render(model, plain), render(model, tensors(scene)))
     renderer = NeuralRenderer(model)
     shown = renderer.render(scene, PX)[0]
-    expected = radiance(picture(model, plain)[0, 0]).numpy()
+    expected = radiance(render(model, plain)[0, 0]).numpy()
     np.testing.assert_allclose(shown, expected, rtol=1e-4, atol=1e-6)
     with pytest.raises(TrilightError, match="multiple of 8"):
         renderer.render(scene, 30)
@@ -203,13 +193,13 @@ def test_what_comes_traced_is_what_the_network_traces_itself() -> None:
 
 def test_each_input_is_read_and_can_be_withheld() -> None:
     model, scene = network(), tensors(corner())
-    whole = picture(model, scene)
+    whole = render(model, scene)
     assert scene.traced is not None
     for index, name in enumerate(INPUTS):
         kept = torch.ones(1, len(INPUTS))
         kept[0, index] = 0
         without = dataclasses.replace(scene, traced=scene.traced.without(kept))
-        shown = picture(model, without)
+        shown = render(model, without)
         assert torch.isfinite(shown).all()
         assert (shown - whole).abs().max() > 1e-4, name
 
@@ -226,23 +216,8 @@ def test_every_weight_has_a_gradient_and_comes_back_from_its_file(tokens: bool) 
     assert again.config == model.config
     assert any(isinstance(each, nn.RMSNorm) for each in again.decoder.modules()), "for training"
     scene = tensors(corner())
-    shown = picture(again, scene)
-    assert torch.equal(shown, picture(model.eval(), scene)) and torch.isfinite(shown).all()
-
-
-@for_each(
-    ("changes", "message"),
-    [
-        ({"hit_rays": 0}, "hit_rays 0 with view_stage hits"),
-        ({"pixel_width": 0}, "pixel_width 0"),
-        ({"hit_anchors": 12}, "a multiple of 8"),
-        ({"patch_px": 4}, "patch_px 4"),
-        ({"view_stage": "bundles"}, "hit_anchors 8 with view_stage bundles; expected 0"),
-    ],
-)
-def test_settings_that_go_not_together_are_refused(changes: dict[str, Any], message: str) -> None:
-    with pytest.raises(TrilightError, match=message):
-        hits_config(**changes)
+    shown = render(again, scene)
+    assert torch.equal(shown, render(model.eval(), scene)) and torch.isfinite(shown).all()
 
 
 @pytest.mark.skipif(
@@ -253,8 +228,8 @@ def test_it_takes_bfloat16_for_what_is_rounded() -> None:
     from model.precision import set_precision
 
     scene = tensors(corner())
-    exact = picture(network(), scene)
-    rounded = picture(set_precision(network(), "bfloat16"), scene)
+    exact = render(network(), scene)
+    rounded = render(set_precision(network(), "bfloat16"), scene)
     assert rounded.dtype == torch.float32
     # 8 bits of mantissa in anchors alone, whose numbers gain at most twice what was traced
     assert (rounded - exact).abs().mean() < 0.03 * exact.abs().mean()

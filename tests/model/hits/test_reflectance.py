@@ -14,7 +14,7 @@ from model.hits.decoder import (
     LightFilter,
     _mean_around,
 )
-from model.hits.lit_scene import LitScene, Points, gloss_at, lobe, sample_lobe
+from model.hits.lit_scene import Gloss, LitScene, Points, gloss_at, lobe, sample_lobe
 from model.hits.radiosity import BOUNCES, scene_light
 from model.hits.vectors import dot, unit
 from model.hits.view_inputs import Channel
@@ -27,17 +27,16 @@ from tests.pipeline.renders.scene_kit import box, join, light, material, quad
 COUNT = 20_000
 
 
-def _plate(roughness: float, specular: float = 1.0) -> LitScene:
+def _plate(roughness: float, toward: np.ndarray) -> tuple[Gloss, Points]:
+    """Return the gloss and the points of a white plate, seen from these directions."""
     corners = np.array([[[0, 0, 0], [1, 0, 0], [0, 1, 0]]], np.float32)
     materials = np.zeros((1, 10), np.float32)
-    materials[0, 3:6], materials[0, 6] = specular, roughness
-    return LitScene(corners, np.tile(np.array([0, 0, 1], np.float32), (1, 3, 1)), materials)
-
-
-def _points(scene: LitScene, toward: np.ndarray) -> Points:
+    materials[0, 3:6], materials[0, 6] = 1.0, roughness
+    scene = LitScene(corners, np.tile(np.array([0, 0, 1], np.float32), (1, 3, 1)), materials)
     count = toward.shape[1]
     uv = np.full((2, count), 0.25, np.float32)
-    return scene.points(np.zeros(count, np.intp), uv, -toward.astype(np.float32))
+    points = scene.points(np.zeros(count, np.intp), uv, -toward.astype(np.float32))
+    return gloss_at(scene, points), points
 
 
 def _toward(cosine: float, count: int = COUNT) -> np.ndarray:
@@ -49,9 +48,7 @@ def _toward(cosine: float, count: int = COUNT) -> np.ndarray:
 @for_each("cosine", [0.95, 0.4, 0.1])
 def test_a_white_lobe_returns_all_light(roughness: float, cosine: float) -> None:
     """Single scattering by drawn directions, and the scale for the rest: together 1."""
-    scene = _plate(roughness)
-    points = _points(scene, _toward(cosine))
-    gloss = gloss_at(scene, points)
+    gloss, points = _plate(roughness, _toward(cosine))
     u = np.random.default_rng(0).random((2, COUNT), np.float32)
     _, weight = sample_lobe(gloss, points, u)
     alpha = roughness**2
@@ -64,9 +61,7 @@ def test_a_white_lobe_returns_all_light(roughness: float, cosine: float) -> None
 
 @for_each("roughness", [0.15, 0.4, 0.9])
 def test_a_sample_weighs_its_value_over_its_density(roughness: float) -> None:
-    scene = _plate(roughness)
-    points = _points(scene, _toward(0.6, 500))
-    gloss = gloss_at(scene, points)
+    gloss, points = _plate(roughness, _toward(0.6, 500))
     u = np.random.default_rng(1).random((2, 500), np.float32)
     direction, weight = sample_lobe(gloss, points, u)
     value, density = lobe(gloss, points, direction, dot(direction, points.normal))
@@ -80,12 +75,10 @@ def test_a_sample_weighs_its_value_over_its_density(roughness: float) -> None:
 def test_the_density_integrates_to_what_is_drawn_above(roughness: float) -> None:
     """Over the hemisphere, by even directions: all that is drawn and not lost below."""
     rng = np.random.default_rng(2)
-    scene = _plate(roughness)
     height, turn = rng.random(COUNT), 2 * np.pi * rng.random(COUNT)
     radius = np.sqrt(1 - height**2)
     even = np.stack([radius * np.cos(turn), radius * np.sin(turn), height]).astype(np.float32)
-    points = _points(scene, _toward(0.7))
-    gloss = gloss_at(scene, points)
+    gloss, points = _plate(roughness, _toward(0.7))
     _, density = lobe(gloss, points, even, even[2])
     _, weight = sample_lobe(gloss, points, rng.random((2, COUNT)).astype(np.float32))
     spread = 2 * np.pi * density.std() / np.sqrt(COUNT)
@@ -94,21 +87,18 @@ def test_the_density_integrates_to_what_is_drawn_above(roughness: float) -> None
 
 def test_the_lobe_is_symmetric_but_for_its_scale() -> None:
     """D G2 / 4 / cosines: exchanging viewer and light changes nothing."""
-    scene = _plate(0.5)
     rng = np.random.default_rng(3)
     a, b = (unit(rng.normal(size=(3, 300)).astype(np.float32)) for _ in range(2))
     a[2], b[2] = np.abs(a[2]) + 0.05, np.abs(b[2]) + 0.05
     a, b = unit(a), unit(b)
-    there = lobe(gloss_at(scene, _points(scene, a)), _points(scene, a), b, b[2])[0] / b[2]
-    back = lobe(gloss_at(scene, _points(scene, b)), _points(scene, b), a, a[2])[0] / a[2]
+    there = lobe(*_plate(0.5, a), b, b[2])[0] / b[2]
+    back = lobe(*_plate(0.5, b), a, a[2])[0] / a[2]
     np.testing.assert_allclose(there, back, rtol=1e-3)
 
 
 def test_from_behind_and_below_nothing_is_reflected() -> None:
-    scene = _plate(0.3)
-    points = _points(scene, _toward(0.5, 2))
     below = np.array([[0.6, 0.0], [0.0, 0.8], [-0.8, -0.6]], np.float32)
-    value, _ = lobe(gloss_at(scene, points), points, below, below[2])
+    value, _ = lobe(*_plate(0.3, _toward(0.5, 2)), below, below[2])
     assert not value.any()
 
 

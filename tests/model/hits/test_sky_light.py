@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 
 from model.config import ModelConfig
 from model.hits.direct_light import add_sky_light, escaped_light, no_light, sees_sky
-from model.hits.lit_scene import LitScene, Points, SkySampler, gloss_at, sample_lobe
+from model.hits.lit_scene import SkySampler, gloss_at, sample_lobe
 from model.hits.radiosity import scene_light
 from model.hits.view_inputs import Channel
 from model.inference import NeuralRenderer
@@ -76,20 +76,6 @@ def test_a_white_ball_in_a_white_sky_is_white(roughness: float) -> None:
     assert picture[full].mean() == pytest.approx(1.0, abs=0.02)
 
 
-EYE = np.array([1.0, -3.0, 1.4], np.float32)
-
-
-def _seen(lit: LitScene, targets: list[list[float]]) -> Points:
-    """Return what rays from the eye meet first on their way to these places."""
-    toward = np.array(targets, np.float32) - EYE
-    rays = (toward / np.linalg.norm(toward, axis=1)[:, None]).T
-    hits = lit.first_hits(EYE, rays.astype(np.float32))
-    met = np.flatnonzero(hits.triangle >= 0)
-    points = lit.points(hits.triangle[met], hits.uv[:, met], rays[:, met].astype(np.float32))
-    assert len(met) == len(targets)
-    return points
-
-
 def test_scenes_without_a_sky_stay_as_they_are_to_the_bit() -> None:
     plain, asked = traced(corner(), sky_rays=0), traced(corner(), sky_rays=8)
     for name, value in vars(plain).items():
@@ -119,7 +105,12 @@ def test_the_lobe_ray_and_the_others_share_what_a_mirror_shows() -> None:
     """A ball in a smooth sky: with and without rays by the lobe the same light."""
     scene = corner(radiance=0.0, roughness=0.3, sky=smooth())
     lit = lit_scene(scene)
-    points = _seen(lit, [[0.5, -0.2, 0.4]] * 4_000)
+    eye = np.array([1.0, -3.0, 1.4], np.float32)
+    toward = np.array([[0.5, -0.2, 0.4]] * 4_000, np.float32) - eye
+    rays = (toward / np.linalg.norm(toward, axis=1)[:, None]).T.astype(np.float32)
+    hits = lit.first_hits(eye, rays)
+    assert (hits.triangle >= 0).all()
+    points = lit.points(hits.triangle, hits.uv, rays)
     light, gloss = no_light(points), gloss_at(lit, points)
     shift = np.random.default_rng(0).random((2, 4_000), np.float32)
     add_sky_light(light, lit, points, gloss, shift, 0, rays=8, lobe_rays=0)
@@ -217,11 +208,6 @@ def test_scene_and_sky_turned_together_have_the_same_draws_elsewhere() -> None:
     assert np.abs(TURN @ SkySampler(smooth()).sample_directions(u) - there).max() < 1e-6
 
 
-SKY = smooth(rotation=uniform_rotation(np.random.default_rng(8)).astype(np.float32))
-DIRECTIONS = np.random.default_rng(0).normal(size=(500, 3))
-HERE = environment_values(SKY, DIRECTIONS)
-
-
 def test_light_comes_from_where_a_symmetry_of_training_puts_it() -> None:
     """Rotations are kept in float32, by which this sky changes by less than 1e-6."""
 
@@ -231,21 +217,24 @@ def test_light_comes_from_where_a_symmetry_of_training_puts_it() -> None:
         sky.check()
         return sky
 
-    below = bare_scene(scene_tensors(corner(sky=SKY)))
+    turned = smooth(rotation=uniform_rotation(np.random.default_rng(8)).astype(np.float32))
+    directions = np.random.default_rng(0).normal(size=(500, 3))
+    here = environment_values(turned, directions)
+    below = bare_scene(scene_tensors(corner(sky=turned)))
     rotation, sides = uniform_rotation(np.random.default_rng(9)), np.array([-1, 1, 1], np.float32)
     moved = move_scene(below, torch.from_numpy(rotation), torch.tensor([0.4, -0.1, 0.2]))
-    there = environment_values(sky_of(moved), DIRECTIONS @ rotation.T)
-    assert np.abs(there - HERE).max() < 3e-6
+    there = environment_values(sky_of(moved), directions @ rotation.T)
+    assert np.abs(there - here).max() < 3e-6
     mirrored = mirror_scene(below)
-    assert np.abs(environment_values(sky_of(mirrored), DIRECTIONS * sides) - HERE).max() < 3e-6
+    assert np.abs(environment_values(sky_of(mirrored), directions * sides) - here).max() < 3e-6
     twice = sky_of(mirror_scene(mirrored))
-    assert np.array_equal(twice.radiance_rgb, SKY.radiance_rgb)
-    assert np.array_equal(twice.rotation, SKY.rotation)
+    assert np.array_equal(twice.radiance_rgb, turned.radiance_rgb)
+    assert np.array_equal(twice.rotation, turned.rotation)
     order = np.array([1, 2, 0])
     permuted = sky_of(permute_channels(below, order))
-    assert np.array_equal(environment_values(permuted, DIRECTIONS), HERE[:, order])
+    assert np.array_equal(environment_values(permuted, directions), here[:, order])
     scaled = sky_of(scale_light(below, 3.0))
-    assert np.abs(environment_values(scaled, DIRECTIONS) - 3 * HERE).max() < 1e-6
+    assert np.abs(environment_values(scaled, directions) - 3 * here).max() < 1e-6
 
 
 @for_each("config", [tiny_config(), hits_config()])

@@ -4,7 +4,6 @@ How far a dataset is, from its files alone: counts, the rate of the last scenes,
 """
 
 import dataclasses
-import hashlib
 import io
 import json
 import math
@@ -54,6 +53,7 @@ from storage.dataset.splits import (
     split_of_object,
     split_of_shard,
 )
+from storage.digests import sha256_hex
 from storage.errors import TrilightError
 from storage.remote.store import RemoteStore
 from storage.seeds import rng_for, seed_for
@@ -205,12 +205,8 @@ def test_a_billion_planned_shards_cost_nothing(tmp_path: Path) -> None:
 SETTINGS = SplitSettings(scenes_per_shard=4)
 
 
-def _geometry(number: int) -> str:
-    return hashlib.sha256(str(number).encode()).hexdigest()
-
-
 def test_shares_of_objects_are_as_stated() -> None:
-    splits = [split_of_object(_geometry(i), SETTINGS) for i in range(4000)]
+    splits = [split_of_object(sha256_hex(str(i).encode()), SETTINGS) for i in range(4000)]
     for split, share in (("train", 0.75), ("validation", 0.125), ("test", 0.125)):
         # 4000 draws: a standard error of at most 0.007, so 0.03 is over four of them
         assert abs(splits.count(split) / 4000 - share) < 0.03

@@ -373,25 +373,23 @@ def test_roots_and_shards_are_not_mixed(tmp_path: Path) -> None:
         open_training_data(["train-0.tar"]).split("validation")
 
 
-def _same_key(path: Path) -> None:
-    sample = tiny_sample("000000000")
-    path.unlink()  # a shard is never written over
-    write_shard(path, [(sample.key, encode_sample(sample))])
+Members = dict[str, bytes]
 
 
-def _continued(path: Path) -> None:
+def _same_key(_: Path) -> tuple[str, Members]:
+    return "000000000", encode_sample(tiny_sample("000000000"))
+
+
+def _continued(_: Path) -> tuple[str, Members]:
     """The end of the first shard's last sample, as a torn pair of shards would hold it."""
-    members = encode_sample(tiny_sample("000000001"))
-    path.unlink()
-    write_shard(path, [("000000001", {"1.exr": members["1.exr"]})])
+    return "000000001", {"1.exr": encode_sample(tiny_sample("000000001"))["1.exr"]}
 
 
-def _pickled(path: Path) -> None:
+def _pickled(folder: Path) -> tuple[str, Members]:
     """WebDataset would unpickle it: that would make a folder."""
-    bomb = b"cos\nmkdir\n(S'" + str(path.parent / "ran").encode() + b"'\ntR."
+    bomb = b"cos\nmkdir\n(S'" + str(folder / "ran").encode() + b"'\ntR."
     members = encode_sample(tiny_sample("000000009"))
-    path.unlink()
-    write_shard(path, [("000000009", {**members, "json": bomb, "extra.pyd": bomb})])
+    return "000000009", {**members, "json": bomb, "extra.pyd": bomb}
 
 
 HOSTILE_SHARDS = {
@@ -421,13 +419,12 @@ def audited() -> Iterator[list[str]]:
         state["on"] = False
 
 
-@for_each(("spoil", "message"), HOSTILE_SHARDS.values())
+@for_each(("hostile", "message"), HOSTILE_SHARDS.values())
 def test_hostile_shards_are_refused_and_run_nothing(
-    tmp_path: Path, spoil: Callable[[Path], None], message: str
+    tmp_path: Path, hostile: Callable[[Path], tuple[str, Members]], message: str
 ) -> None:
     five_scenes(tmp_path)
-    shutil.copy(tmp_path / "train-000001.tar", tmp_path / "train-000002.tar")
-    spoil(tmp_path / "train-000002.tar")
+    write_shard(tmp_path / "train-000002.tar", [hostile(tmp_path)])
     shards = open_training_data([f"{tmp_path}/train-{{000000,000002}}.tar"]).split("train")
     before = sorted(path.name for path in tmp_path.iterdir())
 

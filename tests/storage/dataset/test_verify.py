@@ -3,7 +3,7 @@
 import dataclasses
 import json
 import re
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 from pathlib import Path
 from typing import Any
 
@@ -36,6 +36,18 @@ def dataset(tmp_path: Path) -> Dataset:
     return opened(five_scenes(tmp_path))
 
 
+def replace_shard(
+    dataset: Dataset, name: str, samples: Iterable[tuple[str, dict[str, bytes]]]
+) -> None:
+    """Write a shard anew, and have the manifest agree."""
+    dataset.folder.shard(name).unlink()  # a shard is never written over
+    write_shard(dataset.folder.shard(name), samples)
+    shards = tuple(
+        index_shard(dataset.folder.shard(shard.name)) for shard in dataset.manifest.shards
+    )
+    write_manifest(dataset.folder.manifest, dataclasses.replace(dataset.manifest, shards=shards))
+
+
 def rewrite(
     dataset: Dataset,
     name: str,
@@ -49,12 +61,7 @@ def rewrite(
         members = encode_sample(sample)
         change(sample.key, members)
         samples.append((key(sample.key), members))
-    dataset.folder.shard(name).unlink()  # a shard is never written over
-    write_shard(dataset.folder.shard(name), samples)
-    shards = tuple(
-        index_shard(dataset.folder.shard(shard.name)) for shard in dataset.manifest.shards
-    )
-    write_manifest(dataset.folder.manifest, dataclasses.replace(dataset.manifest, shards=shards))
+    replace_shard(dataset, name, samples)
     return verify_dataset(dataset.folder.root)
 
 
@@ -214,23 +221,19 @@ def mapped(tmp_path: Path) -> Dataset:
     return opened(made)
 
 
-def _with_sky(value: float) -> Change:
-    """Return a change to a sky of one wrong value, named as its content is."""
-    other = sky(radiance_rgb=np.full((2, 4, 3), value, np.float32))
-
-    def change(_: str, members: dict[str, bytes]) -> None:
-        if members.pop(SKY, None) is not None:
-            members["json"] = members["json"].replace(sky().sha256.encode(), other.sha256.encode())
-            members[map_member(other.sha256)] = pack_map(other)
-
-    return change
+def _spoil_sky(_: str, members: dict[str, bytes]) -> None:
+    """Put a sky of one wrong value, named as its content is, in the place of the right one."""
+    other = sky(radiance_rgb=np.full((2, 4, 3), np.nan, np.float32))
+    if members.pop(SKY, None) is not None:
+        members["json"] = members["json"].replace(sky().sha256.encode(), other.sha256.encode())
+        members[map_member(other.sha256)] = pack_map(other)
 
 
 @pytest.mark.parametrize(
     ("change", "message", "rows"),
     [
         (lambda _, each: each.pop(ROUGHNESS, None), "is missing; expected a member", (1, 2, 3)),
-        (_with_sky(np.nan), r"radiance_rgb\[0, 0, 0\] is nan; expected finite", (1, 2)),
+        (_spoil_sky, r"radiance_rgb\[0, 0, 0\] is nan; expected finite", (1, 2)),
     ],
 )
 def test_a_wrong_map_is_a_finding_of_each_sample_that_has_it(

@@ -117,19 +117,14 @@ def _record(change: Callable[[dict[str, Any]], None]) -> Callable[[Members], Non
 
 def _entry(kind: str, **fields: Any) -> Callable[[Members], None]:
     """Change what the record says of the first texture, or of the environment."""
-
-    def change(maps: dict[str, Any]) -> None:
-        (maps["environment"] if kind == "environment" else maps["textures"][0]).update(fields)
-
-    return _record(change)
+    if kind == "environment":
+        return _record(lambda maps: maps["environment"].update(fields))
+    return _record(lambda maps: maps["textures"][0].update(fields))
 
 
 def _texture_bytes(change: Callable[[bytes], bytes]) -> Callable[[Members], None]:
-    def changed(members: Members) -> None:
-        name = map_member(colour_texture().sha256)
-        members[name] = change(members[name])
-
-    return changed
+    name = map_member(colour_texture().sha256)
+    return lambda members: members.update({name: change(members[name])})
 
 
 def _other_values(data: bytes) -> bytes:
@@ -138,15 +133,13 @@ def _other_values(data: bytes) -> bytes:
 
 
 def _claiming(shape: Any, dtype: str = "U8") -> Callable[[bytes], bytes]:
-    def changed(_: bytes) -> bytes:
-        header = {
-            "__metadata__": {"form": "srgb"},
-            "values": {"dtype": dtype, "shape": shape, "data_offsets": [0, 1]},
-        }
-        text = json.dumps(header).encode()
-        return gzip.compress(len(text).to_bytes(8, "little") + text + b"\0")
-
-    return changed
+    header = {
+        "__metadata__": {"form": "srgb"},
+        "values": {"dtype": dtype, "shape": shape, "data_offsets": [0, 1]},
+    }
+    text = json.dumps(header).encode()
+    packed = gzip.compress(len(text).to_bytes(8, "little") + text + b"\0")
+    return lambda _: packed
 
 
 def _drop_maps(members: Members) -> None:
@@ -375,11 +368,6 @@ def test_directions_and_places_are_inverse() -> None:
     assert relative[0] == pytest.approx(1, abs=1e-6)
 
 
-def _texel(texture: Texture, row: int, column: int) -> np.ndarray:
-    height, width, _ = texture.texels.shape
-    return texture.linear(texture.texels[row % height, column % width]).astype(np.float64)
-
-
 def _slow(texture: Texture, u: float, v: float) -> np.ndarray:
     """Return the sum over all texels, each weighted by its tents in u and v."""
     height, width, channels = texture.texels.shape
@@ -388,7 +376,8 @@ def _slow(texture: Texture, u: float, v: float) -> np.ndarray:
         for column in range(-width, 3 * width):
             across = max(0.0, 1 - abs((v % 1) * height - (row + 0.5)))
             along = max(0.0, 1 - abs((u % 1) * width - (column + 0.5)))
-            total += across * along * _texel(texture, row, column)
+            texel = texture.linear(texture.texels[row % height, column % width])
+            total += across * along * texel.astype(np.float64)
     return total
 
 

@@ -19,8 +19,6 @@ from numpy.typing import NDArray
 
 from storage.conventions import SCHEMA_VERSION
 from storage.dataset.dataset import open_dataset
-from storage.dataset.manifest import index_shard, write_manifest
-from storage.dataset.shard import write_shard
 from storage.dataset.statistics import dataset_statistics
 from storage.errors import TrilightError
 from storage.metrics import psnr_log_db
@@ -42,6 +40,7 @@ from tests.command_line import run_program
 from tests.for_each import case, for_each
 from tests.pipeline.documents.dataset_by_hand import edit_manifest, five_scenes
 from tests.scenes_by_hand import tiny_sample
+from tests.storage.dataset.test_verify import replace_shard
 
 
 @for_each("profile", PROFILES)
@@ -170,16 +169,10 @@ def test_each_view_has_its_own_floor() -> None:
 def test_the_digest_of_scenes_does_not_know_the_profile(tmp_path: Path) -> None:
     dataset = five_scenes(tmp_path)
     before = dataset_statistics(dataset)
-    shards = []
     for shard in dataset.manifest.shards:
         samples = list(dataset.read_shard(shard))
-        path = dataset.folder.shard(shard.name)
-        path.unlink()  # a shard is never written over
-        write_shard(path, [(sample.key, encode_sample(sample, "compact")) for sample in samples])
-        shards.append(index_shard(path))
-    write_manifest(
-        dataset.folder.manifest, dataclasses.replace(dataset.manifest, shards=tuple(shards))
-    )
+        packed = [(sample.key, encode_sample(sample, "compact")) for sample in samples]
+        replace_shard(dataset, shard.name, packed)
     after = open_dataset(str(edit_manifest(dataset)))
     assert dataset_statistics(after).scene_digest == before.scene_digest
     assert after.manifest.dataset_digest != dataset.manifest.dataset_digest
@@ -187,22 +180,19 @@ def test_the_digest_of_scenes_does_not_know_the_profile(tmp_path: Path) -> None:
     assert len(list(after.read_scenes(first))) == first.num_samples
 
 
-PLAIN = b"the arrays of a scene" * 100
-HOSTILE: list[tuple[dict[str, bytes], str]] = [
-    ({}, "is missing"),
-    ({"scene.safetensors": PLAIN, **pack_arrays(PLAIN, "compact")}, "there in two forms"),
-    ({"scene.safetensors.gz": PLAIN}, "damaged"),
-    ({"scene.safetensors.gz": gzip.compress(PLAIN)[:-9]}, "cut short"),
-    ({"scene.safetensors.gz": gzip.compress(PLAIN)[:-8] + b"\0" * 8}, "damaged"),
-    ({"scene.safetensors.gz": gzip.compress(PLAIN) * 2}, "after its end"),
-]
-
-
 def test_hostile_arrays_are_refused_and_a_bomb_before_it_goes_off(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     """Of a member that inflates beyond the limit nothing more than the limit is unpacked."""
-    for members, message in HOSTILE:
+    plain = b"the arrays of a scene" * 100
+    for members, message in [
+        ({}, "is missing"),
+        ({"scene.safetensors": plain, **pack_arrays(plain, "compact")}, "there in two forms"),
+        ({"scene.safetensors.gz": plain}, "damaged"),
+        ({"scene.safetensors.gz": gzip.compress(plain)[:-9]}, "cut short"),
+        ({"scene.safetensors.gz": gzip.compress(plain)[:-8] + b"\0" * 8}, "damaged"),
+        ({"scene.safetensors.gz": gzip.compress(plain) * 2}, "after its end"),
+    ]:
         with case(message), pytest.raises(TrilightError, match=message):
             unpack_arrays(members)
     monkeypatch.setattr("storage.records.profiles.MAX_ARRAY_BYTES", 1 << 20)

@@ -92,12 +92,6 @@ def test_a_sky_is_light_enough_unless_it_is_black() -> None:
     tiny_scene(environment=black).check()
 
 
-def _with_texel(texture: Texture, value: float) -> Texture:
-    texels = texture.texels.copy()
-    texels[1, 0, 0] = value
-    return dataclasses.replace(texture, texels=texels)
-
-
 def _index(row: int, place: int, value: int) -> Scene:
     index = textured_scene().material_textures
     assert index is not None
@@ -113,7 +107,10 @@ def _uv(change: Any) -> np.ndarray:
 
 
 def _rough(value: float) -> Scene:
-    return textured_scene(0, colour_texture(), _with_texel(number_texture(), value))
+    texels = number_texture().texels.copy()
+    texels[1, 0, 0] = value
+    rough = dataclasses.replace(number_texture(), texels=texels)
+    return textured_scene(0, colour_texture(), rough)
 
 
 def _normals(rows: list[int]) -> Scene:

@@ -10,12 +10,12 @@ from pathlib import Path
 import pytest
 
 from storage.dataset.dataset import Dataset, open_dataset
-from storage.digests import sha256_hex
 from storage.records.sample import encode_sample
 from storage.remote import retries, url
 from tests.http_server import Site, serve
-from tests.pipeline.documents.dataset_by_hand import edit_manifest, five_scenes
+from tests.pipeline.documents.dataset_by_hand import five_scenes
 from tests.s3_server import moto as moto
+from tests.storage.dataset.test_verify import opened
 
 
 @pytest.fixture
@@ -31,9 +31,7 @@ def cache(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
 @pytest.fixture
 def local(tmp_path: Path) -> Dataset:
     """Return the same dataset as the server's, in its folder; it verifies."""
-    dataset = five_scenes(tmp_path / "served")
-    digest = sha256_hex(dataset.folder.objects_lock.read_bytes())
-    return open_dataset(str(edit_manifest(dataset, objects_lock_sha256=digest)))
+    return opened(five_scenes(tmp_path / "served"))
 
 
 @pytest.fixture

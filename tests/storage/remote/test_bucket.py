@@ -33,20 +33,14 @@ from storage.remote import fetch, store
 from storage.remote import url as remote_url
 from storage.remote.retries import with_tries
 from storage.remote.store import LocalStore, RemoteStore, Store
-from storage.remote.url import RemoteUrl
 from tests.command_line import run_program
 from tests.for_each import for_each
 from tests.http_server import Handler, running
 from tests.pipeline.generation.bucket_kit import empty_bucket
 from tests.pipeline.generation.test_dataset_writer import ENVIRONMENT, _build
 from tests.s3_server import Line, control
+from tests.storage.remote.cache_readers import remote
 from tests.storage.remote.conftest import SHARD, expected, read, with_changed_byte
-
-
-def place(text: str) -> RemoteUrl:
-    url = remote_url.parse_url(text, what="out")
-    assert isinstance(url, RemoteUrl)
-    return url
 
 
 def fill(driver: Any, local: Dataset) -> None:
@@ -84,7 +78,7 @@ def gs(
     monkeypatch.setenv("STORAGE_EMULATOR_HOST", f"http://127.0.0.1:{port}")
     monkeypatch.setattr(fetch, "PIECE_BYTES", 4096)
     remote_url._driver_of.cache_clear()
-    driver = remote_url.open_driver(place("gs://shards"))
+    driver = remote_url.open_driver(remote("gs://shards"))
     fill(driver, local)
     yield driver
     remote_url._driver_of.cache_clear()
@@ -127,7 +121,7 @@ def test_a_bucket_holds_the_same_dataset(
     shards = open_training_data([f"{url}/train-{{000000..000001}}.tar"]).split("train")
     assert [shards.num_samples(number) for number in range(2)] == [2, 2]
     shutil.rmtree(os.environ["TRILIGHT_CACHE"])
-    driver = remote_url.open_driver(place(f"{scheme}://shards"))
+    driver = remote_url.open_driver(remote(f"{scheme}://shards"))
     driver.pipe_file(f"shards/set/{SHARD}", with_changed_byte(local.folder.root / SHARD))
     driver.rm_file("shards/set/test-000005.tar")
     assert verify_dataset(url, fast=True).bad_shards == ["test-000005.tar"]
@@ -188,13 +182,13 @@ def create_once(made: Store, folder: Path) -> None:
 def test_a_file_is_created_once(moto: int, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(store, "_PART_BYTES", 5 << 20)  # no server takes smaller parts
     with empty_bucket(moto, monkeypatch):
-        made = RemoteStore(place("s3://shards/set"), tmp_path / "work")
+        made = RemoteStore(remote("s3://shards/set"), tmp_path / "work")
         create_once(made, tmp_path)
         assert {"small", "part-0001/large"} < made.list_all()
 
 
 def test_a_file_is_created_once_at_google(gs: Any, conditional: None, tmp_path: Path) -> None:
-    create_once(RemoteStore(place("gs://shards/made"), tmp_path / "work"), tmp_path)
+    create_once(RemoteStore(remote("gs://shards/made"), tmp_path / "work"), tmp_path)
 
 
 def test_a_file_is_created_once_in_a_folder(tmp_path: Path) -> None:
@@ -214,7 +208,7 @@ def test_a_server_that_ignores_the_condition_is_refused_before_anything_is_begun
         PublishedShards(folder).hold_lock(),
     ):
         begin_or_resume_dataset(PublishedShards(folder), _build(), ENVIRONMENT, 8)
-    assert RemoteStore(place("gs://shards/made")).list_all() == {".staging/once"}
+    assert RemoteStore(remote("gs://shards/made")).list_all() == {".staging/once"}
     assert not folder.manifest.exists()
 
 

@@ -1,8 +1,6 @@
 """Damaged or malformed data: the first ends the run, or it is named, replaced and bounded."""
 
-import dataclasses
 import itertools
-from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 from unittest import mock
@@ -12,11 +10,11 @@ import pytest
 from safetensors.numpy import load, save
 
 from storage.dataset.dataset import Dataset
-from storage.dataset.manifest import index_shard, write_manifest
 from storage.dataset.shard import ShardReader, write_shard
 from storage.dataset.training_data import TrainingData, open_training_data
 from storage.errors import TrilightError
 from storage.records.sample import encode_sample
+from tests.storage.dataset.test_verify import replace_shard
 from tests.train.kit import flip_a_bit, keys_of, plain_run, take
 from tests.train.toy import toy_sample, write_toy_dataset
 from train.data.bad_samples import BadSampleCounter
@@ -39,21 +37,12 @@ def dataset(tmp_path: Path) -> Dataset:
 
 def spoil_sample(dataset: Dataset, suffixes: tuple[str, ...] = ("0.exr", "1.exr")) -> None:
     """Make pictures of a sample unreadable whose shard has the hash of the manifest."""
-    name = "train-000001.tar"
     samples = [
         (sample.key, encode_sample(sample))
         for sample in (toy_sample(i, resolution=8) for i in (2, 3))
     ]
     samples[0][1].update(dict.fromkeys(suffixes, b"no picture"))
-    dataset.folder.shard(name).unlink()  # a shard is never written over
-    write_shard(dataset.folder.shard(name), samples)
-    shards = [
-        index_shard(dataset.folder.shard(name)) if shard.name == name else shard
-        for shard in dataset.manifest.shards
-    ]
-    write_manifest(
-        dataset.folder.manifest, dataclasses.replace(dataset.manifest, shards=tuple(shards))
-    )
+    replace_shard(dataset, "train-000001.tar", samples)
 
 
 def test_the_first_damage_ends_the_run_or_is_replaced_whatever_the_ranks(dataset: Dataset) -> None:
@@ -129,18 +118,14 @@ BAD, GOOD = "bad-000000.tar", "good-000000.tar"
 Members = dict[str, bytes]
 
 
-def put(name: str, at: Any, value: float) -> Callable[[Members], object]:
-    """Return what changes one number of one array of a sample."""
-
-    def spoil(members: Members) -> None:
-        arrays = {key: values.copy() for key, values in load(members["scene.safetensors"]).items()}
-        arrays[name][at] = value
-        members["scene.safetensors"] = save(arrays)
-
-    return spoil
+def lose_a_place(members: Members) -> None:
+    """Put what is no number into the positions of a sample."""
+    arrays = {key: values.copy() for key, values in load(members["scene.safetensors"]).items()}
+    arrays["vertex_positions"][0, 1] = np.nan
+    members["scene.safetensors"] = save(arrays)
 
 
-def write_shards(folder: Path, spoil: Callable[[Members], object], bad_samples: int) -> list[str]:
+def write_shards(folder: Path, bad_samples: int) -> list[str]:
     """Write a shard whose first samples are spoilt and one without fault; return their paths."""
     for name, first, count in ((BAD, 0, 3), (GOOD, 3, 2)):
         samples = []
@@ -148,7 +133,7 @@ def write_shards(folder: Path, spoil: Callable[[Members], object], bad_samples: 
             sample = toy_sample(index, resolution=8, views=2)
             members = encode_sample(sample)
             if index < bad_samples:
-                spoil(members)
+                lose_a_place(members)
             samples.append((sample.key, members))
         write_shard(folder / name, samples)
     return [f"{folder}/{BAD}", f"{folder}/{GOOD}"]
@@ -162,7 +147,7 @@ def spoilt_keys(paths: list[str], unusable: BadSampleCounter, count: int = 5) ->
 def test_a_shard_that_is_all_bad_is_given_up_once(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    paths = write_shards(tmp_path, put("vertex_positions", (0, 1), np.nan), bad_samples=3)
+    paths = write_shards(tmp_path, bad_samples=3)
     decode = ShardReader.stored_sample
     read: Any = mock.create_autospec(decode, side_effect=decode)
     monkeypatch.setattr(ShardReader, "stored_sample", read)
@@ -178,7 +163,7 @@ def test_a_shard_that_is_all_bad_is_given_up_once(
 
 
 def test_a_scene_with_fewer_views_than_are_drawn_is_replaced(tmp_path: Path) -> None:
-    paths = write_shards(tmp_path, lambda members: None, bad_samples=0)
+    paths = write_shards(tmp_path, bad_samples=0)
     (tmp_path / GOOD).unlink()
     few = toy_sample(3, resolution=8, views=1)
     write_shard(tmp_path / GOOD, [(few.key, encode_sample(few))])

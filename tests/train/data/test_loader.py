@@ -32,6 +32,7 @@ from storage.seeds import rng_for
 from tests.command_line import run_program
 from tests.for_each import case, for_each
 from tests.model.kit import tensors_of, tiny_config
+from tests.train.data.test_augment import EVERYTHING
 from tests.train.kit import plain_run, take
 from tests.train.toy import toy_sample, write_toy_dataset
 from train.data.augment import augment_scene
@@ -248,14 +249,8 @@ def test_drawn_views_are_those_of_the_whole_sample_to_the_bit(
         sample = dataclasses.replace(sample, radiance_rgb=exact, lights_rgb=exact[:, None])
     members = encode_sample(sample, profile)
     whole, stored = decode_sample("1", members), stored_sample("1", members)
-    settings = AugmentationSettings(
-        mirror=True,
-        channels=True,
-        vertex_order=True,
-        light_scale=3.0,
-        light_mix=2.0 if lights_apart else 1.0,
-        rotation="uniform",
-    )
+    light_mix = 2.0 if lights_apart else 1.0
+    settings = dataclasses.replace(EVERYTHING, translation=0.0, light_mix=light_mix)
     for seed, resolution in enumerate((16, 16, 8, 16)):
         full = training_scene(whole, resolution, lights_apart=lights_apart)
         drawn = scene_of_views(stored, [0, 2], resolution, per_light=lights_apart)
@@ -454,17 +449,6 @@ def noisy(index: int) -> Sample:
     )
 
 
-@pytest.fixture(scope="module")
-def shards(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    folder = tmp_path_factory.mktemp("large")
-    for number in range(SHARDS):
-        samples = [noisy(PER_SHARD * number + row) for row in range(PER_SHARD)]
-        write_shard(
-            folder / f"train-{number:06d}.tar", [(s.key, encode_sample(s)) for s in samples]
-        )
-    return folder
-
-
 def peak_bytes(folder: Path, num_shards: int) -> int:
     """Return the most memory of a process that reads so many shards once."""
     pattern = f"{folder}/train-{{000000..{num_shards - 1:06d}}}.tar"
@@ -475,9 +459,13 @@ def peak_bytes(folder: Path, num_shards: int) -> int:
 
 
 @pytest.mark.slow("memory")
-def test_the_reader_holds_as_much_of_a_large_set_as_of_a_small_one(shards: Path) -> None:
+def test_the_reader_holds_as_much_of_a_large_set_as_of_a_small_one(tmp_path: Path) -> None:
     """6 shards of 1.4 MB and 30: what is read grows by 33 MB, more when it is unpacked."""
-    more = sum(path.stat().st_size for path in shards.iterdir()) * (SHARDS - 6) // SHARDS
-    grown = peak_bytes(shards, SHARDS) - peak_bytes(shards, 6)
+    for number in range(SHARDS):
+        samples = [noisy(PER_SHARD * number + row) for row in range(PER_SHARD)]
+        path = tmp_path / f"train-{number:06d}.tar"
+        write_shard(path, [(sample.key, encode_sample(sample)) for sample in samples])
+    more = sum(path.stat().st_size for path in tmp_path.iterdir()) * (SHARDS - 6) // SHARDS
+    grown = peak_bytes(tmp_path, SHARDS) - peak_bytes(tmp_path, 6)
     # a tenth of what was read leaves room for what the allocator keeps; measured: 0.5 MB
     assert grown < more / 10

@@ -257,11 +257,8 @@ FILTERS: tuple[Filter, ...] = ("fast", "high")
 LADDER = tuple(1 << step for step in range(13))
 
 
-JUDGED = [(64, 10, 10 * 2), (10, 10, 10), (4, 10, 4), (1, 10, 1)]
-
-
 def test_it_is_judged_on_no_more_views_than_asked_from_all_over_the_split() -> None:
-    for most, scenes, judged in JUDGED:
+    for most, scenes, judged in [(64, 10, 10 * 2), (10, 10, 10), (4, 10, 4), (1, 10, 1)]:
         with case(most):
             every, first = spread_views(most, scenes)
             numbers = [number for number in range(0, scenes, every) for view in range(2)[:first]]

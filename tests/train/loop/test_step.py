@@ -44,14 +44,6 @@ from train.settings import Compile, LossSettings, Precision
 RESOLUTION = 16
 
 
-def scenes(count: int = 5) -> list:
-    return [training_scene(toy_sample(index), RESOLUTION) for index in range(count)]
-
-
-def cost(num_triangles: int) -> float:
-    return 100.0 + num_triangles
-
-
 def step(state: TrainState, batches: list[TrainingBatch]) -> StepReport:
     report = stepper(state).step(batches, 3e-3)
     state.step += 1
@@ -65,8 +57,8 @@ def gradients(batches: list[TrainingBatch]) -> tuple[float, list[Tensor]]:
 
 
 def test_buckets_of_any_size_give_the_gradient_of_one_batch() -> None:
-    drawn = scenes()
-    buckets = bucket_scenes(drawn, cost, 16)
+    drawn = [training_scene(toy_sample(index), RESOLUTION) for index in range(5)]
+    buckets = bucket_scenes(drawn, lambda num_triangles: 100.0 + num_triangles, 16)
     sizes = {len(batch.target_BVRR3) for batch in buckets}
     assert len(sizes) > 1, "equal buckets could not tell a mean over views from one over batches"
     loss, cut = gradients(buckets)

@@ -10,7 +10,6 @@ import json
 import math
 import os
 import re
-import subprocess
 import sys
 import time
 from collections.abc import Callable
@@ -29,7 +28,7 @@ from torch import nn
 from storage.dataset.dataset import Dataset
 from storage.errors import TrilightError
 from storage.seeds import rng_for
-from tests.conftest import ROOT
+from tests.command_line import run_program
 from tests.for_each import for_each
 from tests.train.kit import ALONE, CPU, Heard, Killed, stepper, tiny_run, toy_batch, trained
 from train.data import loader
@@ -163,17 +162,13 @@ def test_of_two_processes_the_slow_one_and_the_hanging_one_are_named(
     out = tmp_path / "run"
     words = [sys.executable, "-m", "torch.distributed.run", "--standalone", "--nproc-per-node=2"]
     words += ["-m", "tests.train.monitoring.test_watchdog", str(dataset.folder.root), str(out)]
-    own = {"OMP_NUM_THREADS": "1", "GLOO_SOCKET_IFNAME": "lo"}
-    done = subprocess.run(
-        words, cwd=ROOT, env=os.environ | own, capture_output=True, text=True, check=False
-    )
-    assert done.returncode == 0, done.stderr
-    assert "process 1 of 2 is the slow one" in done.stdout
+    said = run_program(words, OMP_NUM_THREADS="1", GLOO_SOCKET_IFNAME="lo").stdout
+    assert "process 1 of 2 is the slow one" in said
     first = r"process 0 of 2: step \d+ has taken .* exchange with the other processes"
     second = r"process 1 of 2: step \d+ has taken .* waiting for data\. Stacks"
-    assert re.search(first, done.stdout), done.stdout
-    assert re.search(second, done.stdout), done.stdout
-    assert "went on after all" in done.stdout
+    assert re.search(first, said), said
+    assert re.search(second, said), said
+    assert "went on after all" in said
     stacks = [path.read_text() for path in RunFolder(out).monitoring.glob("hang-*-rank-1.txt")]
     assert any("test_watchdog.py" in text and "sleeping" in text for text in stacks)
     rows = [row for row in read_rows(RunFolder(out).metrics) if "loss" in row]

@@ -9,7 +9,6 @@ import io
 import numpy as np
 import OpenEXR
 import pytest
-from numpy.typing import NDArray
 
 from storage.conventions import camera_rays, in_camera, look_at_c2w, pixel_places
 from storage.dataset.settings import StorageSettings
@@ -37,12 +36,6 @@ from tests.storage.records.test_parts import faults
 from tests.textured_by_hand import sky, textured_scene
 
 
-def rays_of(
-    scene: Scene, resolution: int, view: int = 0
-) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    return camera_rays(scene.c2w[view], float(scene.fov_deg[view]), resolution)
-
-
 def room(seed: int = 0, num_views: int = 2) -> Scene:
     """Return shell, objects with curved and flat faces, and lights, in a view with empty pixels."""
     return sampled_like_scene(np.random.default_rng(seed), num_views=num_views)
@@ -64,7 +57,7 @@ def test_laws_of_the_centre_rays(view: int) -> None:
     seen = view_passes(scene, view=view, resolution=resolution)
     hit, c2w = seen["hit"], scene.c2w[view]
     assert 0.2 < hit.mean() < 1
-    origin, rays = rays_of(scene, resolution, view)
+    origin, rays = camera_rays(c2w, float(scene.fov_deg[view]), resolution)
     along = origin + seen["depth_ray_m"][..., None] * rays
     np.testing.assert_allclose(seen["position_m"][hit], along[hit], atol=EXACT)
     corners = scene.vertex_positions[scene.faces[seen["triangle"]]].astype(np.float64)
@@ -201,7 +194,8 @@ def test_a_camera_inside_an_object_sees_its_back() -> None:
     seen = view_passes(scene, resolution=16, rays_a_side=2)
     assert seen["coverage"].min() == 1
     assert seen["depth_ray_m"].min() > 0.5
-    behind = np.sum(seen["geometric_normal"] * rays_of(scene, 16)[1], axis=-1) > 0
+    _, rays = camera_rays(scene.c2w[0], 100.0, 16)
+    behind = np.sum(seen["geometric_normal"] * rays, axis=-1) > 0
     assert 0 < behind.sum() < behind.size, "normals are those of the triangles, not turned"
 
 
