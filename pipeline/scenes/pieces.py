@@ -115,7 +115,7 @@ def surface_piece(
     """
     solid = has_area(positions, faces)
     if not solid.any():
-        raise Rejected("no_faces", f"{entry.uid}: no triangle of the level has an area")
+        raise Rejected("no_faces", f"{entry.uid or entry.name}: none of its triangles has an area")
     if surface.smooth:
         mesh = smooth_shaded(positions, faces[solid], smooth_angle_deg)
     else:

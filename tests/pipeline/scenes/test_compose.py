@@ -19,6 +19,7 @@ from pipeline.presets.registry import DATASET_PRESETS, preset_settings
 from pipeline.renders.tracer import choose_tracing_scale
 from pipeline.scenes import triangle_budget
 from pipeline.scenes.compose import compose_scene
+from pipeline.scenes.pieces import shell_piece
 from pipeline.scenes.triangle_budget import (
     FitTable,
     PooledAsset,
@@ -26,6 +27,7 @@ from pipeline.scenes.triangle_budget import (
     levels_within,
 )
 from pipeline.scenes.views import require_valid
+from scene_templates.layout import ShellPart
 from scene_templates.sample_layout import scene_plan
 from scene_templates.templates import TEMPLATES
 from storage.errors import Rejected, TrilightError
@@ -38,6 +40,7 @@ from storage.settings.overrides import apply_overrides
 from tests.for_each import for_each
 from tests.pipeline.scenes.small_pool import (
     BLIND,
+    LOOK,
     QUALITY,
     SOURCE,
     TOUCH,
@@ -248,6 +251,14 @@ def test_a_mesh_without_usable_triangles_is_rejected(pool: list[PooledAsset], bu
             assert "made/box" in rejection.message
             continue
         assert not any(entry.kind == "object" for entry in scene.objects), damage
+
+
+def test_a_wall_without_area_is_called_by_its_name() -> None:
+    """A layout of a user's may have one; it has no uid."""
+    faces = np.array([[0, 1, 2]], np.uint32)
+    flat = ShellPart(name="wall9", positions=np.zeros((3, 3)), faces=faces, surface=LOOK)
+    with pytest.raises(Rejected, match="^no_faces: wall9: "):
+        shell_piece(flat, np.random.default_rng(0), 30.0)
 
 
 def test_what_a_scene_must_be_is_looked_at_last(scenes: list[Scene]) -> None:
