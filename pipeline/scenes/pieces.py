@@ -15,6 +15,7 @@ the camera does not see them.
 import dataclasses
 from collections.abc import Sequence
 from dataclasses import dataclass
+from itertools import accumulate
 from typing import Any
 
 import numpy as np
@@ -173,22 +174,24 @@ def lamp_piece(
 
 def concatenate_pieces(pieces: Sequence[ScenePiece]) -> dict[str, Any]:
     """Return the geometry, materials and textures of a Scene, in the order of the pieces."""
-    meshes = [piece.mesh for piece in pieces]
-    counts = [len(mesh.faces) for mesh in meshes]
-    first_vertices, first_rows = (
-        np.repeat(np.cumsum([0, *sizes[:-1]]), counts)
-        for sizes in (
-            [len(mesh.positions) for mesh in meshes],
-            [len(piece.materials) for piece in pieces],
-        )
-    )
-    faces = np.concatenate([mesh.faces for mesh in meshes]) + first_vertices[:, None]
-    rows = np.concatenate([piece.material_index for piece in pieces]) + first_rows
+    vertex_starts = accumulate((len(piece.mesh.positions) for piece in pieces), initial=0)
+    material_starts = accumulate((len(piece.materials) for piece in pieces), initial=0)
+    counts = [len(piece.mesh.faces) for piece in pieces]
     return {
-        "vertex_positions": np.concatenate([mesh.positions for mesh in meshes]),
-        "vertex_normals": np.concatenate([mesh.normals for mesh in meshes]),
-        "faces": faces.astype(np.uint32),
-        "material_index": rows.astype(np.uint16),
+        "vertex_positions": np.concatenate([piece.mesh.positions for piece in pieces]),
+        "vertex_normals": np.concatenate([piece.mesh.normals for piece in pieces]),
+        "faces": np.concatenate(
+            [
+                piece.mesh.faces + np.uint32(start)
+                for piece, start in zip(pieces, vertex_starts, strict=False)
+            ]
+        ),
+        "material_index": np.concatenate(
+            [
+                piece.material_index + start
+                for piece, start in zip(pieces, material_starts, strict=False)
+            ]
+        ).astype(np.uint16),
         "materials": np.concatenate([piece.materials for piece in pieces]),
         "object_index": np.repeat(np.arange(len(pieces)), counts).astype(np.uint16),
         **_skins(pieces),

@@ -79,6 +79,8 @@ def with_new_lights(
         raise Rejected("no_layout", f"{name!r} is no layout that draws lights; keep its lights")
     lit = np.array([entry.is_lamp for entry in scene.objects])
     count = int(lit.sum()) if num_lights is None else num_lights
+    if count == 0:  # a scene that its sky or its objects light alone
+        return scene
     rng = scene_key.rng("new lights")
     centres = list(object_boxes(scene).sum(axis=1).astype(np.float64) / 2)
     emitters = sample_lights(rng, settings, TEMPLATES[name].lights, count, centres)
