@@ -308,7 +308,7 @@ class StepProfiler:
 def merge_spikes(by_rank: Sequence[Sequence[Mapping[str, Any]]]) -> list[dict[str, Any]]:
     """Merge the spikes of all processes, which have equal values and different scenes.
 
-    Processors of two kinds may differ by rounding, so a spike at the bound may be that of one alone.
+    Processors of two kinds differ by rounding, so that one alone may see a spike at the bound.
     """
     rows = []
     for spike in by_rank[0]:
