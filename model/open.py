@@ -199,12 +199,13 @@ def save_published(model: RenderFormer, folder: Path) -> None:
 def _read_config(path: Path) -> PublishedConfig:
     try:
         with open_plain(path) as file:
-            text = file.read(MAX_CONFIG_BYTES)
+            data = file.read(MAX_CONFIG_BYTES)
     except OSError as error:
         raise TrilightError(
             f"{path}: cannot be read ({error.strerror}); weights that carry no configuration of "
             "ours need the published one beside them."
         ) from error
+    text = data.decode(json.detect_encoding(data), "replace")  # editors add byte order marks
     return decode_published_config(read_json(text, dict[str, Any], str(path)))
 
 

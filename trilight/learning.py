@@ -24,10 +24,10 @@ def train_network(
     steps: int | None = None,
     changes: Mapping[str, Any] | None = None,
     resume: bool = False,
-    branch: str | None = None,
+    branch: str | os.PathLike[str] | None = None,
     decisions: Mapping[str, Any] | None = None,
-    begin_with: str | None = None,
-    lpips: str | None = None,
+    begin_with: str | os.PathLike[str] | None = None,
+    lpips: str | os.PathLike[str] | None = None,
     workers: int | None = None,
     device: str | None = None,
     watched: WatchSettings | None = None,
@@ -61,10 +61,10 @@ def train_network(
     settings = override_training_preset(run, changes or {}, steps=steps)
     start = StartOptions(
         resume=resume,
-        branch=branch,
+        branch=None if branch is None else os.fspath(branch),
         decisions=decisions or {},
-        begin_with=begin_with,
-        lpips=lpips,
+        begin_with=None if begin_with is None else os.fspath(begin_with),
+        lpips=None if lpips is None else os.fspath(lpips),
     )
     start.check(settings)
     return _train_alone(

@@ -189,6 +189,14 @@ def test_pickled_code_is_refused_unread(tmp_path: Path, name: str) -> None:
             open_network(str(tmp_path))
 
 
+def test_a_config_that_an_editor_saved_with_a_byte_order_mark_opens(published: Path) -> None:
+    text = (published / CONFIG_NAME).read_text()
+    for encoding in ("utf-8-sig", "utf-16"):
+        (published / CONFIG_NAME).write_text(text, encoding)
+        with case(encoding):
+            assert open_network(str(published)).config == publishable("swin")
+
+
 def test_a_config_that_is_none_is_refused(published: Path) -> None:
     for text in ("", "[1]", "{", "[" * 50_000):
         (published / CONFIG_NAME).write_text(text)

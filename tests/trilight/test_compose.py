@@ -177,6 +177,13 @@ def test_no_name_is_one_that_a_wheel_needs() -> None:
     assert not {*trilight.__all__, *modules} & {*PACKAGES, "tests"}
 
 
+def test_each_path_of_a_training_may_be_a_path() -> None:
+    with mock.patch("trilight.learning._train_alone") as train:
+        trilight.train_network("tiny", data="set", out="run", branch=Path("old"), lpips=Path("vgg"))
+    start = train.call_args.kwargs["start"]
+    assert (start.branch, start.lpips) == ("old", "vgg")
+
+
 @for_each("example", sorted((ROOT / "examples").glob("*.py")))
 def test_examples_import_from_the_face_alone(example: Path) -> None:
     ours = {

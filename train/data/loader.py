@@ -209,7 +209,7 @@ class _SceneMaker:
         try:
             return self._shards.num_samples(number)
         except TrilightError as error:
-            self._unusable.add_shard(self._shards, number, error)
+            self._unusable.add(self._shards.names[number], 1, error)
             return 0
 
     def scene(self, visit: Visit) -> TrainingScene:

@@ -306,12 +306,20 @@ class StepProfiler:
 
 
 def merge_spikes(by_rank: Sequence[Sequence[Mapping[str, Any]]]) -> list[dict[str, Any]]:
-    """Merge the spikes of all processes, which have equal values and different scenes."""
+    """Merge the spikes of all processes, which have equal values and different scenes.
+
+    Processors of two kinds differ by rounding, so that one alone may see a spike at the bound.
+    """
     rows = []
-    for same in zip(*by_rank, strict=True):
-        keys = list(itertools.chain(*(spike["keys"] for spike in same)))
-        spike = {name: same[0][name] for name in ("what", "value", "bound")}
-        rows.append({"step": same[0]["step"], "spike": {**spike, "keys": keys}})
+    for spike in by_rank[0]:
+        keys = [
+            key
+            for other in itertools.chain(*by_rank)
+            if (other["step"], other["what"]) == (spike["step"], spike["what"])
+            for key in other["keys"]
+        ]
+        rest = {name: spike[name] for name in ("what", "value", "bound")}
+        rows.append({"step": spike["step"], "spike": {**rest, "keys": keys}})
     return rows
 
 

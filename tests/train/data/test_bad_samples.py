@@ -11,6 +11,7 @@ from safetensors.numpy import load, save
 
 from storage.dataset.dataset import Dataset
 from storage.dataset.shard import ShardReader, write_shard
+from storage.dataset.shard_set import ShardSet
 from storage.dataset.training_data import TrainingData, open_training_data
 from storage.errors import TrilightError
 from storage.records.sample import encode_sample
@@ -102,6 +103,16 @@ def test_a_list_with_an_unreadable_shard_goes_on_without_it(dataset: Dataset) ->
         f"00000000{index}" for index in (0, 1, 4, 5, 6, 7)
     }
     assert len(unusable.messages) == 1
+
+
+def test_a_shard_that_ends_the_run_was_fetched_once(dataset: Dataset) -> None:
+    for path in dataset.folder.root.glob("train-*.tar"):
+        path.write_bytes(b"no shard at all")
+    data = open_training_data([f"{dataset.folder.root}/train-000000.tar"])
+    fetch = mock.patch.object(ShardSet, "open", autospec=True, side_effect=ShardSet.open)
+    with fetch as fetched, pytest.raises(TrilightError, match="train-000000"):
+        keys(data, BadSampleCounter(0))
+    assert fetched.call_count == 1
 
 
 def test_all_unusable_ends_the_run(dataset: Dataset) -> None:

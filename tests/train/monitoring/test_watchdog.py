@@ -49,6 +49,7 @@ from train.monitoring.process_monitor import (
     StepProfiler,
     Watchdog,
     layer_of,
+    merge_spikes,
     own_seconds,
     slowest_rank,
     spike_bound,
@@ -341,6 +342,15 @@ def test_a_gradient_that_jumps_is_found_with_its_scenes_and_a_falling_loss_is_no
     assert spike == {"step": 300, "what": "grad_norm", "value": 5.0, "keys": ["a", "b300"]}
     # 8 deviations of 10 % above the median of 0.1; a median of 200 is sure to some per cent
     assert 0.15 < bound < 0.2
+
+
+def test_a_spike_of_one_process_alone_ends_no_run() -> None:
+    """Norms of two kinds of processors differ by rounding, and one may lie at the bound."""
+    alike = {"step": 3, "what": "loss", "value": 2.0, "bound": 1.0}
+    alone = {"step": 3, "what": "grad_norm", "value": 2.0, "bound": 1.9, "keys": ["b"]}
+    found = merge_spikes([[{**alike, "keys": ["a"]}], [{**alike, "keys": ["b"]}, alone]])
+    rest = {"what": "loss", "value": 2.0, "bound": 1.0}
+    assert found == [{"step": 3, "spike": {**rest, "keys": ["a", "b"]}}]
 
 
 def test_a_bound_is_median_and_deviations_and_neither_a_breath_nor_infinity_spikes() -> None:
