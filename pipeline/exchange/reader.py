@@ -181,18 +181,18 @@ class SceneReader(contextlib.AbstractContextManager["SceneReader"]):
         """Read one scene; as `load_source`."""
         return self._read(load_source, source, pictures)
 
-    def cameras(self, file: SceneSource, view: int) -> list[Camera]:
+    def cameras(self, file: SceneSource, view: int | None = None) -> list[Camera]:
         """Read all cameras of the scene of a file, or one of each frame of an animated stage.
 
         Args:
             file: JSON file with a list `cameras` as in RenderFormer's scenes, or any scene.
-            view: row of the camera in each frame.
+            view: row of the camera in each frame; None for all cameras of the first frame alone.
 
         Raises:
             TrilightError: the file is unusable, or has no such camera.
         """
-        frames = self.scenes_of(file)
-        if len(frames) == 1:
+        frames = [file] if view is None else self.scenes_of(file)
+        if view is None or len(frames) == 1:
             return [
                 Camera(c2w=pose, fov_deg=float(angle))
                 for pose, angle in zip(*self._read(load_cameras, frames[0]), strict=True)

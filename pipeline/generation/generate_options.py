@@ -342,7 +342,7 @@ def _cameras(words: str, num_views: int) -> dict[str, Any]:
         from pipeline.exchange.reader import SceneReader, scene_source  # slow: every reader
 
         with SceneReader() as reader:
-            cameras = reader.cameras(scene_source(words), 0)
+            cameras = reader.cameras(scene_source(words))
         if len(cameras) > MOST_CAMERAS:
             raise TrilightError(
                 f"--cameras {words}: {len(cameras)}; expected up to {MOST_CAMERAS}."

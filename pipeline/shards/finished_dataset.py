@@ -85,11 +85,11 @@ def read_facts(
     for shard in dataset.manifest.shards:
         with dataset.open_shard(shard, checked=True) as opened:
             for key in opened.samples:
+                members = opened.members(key, lambda suffix: suffix in ("json", PLAIN, PACKED))
+                values: Mapping[str, Any] = {}
+                if names:  # it names the sample itself, which may be whole but not for this process
+                    values = condition_values(decode_scene(key, members), shard.split, names)
                 with reading(dataset.display_name, f"{shard.name}: sample {key}"):
-                    members = opened.members(key, lambda suffix: suffix in ("json", PLAIN, PACKED))
-                    values: Mapping[str, Any] = {}
-                    if names:
-                        values = condition_values(decode_scene(key, members), shard.split, names)
                     record = json.loads(members["json"])
                     provenance = record["provenance"]
                     rows = ((str(row["kind"]), str(row["uid"])) for row in record["objects"])

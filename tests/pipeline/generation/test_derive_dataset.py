@@ -43,6 +43,7 @@ from storage.records.objects import (
 )
 from storage.records.sample import Sample, encode_sample, sample_key
 from storage.records.scene import Scene
+from tests.columns_kit import COAT, declared
 from tests.for_each import for_each
 from tests.pipeline.documents.dataset_by_hand import furnished, locked, sample, write_dataset
 from tests.pipeline.generation.test_dataset_writer import ENVIRONMENT, _build
@@ -54,6 +55,7 @@ from tests.textured_by_hand import (
     textured_sample,
     textured_scene,
 )
+from tests.train.toy import toy_sample
 
 SETTINGS: dict[str, Any] = {
     "build": "smoke",
@@ -429,6 +431,15 @@ def test_damage_and_what_is_not_finished_are_refused(tmp_path: Path) -> None:
     assert "no such folder" in refused(out, derive, tmp_path / "nowhere")
     assert "on this machine" in refused(out, derive, "https://u:secret@example.org/a?token=x")
     assert "secret" not in refused(out, derive, "https://u:secret@example.org/a?token=x")
+
+
+def test_a_column_that_is_not_declared_here_is_no_damage(tmp_path: Path) -> None:
+    with declared(COAT):
+        coated = toy_sample(0)
+        coated.scene.materials[0, -1] = 0.5
+        a = finished(tmp_path / "a", {"train-000000.tar": [coated]})
+    said = refused(tmp_path / "b", select(where="lights_per_scene > 0"), a)
+    assert "'coat' is not declared here" in said and "damaged" not in said
 
 
 def test_arguments_that_make_nothing_are_refused(tmp_path: Path) -> None:

@@ -15,6 +15,7 @@ import pytest
 
 from infra.cli.overrides import BaseSettings, with_base_settings
 from infra.repair import repair
+from pipeline.exchange.usd.write_usd import write_usd_shard
 from pipeline.executors.threads import ThreadRunner
 from pipeline.generation import render_workers
 from pipeline.generation.generate_options import (
@@ -33,6 +34,7 @@ from storage.records.scene_facts import lights
 from tests.for_each import for_each
 from tests.infra.child_here import ChildHere
 from tests.pipeline.generation.tiny_scenes_kit import Undocumented
+from tests.scenes_by_hand import tiny_scene
 
 TINY = {
     "renders.max_spp": 16,
@@ -168,6 +170,16 @@ def test_a_kept_camera_is_rendered_again_where_it_would_see_something_else(
         assert not np.array_equal(now.radiance_rgb, then.radiance_rgb)
         changed = not np.array_equal(now.scene.materials, then.scene.materials)
         assert changed == ("seed" not in asked)
+
+
+def test_of_a_file_with_frames_all_cameras_of_the_first_are_given(
+    source: Dataset, tmp_path: Path
+) -> None:
+    path, scene = tmp_path / "frames.usdc", tiny_scene()
+    write_usd_shard(path, [("a", scene), ("b", scene), ("c", scene)])
+    asked = order_of(source.folder.root, tmp_path / "given", cameras=str(path))
+    given = asked.changes["revisit"]["given_cameras"]
+    assert [camera["c2w"] for camera in given] == [pose.ravel().tolist() for pose in scene.c2w]
 
 
 def test_given_cameras_are_those_of_every_scene(source: Dataset, tmp_path: Path) -> None:
