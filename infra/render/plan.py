@@ -5,9 +5,11 @@ numbered pictures with or without a video.
 """
 
 import importlib.util
+import tempfile
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
@@ -21,6 +23,8 @@ from infra.torch_library import require_torch
 from pipeline.exchange.reader import SceneReader, SceneSource, scene_source
 from pipeline.renders.mitsuba_variant import choose_variant
 from pipeline.renders.preview import PreviewSettings
+from pipeline.renders.settings import RenderSettings
+from storage.atomic import write_error
 from storage.errors import TrilightError
 from storage.machine import available_cores
 from storage.records.scene import Scene
@@ -43,7 +47,8 @@ class OutputPaths:
     @property
     def video(self) -> Path | None:
         """Path of the video; None without one."""
-        return self.out if self.out.with_suffix("") == self.folder != self.out else None
+        is_video = self.out != self.folder and self.out.suffix.lower() != ".exr"
+        return self.out if is_video else None
 
     def stem_of(self, index: int) -> Path:
         """Return the path of a picture without its suffix."""
@@ -63,6 +68,30 @@ def output_paths(out: Path) -> OutputPaths:
             "X.webp, beside which they are kept in a folder X."
         )
     return OutputPaths(out=out, folder=out.with_suffix(""))
+
+
+def load_av() -> Any:
+    """Return the module of PyAV; raises TrilightError without it."""
+    try:
+        import av
+    except ImportError as error:
+        raise TrilightError(
+            "--out X.mp4 needs PyAV, which is not installed: pip install av (it holds x264, GPL), "
+            "or choose --out X.webp."
+        ) from error
+    return av
+
+
+def _require_writable(output: OutputPaths) -> None:
+    """Refuse what would fail after pictures are rendered; nothing is made that stays."""
+    if output.video is not None and output.video.suffix.lower() == ".mp4":
+        load_av()
+    try:
+        folder = next(path for path in (output.folder, *output.folder.parents) if path.exists())
+        with tempfile.TemporaryFile(dir=folder):
+            pass
+    except OSError as error:
+        raise write_error(output.out, error) from error
 
 
 def pair_cameras(
@@ -148,7 +177,8 @@ def plan_render(options: RenderOptions, reader: SceneReader) -> RenderPlan:
     """Return the plan of a render, before a file is written.
 
     Raises:
-        TrilightError: an option without effect, or an unusable source, camera or checkpoint.
+        TrilightError: an option without effect, an unusable source, camera or checkpoint, or a
+            folder that cannot be written.
     """
     output = output_paths(options.out)
     if not output.is_sequence and (options.orbit, options.cameras) != (None, None):
@@ -156,7 +186,11 @@ def plan_render(options: RenderOptions, reader: SceneReader) -> RenderPlan:
     look = Look(tone_map=options.tone_map, exposure_ev=options.exposure_ev)
     checkpoint, resolution = _network_and_width(options)
     PreviewSettings(resolution=resolution, spp=1)  # reports a wrong width first
+    traced = None if options.engine == "neural" else options.quality(resolution)
+    _require_writable(output)  # as all that can be refused before a file is read for long
     sources = reader.list_scenes(options.source, options.albedo_over_one, many=output.is_sequence)
+    if traced is not None:
+        choose_variant("auto")  # probed once, and refused before cameras or a scene are read
     cameras: Sequence[Camera | int] = [options.view]
     if options.cameras is not None:
         file = scene_source(options.cameras, many=True)
@@ -166,7 +200,7 @@ def plan_render(options: RenderOptions, reader: SceneReader) -> RenderPlan:
         start = Camera.of_scene(scene, options.view, "--view")
         cameras = orbit(scene, start, options.orbit, options.arc_deg)
     pairs = pair_cameras(sources, cameras)
-    renderers, choice = _renderers(options, checkpoint, resolution, pairs)
+    renderers, choice = _renderers(options, traced, checkpoint, resolution, pairs)
     return RenderPlan(
         source=options.source,
         view=options.view,
@@ -197,10 +231,13 @@ def _network_and_width(options: RenderOptions) -> tuple[str | None, int]:
 
 
 def _renderers(
-    options: RenderOptions, checkpoint: str | None, resolution: int, pairs: Pairs
+    options: RenderOptions,
+    traced: RenderSettings | PreviewSettings | Budget | None,
+    checkpoint: str | None,
+    resolution: int,
+    pairs: Pairs,
 ) -> tuple[list[Renderer], Choice | None]:
     """Return the renderers of `--engine`, or of what is chosen for a budget; and that choice."""
-    traced = None if options.engine == "neural" else options.quality(resolution)
     choice = None
     if isinstance(traced, Budget):
         table = shipped_table()

@@ -11,7 +11,6 @@ shown by browsers; MP4 is written by FFmpeg through PyAV.
 import dataclasses
 import io
 import itertools
-import tempfile
 import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import ExitStack, closing
@@ -25,7 +24,7 @@ from numpy.typing import NDArray
 from PIL import Image as Picture
 from PIL import ImageDraw, ImageFont
 
-from infra.render.plan import OutputPaths, RenderPlan
+from infra.render.plan import RenderPlan, load_av
 from infra.render.tone_mapping import display_pixels, enlarge
 from pipeline.documents.png import encode_png
 from pipeline.exchange.formats import FORMATS, SceneSource
@@ -207,7 +206,10 @@ def run_plan(
         TrilightError: a network or a scene cannot be loaded or rendered, or a file cannot be
             written.
     """
-    _require_writable(plan.output)
+    try:
+        plan.output.folder.mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        raise write_error(plan.output.out, error) from error
     finished = list[FinishedShot]()
     notes = dict[str, None]()
     before: Frame | None = None
@@ -347,18 +349,6 @@ def _caveats(renderer: Renderer, finished: Sequence[FinishedShot]) -> list[str]:
     return [*notes, *renderer.notes]
 
 
-def _require_writable(output: OutputPaths) -> None:
-    """Make the folder of the pictures, and refuse what would fail after they are rendered."""
-    if output.video is not None and output.video.suffix.lower() == ".mp4":
-        _av()
-    try:
-        output.folder.mkdir(parents=True, exist_ok=True)
-        with tempfile.TemporaryFile(dir=output.folder):
-            pass
-    except OSError as error:
-        raise write_error(output.out, error) from error
-
-
 def write_video(path: Path, frames: Sequence[Path], fps: int) -> None:
     """Write pictures of equal, even width and height as a video.
 
@@ -378,7 +368,7 @@ def _iter_frames(frames: Sequence[Path]) -> Iterator[Picture.Image]:
 
 
 def _mp4(frames: Sequence[Path], fps: int) -> bytes:
-    av = _av()
+    av = load_av()
     stream = io.BytesIO()
     with av.open(stream, "w", format="mp4") as container:
         track: Any = None
@@ -411,14 +401,3 @@ def _webp(frames: Sequence[Path], fps: int) -> bytes:
         quality=_WEBP_QUALITY,
     )
     return stream.getvalue()
-
-
-def _av() -> Any:
-    try:
-        import av
-    except ImportError as error:
-        raise TrilightError(
-            "--out X.mp4 needs PyAV, which is not installed: pip install av (it holds x264, GPL), "
-            "or choose --out X.webp."
-        ) from error
-    return av

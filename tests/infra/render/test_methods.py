@@ -4,6 +4,7 @@ import contextlib
 import dataclasses
 import json
 import re
+import sys
 from pathlib import Path
 from unittest import mock
 
@@ -330,6 +331,29 @@ def test_a_plan_has_all_that_was_asked(source: Path, tmp_path: Path) -> None:
     assert plan.output.video == tmp_path / "turn.webp"
     assert len(plan.pairs) == 3 and all(isinstance(camera, Camera) for _, camera in plan.pairs)
     assert plan.output.stem_of(2) == tmp_path / "turn/000002"
+
+
+def test_nothing_is_read_before_a_mistake_that_needs_no_file_is_named(
+    source: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """A film of many scenes, or a path of cameras, may take minutes to read."""
+    (tmp_path / "file").touch()
+    monkeypatch.setitem(sys.modules, "av", None)
+    reader = mock.Mock(spec=SceneReader)
+    for more, message in (
+        ({"out": tmp_path / "x.mp4"}, "needs PyAV, which is not installed: pip install av"),
+        ({"out": tmp_path / "file/x.webp"}, "file is a file; expected a folder"),
+        ({"out": tmp_path / "file/x.exr"}, "file is a file; expected a folder"),
+        ({"out": tmp_path / "new", "max_spp": 100}, "max_spp 100; expected multiples of 8"),
+    ):
+        with pytest.raises(TrilightError, match=message):
+            plan_render(RenderOptions(source=str(source), **more), reader)
+    monkeypatch.setenv("TRILIGHT_VARIANT", "none such")
+    path = {"out": tmp_path / "new/turn.webp", "cameras": str(source)}
+    with pytest.raises(TrilightError, match="TRILIGHT_VARIANT is 'none such'"):
+        plan_render(RenderOptions(source=str(source), **path), reader)  # type: ignore[arg-type]
+    assert {name for name, _, _ in reader.method_calls} == {"list_scenes"}
+    assert not (tmp_path / "new").exists()
 
 
 def test_the_pictures_of_a_turn_share_the_loading_of_its_scene(
