@@ -257,6 +257,9 @@ def test_new_lights_leave_surfaces_and_follow_the_ranges(scene: Scene) -> None:
         assert [entry.kind for entry in new.objects][-len(lit) :] == ["emitter"] * len(lit)
         assert len(np.unique(new.faces)) == len(new.vertex_positions)  # no vertex is left over
         assert len(np.unique(new.material_index)) == len(new.materials)
+    glowing = [dataclasses.replace(entry, uid=entry.uid or "mine:x") for entry in scene.objects]
+    lit_by_objects = dataclasses.replace(scene, objects=tuple(glowing))
+    assert with_new_lights(lit_by_objects, SMOKE.lights, None, KEY) is lit_by_objects
 
 
 def test_redrawn_scenes_are_equal_for_equal_arguments_and_keep_the_laws(scene: Scene) -> None:
