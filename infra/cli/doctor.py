@@ -21,8 +21,8 @@ from infra.cli.console import console, first_words, print_json
 from infra.cli.options import command
 from pipeline.isolation.confinement import VARIABLE, confinement_mode, missing_features
 from pipeline.isolation.system_calls import landlock_version, seccomp_works
-from pipeline.renders.facts import VIEW_PX, VIEW_SPP, render_facts
 from pipeline.renders.mitsuba_variant import choose_variant, query_gpus
+from pipeline.renders.variant_probe import VIEW_PX, VIEW_SPP, render_facts
 from storage.cache import cache_folder
 from storage.errors import EnvironmentFailure, TrilightError
 from storage.installation import IMPORT_ROOT, child_environment, module_name
@@ -138,8 +138,8 @@ def _renderer() -> Finding:
 def _denoiser() -> Finding:
     variant = choose_variant("auto")
     facts = render_facts(variant)
-    if "denoiser" not in facts:
-        text = f"pyoidn {facts['pyoidn']} does not respond"
+    if not facts:
+        text = f"pyoidn {metadata.version('pyoidn')} does not respond"
         return Finding("missing", text, "pictures cannot be denoised", "make setup")
     text = (
         f"OIDN {facts['denoiser']}, {facts['denoiser_device']}, {facts['threads']} threads; a view "

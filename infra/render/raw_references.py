@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 
 from pipeline.renders.calibrated_error import LEAST_ERROR
 from pipeline.renders.noise_floor import Curve, secant_slope
-from pipeline.renders.settings import PASS_SPP, RenderSettings
+from pipeline.renders.settings import PASS_SPP
 from pipeline.renders.tracer import PixelCamera, load_tracer, pixel_camera
 from storage.records.lights import light_rows, num_light_pictures
 from storage.records.scene import Scene
@@ -47,20 +47,15 @@ def raw_reference(scene: Scene, camera: PixelCamera, spp: int, *name: int) -> Ra
         spp: samples per pixel of both halves together, a multiple of 128.
         name: numbers that the seeds are derived from.
     """
-    return _reference(_tracer(scene), camera, spp, *name)
+    return _reference(load_tracer(scene), camera, spp, *name)
 
 
 def light_references(scene: Scene, camera: PixelCamera, spp: int) -> list[RawReference]:
     """Return a `raw_reference` of each light alone (storage.records.lights)."""
-    tracer = _tracer(scene)
+    tracer = load_tracer(scene)
     rows: list[int | None] = list(light_rows(scene))
     rows += [None] * (num_light_pictures(scene) - len(rows))
     return [_reference(tracer.only_light(row), camera, spp) for row in rows]
-
-
-def _tracer(scene: Scene) -> Any:
-    depths = {"max_depth": RenderSettings.max_depth, "rr_depth": RenderSettings.rr_depth}
-    return load_tracer(scene, **depths)
 
 
 def _reference(tracer: Any, camera: PixelCamera, spp: int, *name: int) -> RawReference:

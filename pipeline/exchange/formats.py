@@ -23,8 +23,7 @@ from pipeline.exchange.renderformer_json import write_renderformer_json
 from pipeline.exchange.scene_files import build_scene, read_scene_cameras, read_scene_description
 from pipeline.exchange.textured_triangles import LoadedScene as LoadedScene
 from pipeline.exchange.textured_triangles import Pictures as Pictures
-from pipeline.exchange.usd.read_usd import read_usd, usd_keys
-from pipeline.exchange.usd.write_usd import SUFFIXES, write_usd, write_usd_shard
+from pipeline.foreign.limits import WRITTEN_USD_SUFFIXES
 from pipeline.objects.licences import USER_PROVIDED
 from storage.atomic import write_atomically
 from storage.dataset.shard import open_shard
@@ -101,6 +100,30 @@ def _list_usd_pictures(target: Path) -> Sequence[Path]:
     return [target.parent / Path(name).name for name in sorted(names)]
 
 
+def _read_usd(source: SceneSource, pictures: bool) -> LoadedScene:
+    from pipeline.exchange.usd.read_usd import read_usd  # as all of USD, slow to load
+
+    return read_usd(source.path, source.key, source.usd_folder)
+
+
+def _list_usd_scenes(source: SceneSource) -> list[str | None]:
+    from pipeline.exchange.usd.read_usd import usd_keys
+
+    return [key or None for key in usd_keys(source.path, source.usd_folder)]
+
+
+def _write_usd(target: Path, scene: Scene, pictures: Pictures) -> Iterable[str]:
+    from pipeline.exchange.usd.write_usd import write_usd
+
+    return write_usd(target, scene)
+
+
+def _write_usd_shard(target: Path, scenes: Iterable[tuple[str, Scene]]) -> None:
+    from pipeline.exchange.usd.write_usd import write_usd_shard
+
+    write_usd_shard(target, scenes)
+
+
 def _read_json(source: SceneSource, pictures: bool) -> LoadedScene:
     root = source.path.parent.resolve()
     name = source.path.name
@@ -144,14 +167,11 @@ _GEOMETRY = {*ARRAY_FIELDS, *_OBJECTS} - {"materials"}
 _GEOMETRY |= {f"materials.{name}" for name in PUBLISHED_COLUMNS}
 """Members that the formats of other programs hold: triangles, cameras and published columns."""
 
-_READ_USD = SceneFormat(
-    read=lambda source, _: read_usd(source.path, source.key, source.usd_folder),
-    keys=lambda source: [key or None for key in usd_keys(source.path, source.usd_folder)],
-)
+_READ_USD = SceneFormat(read=_read_usd, keys=_list_usd_scenes)
 _USD = dataclasses.replace(
     _READ_USD,
-    write=lambda target, scene, _: write_usd(target, scene),
-    write_many=write_usd_shard,
+    write=_write_usd,
+    write_many=_write_usd_shard,
     named_files=_list_usd_pictures,
     carried=scene_file.CARRIED,
 )
@@ -161,7 +181,7 @@ FORMATS: Registry[SceneFormat] = Registry(
     "scene format",
     SceneFormat,
     {
-        **dict.fromkeys(SUFFIXES, _USD),
+        **dict.fromkeys(WRITTEN_USD_SUFFIXES, _USD),
         ".usd": _READ_USD,
         ".json": SceneFormat(
             read=_read_json,

@@ -121,6 +121,23 @@ def index_corners(
     return vertices[:, :3].copy(), vertices[:, 3:].copy(), faces
 
 
+def octahedron() -> NDArray[np.float64]:
+    """Return the triangles [8, 3, 3] of an octahedron of radius 1, facing out."""
+    faces = np.array(
+        [[[x, 0, 0], [0, y, 0], [0, 0, z]] for x in (1, -1) for y in (1, -1) for z in (1, -1)],
+        float,
+    )
+    faces_inward = np.prod(faces.sum(axis=1), axis=1) < 0
+    faces[faces_inward] = faces[faces_inward][:, ::-1]
+    return faces
+
+
+def sum_area(triangles: NDArray[np.floating]) -> float:
+    """Return the area of triangles [T, 3, 3]."""
+    edges = np.diff(triangles.astype(np.float64), axis=1)
+    return float(np.linalg.norm(np.cross(edges[:, 0], edges[:, 1]), axis=1).sum() / 2)
+
+
 def build_lamp(
     positions: NDArray[np.float32], radiance_rgb: NDArray[np.floating]
 ) -> TexturedTriangles:

@@ -2,7 +2,8 @@
 
 from dataclasses import dataclass
 
-USD_SUFFIXES = (".usd", ".usda", ".usdc", ".usdz")
+WRITTEN_USD_SUFFIXES = (".usda", ".usdc", ".usdz")
+USD_SUFFIXES = (".usd", *WRITTEN_USD_SUFFIXES)
 SUFFIXES = (".glb", ".gltf", ".obj", ".ply", ".stl", ".off", *USD_SUFFIXES)
 """Suffixes of object files, compared in lower case. The suffix decides: a file of another format is
 refused or fails to load, and never reaches the reader of that format."""

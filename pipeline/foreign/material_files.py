@@ -8,8 +8,9 @@ import contextlib
 import dataclasses
 import os
 import re
+import stat
 import unicodedata
-from collections.abc import Callable, Iterable, Iterator, Mapping
+from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
 from urllib.parse import unquote, urlsplit
@@ -36,9 +37,6 @@ _OPTION = re.compile(
     rf"(-o|-s|-t)((?:\s+{_NUMBER}){{1,3}})\s+|(-mm)((?:\s+{_NUMBER}){{1,2}})\s+|(-[a-z]+)\s+(\S+)\s+",
     re.IGNORECASE,
 )
-
-ReadFile = Callable[[Path, int], bytes]
-"""Reads a regular file of at most so many bytes; raises Rejected."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -72,18 +70,16 @@ class MaterialFiles:
 class SourceFolder:
     """Reads the files that an object names, none of them outside of a root folder."""
 
-    def __init__(self, folder: Path, root: Path, read: ReadFile) -> None:
+    def __init__(self, folder: Path, root: Path) -> None:
         """Resolve both folders.
 
         Args:
             folder: relative names start here.
             root: no file outside of it is read; `folder` itself where that lies elsewhere.
-            read: function that reads a regular file of at most so many bytes.
         """
         self.folder = folder.resolve()
         root = root.resolve()
         self._root = root if self.folder.is_relative_to(root) else self.folder
-        self.read = read
 
     def read_all(
         self,
@@ -98,7 +94,9 @@ class SourceFolder:
         refused: dict[str, Rejected] = {}
         for name in dict.fromkeys(names):
             try:
-                data[name] = self.read(self._find(name, extra_folders, is_uri=is_uri), bytes_left)
+                data[name] = read_regular(
+                    self._find(name, extra_folders, is_uri=is_uri), bytes_left
+                )
                 bytes_left -= len(data[name])
             except Rejected as error:
                 code = {"too_large_bytes": "texture_too_large", "missing_file": "texture_missing"}
@@ -128,6 +126,23 @@ class SourceFolder:
         if is_outside:
             raise Rejected("texture_outside", "it lies outside the folder of the objects")
         raise Rejected("missing_file", "there is no such file")
+
+
+def read_regular(path: Path, max_bytes: int) -> bytes:
+    """Return the bytes of a regular file, since a pipe or a device would never end.
+
+    Raises:
+        Rejected: missing_file or too_large_bytes.
+    """
+    try:
+        status = path.stat()
+        if not stat.S_ISREG(status.st_mode):
+            raise Rejected("missing_file", f"{path.name!r} is not a regular file")
+        if status.st_size > max_bytes:
+            raise Rejected("too_large_bytes", f"{status.st_size} bytes; expected <= {max_bytes}")
+        return path.read_bytes()
+    except (FileNotFoundError, NotADirectoryError) as error:
+        raise Rejected("missing_file", f"there is no file {path.name!r}") from error
 
 
 def is_elsewhere(uri: str) -> bool:

@@ -89,10 +89,7 @@ def read_openexr(data: bytes, max_pixels: int, *, is_color: bool) -> LinearPictu
     header = headers[choice.part]
     window = _picture_window(header)
     _require_size(headers, window, max_pixels)
-    planes = _read_planes(data, headers, choice)
-    values = np.stack(
-        [_crop_to_window(planes[letter], header, window) for letter in choice.letters], axis=-1
-    )
+    values = _crop_to_window(_read_channels(data, headers, choice), header, window)
     primaries = _read_primaries(header)
     if set(_CHROMA) <= set(choice.letters):
         values = _from_chroma(values, primaries)
@@ -223,24 +220,23 @@ def _require_size(
         )
 
 
-def _read_planes(
+def _read_channels(
     data: bytes, headers: Sequence[Mapping[str, Any]], choice: _Choice
-) -> dict[str, NDArray[np.float32]]:
-    """Return the channels of a choice over its data window [H, W], by their letters."""
+) -> NDArray[np.float32]:
+    """Return the channels of a choice over its data window [H, W, C]."""
     parts = _read_parts(data, header_only=False)
     if len(parts) != len(headers):  # the library leaves parts out that it cannot read
         raise _cut_off_error()
-    channels = parts[choice.part].channels
-    planes = {}
-    for letter, name in zip(choice.letters, choice.names, strict=True):
-        channel = channels[name]
+    x_min, y_min, width, height = _box(headers[choice.part], "dataWindow")
+    planes = []
+    for name in choice.names:
+        channel = parts[choice.part].channels[name]
         if not isinstance(channel.pixels, np.ndarray):
             raise _cut_off_error()
         plane = channel.pixels.astype(np.float32)
-        x_min, y_min, width, height = _box(headers[choice.part], "dataWindow")
         across = _stretch(plane.T, x_min, width, channel.xSampling)
-        planes[letter] = _stretch(across.T, y_min, height, channel.ySampling)
-    return planes
+        planes.append(_stretch(across.T, y_min, height, channel.ySampling))
+    return np.stack(planes, axis=-1)
 
 
 def _stretch(
@@ -257,16 +253,16 @@ def _stretch(
 
 
 def _crop_to_window(
-    plane: NDArray[np.float32], header: Mapping[str, Any], window: tuple[int, int, int, int]
+    values: NDArray[np.float32], header: Mapping[str, Any], window: tuple[int, int, int, int]
 ) -> NDArray[np.float32]:
-    """Return a plane of the data window over another window, 0 where no pixel is stored."""
+    """Return values [H, W, C] of the data window over another one, 0 where no pixel is stored."""
     x_min, y_min, width, height = window
     if (at := _box(header, "dataWindow")) == window:
-        return plane
+        return values
     right = at[0] - x_min
     down = at[1] - y_min
-    inside = plane[max(-down, 0) : max(height - down, 0), max(-right, 0) : max(width - right, 0)]
-    result = np.zeros((height, width), np.float32)
+    inside = values[max(-down, 0) : max(height - down, 0), max(-right, 0) : max(width - right, 0)]
+    result = np.zeros((height, width, values.shape[2]), np.float32)
     result[max(down, 0) :, max(right, 0) :][: inside.shape[0], : inside.shape[1]] = inside
     return result
 

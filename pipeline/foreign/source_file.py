@@ -5,7 +5,6 @@ them open another one. USD alone receives paths, which it checks first.
 """
 
 import hashlib
-import stat
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 from functools import cached_property
@@ -17,7 +16,7 @@ import numpy as np
 from pipeline.foreign.gltf.document import GltfDocument, open_gltf
 from pipeline.foreign.gltf.primitives import gltf_mesh
 from pipeline.foreign.limits import SUFFIXES, USD_SUFFIXES, ReadLimits
-from pipeline.foreign.material_files import MaterialFiles, SourceFolder, obj_files
+from pipeline.foreign.material_files import MaterialFiles, SourceFolder, obj_files, read_regular
 from pipeline.foreign.mesh import FileMesh, TriangleMesh
 from pipeline.foreign.obj import read_obj
 from pipeline.foreign.off import read_off
@@ -96,7 +95,7 @@ class SourceFile:
     @property
     def unread(self) -> tuple[str, ...]:
         """Return sentences on contents of the file that were not read, each once."""
-        usd = () if self.usd is None else self.usd.stage.opened.notes
+        usd = () if self.usd is None else self.usd.opened.notes
         gltf = () if self.gltf is None else self.gltf.unread
         return tuple(dict.fromkeys((*usd, *gltf, *self.notes)))
 
@@ -125,7 +124,7 @@ def read_source(path: Path, limits: ReadLimits, root: Path | None = None) -> Sou
     suffix = path.suffix.lower()
     if suffix not in SUFFIXES:
         raise Rejected("unsupported_format", f"suffix {suffix!r}; expected one of {SUFFIXES}")
-    data = _read_regular(path, limits.max_bytes)
+    data = read_regular(path, limits.max_bytes)
     if needs_child(path):
         from pipeline.foreign.usd.object_source import UsdSource
 
@@ -134,18 +133,15 @@ def read_source(path: Path, limits: ReadLimits, root: Path | None = None) -> Sou
     _check_start(data, suffix, limits.max_faces)
     gltf: GltfDocument | None = None
     materials = MaterialFiles()
-    keep = limits.with_materials
-    folder = SourceFolder(path.parent, root or path.parent, _read_regular)
+    bytes_left = limits.max_bytes - len(data)
+    folder = SourceFolder(path.parent, root or path.parent)
     if suffix in (".glb", ".gltf"):
         gltf = open_gltf(data, suffix, folder, limits)
         materials = gltf.pictures
-    elif suffix in (".obj", ".ply") and keep:
-        bytes_left = limits.max_bytes - len(data)
-        if suffix == ".obj":
-            normal_maps = limits.with_normal_maps
-            materials = obj_files(data, folder, bytes_left, normal_maps=normal_maps)
-        else:
-            materials = folder.read_all(list_ply_pictures(data), bytes_left)
+    elif suffix == ".obj" and limits.with_materials:
+        materials = obj_files(data, folder, bytes_left, normal_maps=limits.with_normal_maps)
+    elif suffix == ".ply" and limits.with_materials:
+        materials = folder.read_all(list_ply_pictures(data), bytes_left)
     digest = hashlib.sha256(data)
     buffers = {} if gltf is None else gltf.buffers
     for files in (buffers, materials.data):
@@ -173,19 +169,6 @@ def _check_start(data: bytes, suffix: str, max_faces: int) -> None:
             raise Rejected("too_many_faces", f"{count} faces; expected <= {max_faces}")
     elif suffix == ".ply":
         check_face_count(data, max_faces)
-
-
-def _read_regular(path: Path, max_bytes: int) -> bytes:
-    """Read a regular file, since a pipe or a device would never end."""
-    try:
-        status = path.stat()
-        if not stat.S_ISREG(status.st_mode):
-            raise Rejected("missing_file", f"{path.name!r} is not a regular file")
-        if status.st_size > max_bytes:
-            raise Rejected("too_large_bytes", f"{status.st_size} bytes; expected <= {max_bytes}")
-        return path.read_bytes()
-    except (FileNotFoundError, NotADirectoryError) as error:
-        raise Rejected("missing_file", f"there is no file {path.name!r}") from error
 
 
 def load_mesh(source: SourceFile) -> TriangleMesh:

@@ -10,7 +10,6 @@ from numpy.typing import NDArray
 
 from storage.errors import Rejected
 
-_MARKS = {codecs.BOM_UTF16_LE: "utf-16", codecs.BOM_UTF16_BE: "utf-16", codecs.BOM_UTF8: ""}
 T = TypeVar("T", bound=np.generic)
 
 IS_WORD = np.array([not bytes([code]).isspace() for code in range(256)])
@@ -20,10 +19,10 @@ _MOST_LISTED = 12
 
 def plain_text(data: bytes) -> bytes:
     """Return a text without byte order mark, with line feeds as line ends."""
-    for mark, encoding in _MARKS.items():
-        if data.startswith(mark):
-            data = data.decode("utf-16", "replace").encode() if encoding else data[len(mark) :]
-            break
+    if data.startswith((codecs.BOM_UTF16_LE, codecs.BOM_UTF16_BE)):
+        data = data.decode("utf-16", "replace").encode()
+    else:
+        data = data.removeprefix(codecs.BOM_UTF8)
     return data.replace(b"\r\n", b"\n").replace(b"\r", b"\n") if b"\r" in data else data
 
 

@@ -347,11 +347,11 @@ def _cameras(words: str, num_views: int) -> dict[str, Any]:
             raise TrilightError(
                 f"--cameras {words}: {len(cameras)}; expected up to {MOST_CAMERAS}."
             )
-        given = tuple(
+        settings = tuple(
             GivenCamera(c2w=tuple(camera.c2w.ravel().tolist()), fov_deg=camera.fov_deg)
             for camera in cameras
         )
-        return {"kept_cameras": 0, "given_cameras": given}
+        return {"kept_cameras": 0, "given_cameras": settings}
     layouts = ", ".join(TEMPLATES)
     raise TrilightError(f"--cameras is {words!r}; {_CAMERAS} (layouts: {layouts}).")
 

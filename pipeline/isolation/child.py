@@ -97,7 +97,6 @@ class IsolatedChild:
         Raises:
             TrilightError: TRILIGHT_CONFINE has an unknown value, or requires a missing feature.
         """
-        self._is_confined = confined_to is not None and should_confine()
         self._limits = limits
         self._factory = factory
         self._args = args
@@ -105,7 +104,7 @@ class IsolatedChild:
         self._connection: Connection | None = None
         self._calls_left = 0
         self._closed = False
-        self._reach = confined_to
+        self._reach = confined_to if confined_to is not None and should_confine() else None
         self._code = frozenset[Path]()
 
     def allow_files(self, more: Reach) -> None:
@@ -127,21 +126,18 @@ class IsolatedChild:
             TrilightError: also where a new child cannot be set up.
             ChildClosed: `close` was called, perhaps by another thread.
         """
-        return self._call(function, function, args)
+        return self._call(function, args)
 
     def call_method(self, method: Callable[..., Result], *args: Any) -> Result:
         """Run a function whose first argument is the object that the child holds; as `call`."""
-        return self._call(method, call_held, (method, *args))
+        return self._call(method, args, of_held=True)
 
     def _call(
-        self,
-        declared: Callable[..., Result],
-        function: Callable[..., Any],
-        args: tuple[Any, ...],
+        self, function: Callable[..., Result], args: tuple[Any, ...], *, of_held: bool = False
     ) -> Result:
         if self._closed:
             raise ChildClosed
-        if self._reach is not None and not (code := code_of(declared)) <= self._code:
+        if self._reach is not None and not (code := code_of(function)) <= self._code:
             self._code |= code
             self.retire()
         try:
@@ -151,7 +147,7 @@ class IsolatedChild:
                 except ChildFailed as failure:
                     raise _cannot_be_set_up(failure) from failure
             self._calls_left -= 1
-            return self._exchange(declared, function, args, self._limits.wall_s)
+            return self._exchange(function, args, self._limits.wall_s, of_held=of_held)
         except ChildFailed:
             self.retire()
             raise
@@ -177,15 +173,15 @@ class IsolatedChild:
         self._process, self._connection = _launch(self._limits)
         try:
             files = loaded_files()
-            if self._is_confined:  # before it starts threads
+            if self._reach is not None:  # before it starts threads
                 code = self._code | {Path(path).parent for path, _ in files}
                 if self._factory is not None:
                     code |= code_of(self._factory)
-                self._exchange(confine, confine, (self._reach, code), _START_UP_S)
+                self._exchange(confine, (self._reach, code), _START_UP_S)
             if files:  # first: the factory may use their definitions
-                self._exchange(load_same, load_same, (files,), _START_UP_S)
+                self._exchange(load_same, (files,), _START_UP_S)
             if self._factory is not None:
-                self._exchange(hold, hold, (self._factory, *self._args), _START_UP_S)
+                self._exchange(hold, (self._factory, *self._args), _START_UP_S)
         except ChildFailed as failure:
             if self._closed:
                 raise ChildClosed from failure
@@ -196,22 +192,26 @@ class IsolatedChild:
 
     def _exchange(
         self,
-        declared: Callable[..., Result],
-        function: Callable[..., Any],
+        function: Callable[..., Result],
         args: tuple[Any, ...],
         wall_s: float,
+        *,
+        of_held: bool = False,
     ) -> Result:
-        """Send a call, and return the result, checked by the type that `declared` returns."""
+        """Send a call, and return the result, checked by the type that the function declares.
+
+        With `of_held` the object that the child holds comes before `args`.
+        """
         from pipeline.isolation.result_schema import result_reader  # children do without
 
         assert self._connection is not None
-        result_reader(declared)  # raises first if the declared result type cannot be checked
+        result_reader(function)  # raises first if the declared result type cannot be checked
         file = self._connection.fileno()
         wait = CallTime(self._process.pid, wall_s)
         try:
-            send(file, [ForkingPickler.dumps((function, args))], wait)
+            send(file, [ForkingPickler.dumps((function, args, of_held))], wait)
             answer = receive(file, wait, min(self._limits.memory_bytes, _MOST_BYTES))
-            result: Result = decode_answer(answer, declared)
+            result: Result = decode_answer(answer, function)
             return result
         except TooLong as error:
             raise ChildFailed("nonsense", f"its answer would have {error}") from error
@@ -250,11 +250,10 @@ def _launch(limits: ChildLimits) -> tuple[Any, Connection]:
     for tries_left in reversed(range(_LAUNCHES)):
         ours, theirs = context.Pipe()
         output, output_sink = context.Pipe(duplex=False)
-        process = context.Process(
-            target=serve, args=(theirs, output_sink, limits.memory_bytes, limits.cpu_s), daemon=True
-        )
+        words = (theirs, output_sink, limits.memory_bytes, limits.cpu_s)
+        process = context.Process(target=serve, args=words, daemon=True)
         try:
-            with _apart_from_program():
+            with theirs, output_sink, _apart_from_program():
                 process.start()
         except (EOFError, OSError) as error:
             ours.close()
@@ -267,9 +266,6 @@ def _launch(limits: ChildLimits) -> tuple[Any, Connection]:
             os.set_blocking(ours.fileno(), False)
             threading.Thread(target=_print_output, args=(output,), daemon=True).start()
             return process, ours
-        finally:
-            theirs.close()
-            output_sink.close()
     raise AssertionError("unreachable: the last try returns or raises")
 
 
@@ -399,11 +395,6 @@ def hold(factory: Callable[..., object], *args: Any) -> None:
     _held = factory(*args)
 
 
-def call_held(method: Callable[..., Any], *args: Any) -> Any:
-    """Call a function with the object that this child holds, and further arguments."""
-    return method(_held, *args)
-
-
 def serve(connection: Connection, output: Connection, memory_bytes: int, cpu_s: int | None) -> None:
     """Answer calls until the owner closes the connection; ignores Ctrl-C: the owner decides.
 
@@ -423,7 +414,7 @@ def serve(connection: Connection, output: Connection, memory_bytes: int, cpu_s: 
         try:
             # pickle: the child trusts its owner; the owner never unpickles a child's bytes
             (message,) = receive(file, wait_forever, sys.maxsize)
-            function, args = ForkingPickler.loads(message.data)
+            function, args, of_held = ForkingPickler.loads(message.data)
         except EOFError:
             os._exit(0)  # the parent has died: skip the destructors of native libraries
         if cpu_s is not None:  # after so many more, the kernel ends this process in any code
@@ -431,7 +422,7 @@ def serve(connection: Connection, output: Connection, memory_bytes: int, cpu_s: 
             soft = math.ceil(used.ru_utime + used.ru_stime) + cpu_s
             hard = resource.getrlimit(resource.RLIMIT_CPU)[1]
             resource.setrlimit(resource.RLIMIT_CPU, (soft, hard))
-        send(file, _answer(function, args), wait_forever)
+        send(file, _answer(function, (_held, *args) if of_held else args), wait_forever)
 
 
 def _answer(function: Callable[..., Any], args: tuple[Any, ...]) -> list[bytes | memoryview]:

@@ -136,15 +136,15 @@ OUTSIDE = "other samples, widths, filters, layers or versions than measured, or 
 """Reasons for the bound of noise_floor, for people."""
 
 
-def promise_sentence(resolution: int, metric: str = "log") -> str:
-    """Return what a stated error promises at a width, as measured on other scenes; in a sentence.
+def promise_sentence(resolution: int) -> str:
+    """Return what a stated log error promises at a width, as measured on other scenes; a sentence.
 
     The width is the next one below that was judged, or the smallest.
     """
     statement = load_statement()
     if statement is None:
         return f"The stated error is a bound ({OUTSIDE})."
-    judged = statement.metrics[metric].judged
+    judged = statement.metrics["log"].judged
     widths = sorted(map(int, judged))
     width = max((px for px in widths if px <= resolution), default=widths[0])
     record = judged[str(width)]

@@ -84,9 +84,6 @@ class KernelPixels(Pixels):
     def difference(self, first: Any, second: Any) -> Any:
         return mi.Color3d(first) - mi.Color3d(second)
 
-    def are_equal(self, first: Any, second: Any) -> bool:
-        return False
-
     def error_around(self, squared_error: Any) -> Any:
         dr.eval(squared_error)  # eight neighbours of each pixel read it
         row, column = self._rows_and_columns()
@@ -136,11 +133,6 @@ class KernelPixels(Pixels):
             factor = dr.select(is_extreme, common_factor, dr.select(glints, *factors))
             pictures.append(mi.Color3f(mi.Color3d(denoised) * factor))
         return pictures
-
-    def shares(self, parts: Sequence[Any]) -> list[Any]:
-        total = add_up([mi.Color3d(part) for part in parts])
-        equal = 1 / len(parts)
-        return [mi.Color3f(dr.select(total > 0, mi.Color3d(part) / total, equal)) for part in parts]
 
     def tile_sums(self, values: Sequence[Any]) -> Sequence[Any]:
         count = self._resolution**2 // TILE
@@ -216,9 +208,8 @@ class DevicePictures(ViewPictures):
     def _denoise_raws(self, quality: Filtered, *, of_both: bool) -> Sequence[Any]:
         if quality == "off":
             return []
-        sums = self._sums
-        raws = _raws(KernelInputs(), sums, self._names, of_both, self._resolution)
-        pictures = range(sum(len(tracer) - 3 for tracer in sums[0]))
+        raws = _raws(KernelInputs(), self._sums, self._names, of_both, self._resolution)
+        pictures = range(sum(len(tracer) - 3 for tracer in self._sums[0]))
         guides = [self._guides[name] for _, name in to_filter(pictures, self._names)]
         return [denoise_arrays(raw, guides, self._resolution, quality) for raw in raws]
 

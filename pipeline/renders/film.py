@@ -25,15 +25,14 @@ class Film:
     Not a dataclass: Dr.Jit would take its arrays for variables of a loop.
     """
 
-    def __init__(self, camera: PixelCamera) -> None:
+    def __init__(self, camera: PixelCamera, scale: float = 1) -> None:
+        """Take a camera, in a scene that is `scale` times as large as the camera takes it for."""
         focal = float(focal_px(camera.fov_deg, camera.resolution))
         self._width = dr.opaque(mi.UInt32, camera.resolution)
         self._half = dr.opaque(mi.Float, 0.5 * camera.resolution)
         self._focal = dr.opaque(mi.Float, focal)
-        self._right, self._up, self._backward, origin = (
-            opaque_vector(camera.c2w[:3, axis]) for axis in range(4)
-        )
-        self.origin = mi.Point3f(origin)
+        self._right, self._up, self._backward = map(opaque_vector, camera.c2w[:3, :3].T)
+        self.origin = mi.Point3f(opaque_vector(camera.c2w[:3, 3] * scale))
         """Point3f: the pinhole."""
 
     def rays(self, x: Any, y: Any) -> Any:

@@ -20,7 +20,7 @@ import numpy as np
 from pipeline.renders.device_memory import own_floats
 from storage.optics.multiscatter import ROUGHNESS_STEPS, X_STEPS, albedo_table
 
-_INV_PI = 0.3183098861837907
+INV_PI = 0.3183098861837907
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -95,7 +95,7 @@ def evaluate_bsdf(
     masked_in = _stretch(wi.z, lobes.alpha) / wi.z
     masked_out = _stretch(wo.z, lobes.alpha) / wo.z
     mirrored = lobes.specular * (facets / (masked_in + masked_out))
-    cosine = _INV_PI * wo.z
+    cosine = INV_PI * wo.z
     pdf = (1 - lobes.weight) * cosine + lobes.weight * facets / (1 + masked_in)
     reflected = lobes.diffuse * cosine + dr.select(dr.dot(wo, geometric) > 0, mirrored, 0)
     # A viewer below has no specular lobe: its terms are 0 times what may be infinite.
@@ -106,15 +106,6 @@ def evaluate_bsdf(
     if unmapped is not None:
         reflected = dr.select(dr.dot(wo, unmapped) > 0, reflected, 0)
     return dr.select(above, reflected, 0), dr.select(above, pdf, 0)
-
-
-def diffuse_share(
-    lobes: KernelLobes, wi: Any, wo: Any, geometric: Any, unmapped: Any = None
-) -> Any:
-    """Return the share (Color3f) of the diffuse lobe in what `evaluate_bsdf` returns; 1 of 0."""
-    reflected, _ = evaluate_bsdf(lobes, wi, wo, geometric, unmapped)
-    diffuse = lobes.diffuse * (_INV_PI * dr.maximum(wo.z, 0))
-    return dr.select(reflected > diffuse, diffuse / reflected, 1)
 
 
 def reverse_pdf(lobes: KernelLobes, wi: Any, wo: Any, geometric: Any) -> Any:
@@ -132,10 +123,10 @@ def reverse_pdf(lobes: KernelLobes, wi: Any, wo: Any, geometric: Any) -> Any:
     """
     distribution = _distribution(dr.normalize(wi + wo), lobes.alpha)
     facets = distribution / (2 * (wo.z + _stretch(wo.z, lobes.alpha)))
-    pdf = (1 - lobes.weight) * _INV_PI * wi.z + lobes.weight * facets
+    pdf = (1 - lobes.weight) * INV_PI * wi.z + lobes.weight * facets
     same_side = dr.dot(wo, geometric) > 0
     above = dr.select(same_side & (wi.z > 0), pdf, 0)
-    return dr.select(same_side, above, _INV_PI * dr.maximum(-wi.z, 0))
+    return dr.select(same_side, above, INV_PI * dr.maximum(-wi.z, 0))
 
 
 def sample(lobes: KernelLobes, wi: Any, u_lobe: Any, u_direction: Any) -> Any:
@@ -149,7 +140,7 @@ def sample(lobes: KernelLobes, wi: Any, u_lobe: Any, u_direction: Any) -> Any:
 def _distribution(half: Any, alpha: Any) -> Any:
     # sin^2 + alpha^2 cos^2 from x and y: (alpha^2 - 1) cos^2 + 1 cancels for a small alpha.
     spread = dr.square(half.x) + dr.square(half.y) + dr.square(alpha * half.z)
-    return _INV_PI * dr.square(alpha / spread)
+    return INV_PI * dr.square(alpha / spread)
 
 
 def _stretch(cosine: Any, alpha: Any) -> Any:

@@ -11,22 +11,25 @@ large ones: a cell takes the smallest that has enough photons, with a part of wh
 one says, for what the few have missed.
 
 The path tracer draws a share of its directions from the table and the others by the BRDF. The
-density of this mixture is the c_i of pipeline.renders.light_kernel for i > 1. At x1 the path tracer
+density of this mixture is the c_i of pipeline.renders.path_kernel for i > 1. At x1 the path tracer
 is not guided: light paths land there, and guiding there too made pictures no better (study S18).
 """
 
 import math
 from dataclasses import dataclass
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import drjit as dr
 import mitsuba as mi
 import numpy as np
 from numpy.typing import NDArray
 
-from pipeline.renders.device_memory import own_floats, own_integers
+from pipeline.renders.device_memory import own_floats, own_integers, read_back
 from pipeline.renders.ggx import KernelLobes
 from pipeline.renders.surface_table import Hit
+
+if TYPE_CHECKING:
+    from pipeline.renders.path_kernel import Arrival
 
 _CELLS = 1500
 """A cell is about as large as so many parts of the scene's whole surface, or smaller."""
@@ -198,31 +201,86 @@ _PARENT = 0.25
 """Part of a row that the next larger cube says."""
 
 
-@dataclass(frozen=True, kw_only=True, eq=False)
-class Photons:
-    """Photons that arrived by way of a narrow lobe."""
+_SLOTS = 6
+"""Vertices of a path that are recorded at most."""
 
-    cell: NDArray[np.int64]
-    """[P] cell that each photon hit (`GuideCells`)."""
-    bin: NDArray[np.int64]
-    """[P] bin of the direction from which each photon came (`bin_of`)."""
-    power: NDArray[np.float64]
-    """[P] in any unit, above 0."""
+_NARROW = 1.0
+"""Least density (per steradian) of a bounce whose arrival is recorded: thrice that of a cosine."""
+
+_LEAST_ROUGH = 0.2
+"""Least share of a surface's lobes that may be guided, for an arrival to be recorded."""
 
 
-def learn(cells: GuideCells, photons: Photons) -> GuideTable | None:
-    """Return the guide table, or None if no cell got enough photons."""
-    least = max(_LEAST_PHOTONS, math.ceil(len(photons.cell) / _MOST_ROWS))
+class PhotonRecords:
+    """Where light arrives by way of narrow lobes; path guiding learns from it.
+
+    Arrivals straight from an emitter are not recorded, because the path tracer picks emitters, nor
+    those by way of wide lobes, because a BRDF sample finds such light. Not a dataclass: Dr.Jit
+    would take its arrays for loop variables.
+    """
+
+    def __init__(self, cells: GuideCells, count: int) -> None:
+        """Begin with none, for `count` paths."""
+        self._guide_cells = cells
+        self._first = dr.arange(mi.UInt32, count) * _SLOTS
+        self._cells = dr.zeros(mi.UInt32, count * _SLOTS)
+        self._bins = dr.zeros(mi.UInt32, count * _SLOTS)
+        self._powers = dr.zeros(mi.Float, count * _SLOTS)
+
+    def __call__(self, _: Any, arrival: "Arrival") -> None:
+        """Record an arrival of each lane in a cell, from the bin of its direction."""
+        vertex = arrival.vertex
+        cell = self._guide_cells.index(vertex.hit, vertex.front, arrival.active)
+        index, _ = bin_of(-arrival.direction)
+        reflects = dr.max(vertex.lobes.diffuse + vertex.lobes.specular) > 0
+        arrives = arrival.active & (arrival.drawn > _NARROW) & reflects
+        arrives &= rough_share(vertex.lobes) > _LEAST_ROUGH
+        slot = arrival.depth - 2
+        active = arrives & (slot < _SLOTS)
+        place = self._first + slot
+        dr.scatter(self._cells, cell, place, active)
+        dr.scatter(self._bins, index, place, active)
+        dr.scatter(self._powers, arrival.power, place, active)
+
+    def photons(self) -> tuple[NDArray[np.int64], NDArray[np.int64], NDArray[np.float64]]:
+        """Return cells, bins and powers of all that was recorded, path by path, as for `learn`."""
+        powers = read_back(self._powers).astype(np.float64)
+        rows = np.flatnonzero((powers > 0) & np.isfinite(powers))
+        hit_cells, bins = (read_back(v)[rows].astype(np.int64) for v in (self._cells, self._bins))
+        return hit_cells, bins, powers[rows]
+
+
+def learn(
+    cells: GuideCells,
+    hit_cells: NDArray[np.int64],
+    bins: NDArray[np.int64],
+    powers: NDArray[np.float64],
+) -> GuideTable | None:
+    """Return the guide table, or None if no cell got enough photons.
+
+    Args:
+        cells: of the surfaces.
+        hit_cells: [P] cell that each photon hit.
+        bins: [P] bin of the direction from which each photon came (`bin_of`).
+        powers: [P] in any unit, above 0.
+    """
+    least = max(_LEAST_PHOTONS, math.ceil(len(hit_cells) / _MOST_ROWS))
     row_of_cell = np.zeros(len(cells.facing), np.int64)
     rows = np.zeros((1, BINS))
     for level in reversed(range(_LEVELS)):
-        group = _groups(cells, cells.size_m * 2**level)
+        # the number of each cell's cube and facing
+        cube = np.floor(cells.centres_m / (cells.size_m * 2**level)).astype(np.int64)
+        _, group = np.unique(np.column_stack([cube, cells.facing]), axis=0, return_inverse=True)
+        group = group.ravel()
         large_groups = np.flatnonzero(
-            np.bincount(group[photons.cell], minlength=group.max() + 1) >= least
+            np.bincount(group[hit_cells], minlength=group.max() + 1) >= least
         )
         place = np.full(group.max() + 1, -1)
         place[large_groups] = np.arange(len(large_groups))
-        finer = _shares(_histograms(place[group], photons, len(large_groups)))
+        row = place[group][hit_cells]
+        flat = row[row >= 0] * BINS + bins[row >= 0]
+        sums = np.bincount(flat, powers[row >= 0], minlength=len(large_groups) * BINS)
+        finer = _shares(sums.astype(np.float64).reshape(-1, SIDE, SIDE))
         parents = np.zeros(len(large_groups), np.int64)
         held = place[group] >= 0
         parents[place[group[held]]] = row_of_cell[held]
@@ -240,20 +298,6 @@ def apportion_entries(shares: NDArray[np.float64]) -> NDArray[np.int64]:
     """Return shares [N, BINS] as whole numbers that add up to ENTRIES; each row of shares to 1."""
     edges = np.rint(np.cumsum(shares, axis=1) * ENTRIES).astype(np.int64)
     return np.diff(edges, axis=1, prepend=0)
-
-
-def _groups(cells: GuideCells, width_m: float) -> NDArray[np.int64]:
-    """Return for each cell the number of its cube and facing, [C]."""
-    cube = np.floor(cells.centres_m / width_m).astype(np.int64)
-    _, group = np.unique(np.column_stack([cube, cells.facing]), axis=0, return_inverse=True)
-    return group.ravel()
-
-
-def _histograms(place: NDArray[np.int64], photons: Photons, count: int) -> NDArray[np.float64]:
-    row = place[photons.cell]
-    flat = row[row >= 0] * BINS + photons.bin[row >= 0]
-    sums = np.bincount(flat, photons.power[row >= 0], minlength=count * BINS).astype(np.float64)
-    return sums.reshape(count, SIDE, SIDE)
 
 
 def _shares(histograms: NDArray[np.float64]) -> NDArray[np.float64]:

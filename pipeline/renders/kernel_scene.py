@@ -10,10 +10,9 @@ from numpy.typing import NDArray
 
 from pipeline.renders import ggx
 from pipeline.renders.device_memory import own_floats, own_integers, read_back
-from pipeline.renders.emitter_table import EmissionCone, EmitterTable
 from pipeline.renders.ggx import AlbedoLookup, KernelLobes
 from pipeline.renders.guide_table import GuideTable
-from pipeline.renders.sky_table import SkyTable, sky_share
+from pipeline.renders.light_tables import EmissionCone, EmitterTable, SkyTable, sky_share
 from pipeline.renders.surface_table import Hit, SurfacePoint, SurfaceTable
 from pipeline.renders.tracer import split_triangles
 from storage.raycast import MISS, RayHits
@@ -158,30 +157,24 @@ def face_viewer(
     `normalmap`: a half turn about that normal maps one frame to the other. Where the scene has no
     normal map, all stays.
     """
-    if vertex.unmapped is not None:
-        vertex, directions = _turn_to_viewer(vertex, vertex.unmapped, directions)
+    if (axis := vertex.unmapped) is not None:
+        turned = (vertex.incoming.z <= 0) & (dr.dot(vertex.incoming, axis) > 0)
+
+        def turn(direction: Any) -> Any:
+            return dr.select(turned, axis * (2 * dr.dot(axis, direction)) - direction, direction)
+
+        to_world = vertex.frame.to_world
+        axes = (mi.Vector3f(1, 0, 0), mi.Vector3f(0, 1, 0), mi.Vector3f(0, 0, 1))
+        vertex = replace(
+            vertex,
+            frame=mi.Frame3f(*(mi.Vector3f(to_world(turn(each))) for each in axes)),
+            geometric=turn(vertex.geometric),
+            incoming=turn(vertex.incoming),
+            turned=turned,
+        )
+        directions = tuple(map(turn, directions))
     albedo = scene.albedo(vertex.incoming.z, vertex.lobes.alpha, active)
     return replace(vertex, lobes=ggx.seen_from(vertex.lobes, vertex.incoming, albedo)), directions
-
-
-def _turn_to_viewer(
-    vertex: Vertex, axis: Any, directions: tuple[Any, ...]
-) -> tuple[Vertex, tuple[Any, ...]]:
-    turned = (vertex.incoming.z <= 0) & (dr.dot(vertex.incoming, axis) > 0)
-
-    def turn(direction: Any) -> Any:
-        return dr.select(turned, axis * (2 * dr.dot(axis, direction)) - direction, direction)
-
-    axes = (mi.Vector3f(1, 0, 0), mi.Vector3f(0, 1, 0), mi.Vector3f(0, 0, 1))
-    frame = mi.Frame3f(*(mi.Vector3f(vertex.frame.to_world(turn(each))) for each in axes))
-    faced = replace(
-        vertex,
-        frame=frame,
-        geometric=turn(vertex.geometric),
-        incoming=turn(vertex.incoming),
-        turned=turned,
-    )
-    return faced, tuple(map(turn, directions))
 
 
 def hit_of(intersection: Any) -> tuple[Hit, Any]:
@@ -282,7 +275,7 @@ class KernelParts:
     def share(self, vertex: Vertex, local: Any) -> Any:
         """Return the share (Color3f) of the diffuse lobe in the light that a vertex reflects.
 
-        It is None where lobes are not apart.
+        It is 1 of no light, and None where lobes are not apart.
 
         Args:
             vertex: as the camera path sees it.
@@ -290,9 +283,9 @@ class KernelParts:
         """
         if not self._lobes:
             return None
-        return ggx.diffuse_share(
-            vertex.lobes, vertex.incoming, local, vertex.geometric, vertex.unmapped
-        )
+        reflected, _ = vertex.evaluate(local)
+        diffuse = vertex.lobes.diffuse * (ggx.INV_PI * dr.maximum(local.z, 0))
+        return dr.select(reflected > diffuse, diffuse / reflected, 1)
 
     def carry_share(self, vertex: Vertex, local: Any, depth: Any, before: Any) -> Any:
         """Return the `share` of the first vertex of a path, which has `depth` (UInt32) by now."""

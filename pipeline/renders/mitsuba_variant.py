@@ -21,7 +21,7 @@ import subprocess
 import sys
 import tempfile
 import zlib
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from importlib import metadata
 from pathlib import Path
@@ -271,7 +271,7 @@ def _probe(variant: Variant, walls_s: Sequence[float] = _PROBE_S) -> _ProbeResul
         if variant.libllvm:
             environment["DRJIT_LIBLLVM_PATH"] = variant.libllvm
         try:
-            result = run_module("variant_probe", variant.name, wall_s, environment)
+            result = run_probe(variant.name, wall_s, environment)
         except subprocess.TimeoutExpired:
             silent = _ProbeResult(problem=f"no answer within {wall_s:g} s", is_silent=True)
             return _probe(variant, more_s) if more_s else silent
@@ -283,12 +283,12 @@ def _probe(variant: Variant, walls_s: Sequence[float] = _PROBE_S) -> _ProbeResul
     return _ProbeResult(problem=lines[-1] if lines else f"it ended with status {result.returncode}")
 
 
-def run_module(
-    name: str, argument: str, wall_s: float, environment: Mapping[str, str]
+def run_probe(
+    argument: str, wall_s: float, environment: Mapping[str, str]
 ) -> subprocess.CompletedProcess[str]:
-    """Run a module of this package in a child; raises TimeoutExpired after so many seconds."""
+    """Run `variant_probe` in a child; raises TimeoutExpired after so many seconds."""
     return subprocess.run(
-        [sys.executable, "-m", f"{__package__}.{name}", argument],
+        [sys.executable, "-m", f"{__package__}.variant_probe", argument],
         cwd=IMPORT_ROOT,
         env=environment,
         capture_output=True,
@@ -320,7 +320,14 @@ def llvm_libraries() -> list[Path]:
     Symbolic links are resolved, so that one library is named once.
     """
     named = os.environ.get("DRJIT_LIBLLVM_PATH")
-    candidates = {path.resolve() for path in _in_usual_folders()}
+    candidates = {
+        path.resolve()
+        for pattern in _FOLDERS
+        for folder in Path("/").glob(pattern.lstrip("/"))
+        for name in ("libLLVM*.so*", "libLLVM*.dylib")
+        for path in folder.glob(name)
+        if _NAME.match(path.name)
+    }
     ordered = sorted(candidates, key=lambda path: (-_version_in_name(path), str(path)))
     first = [Path(named).resolve()] if named else []
     return [path for path in dict.fromkeys([*first, *_of_wheel(), *ordered]) if path.is_file()]
@@ -338,13 +345,6 @@ def _of_wheel() -> list[Path]:
     except metadata.PackageNotFoundError:
         return []
     return [Path(str(file.locate())).resolve() for file in members if _NAME.match(file.name)]
-
-
-def _in_usual_folders() -> Iterable[Path]:
-    for pattern in _FOLDERS:
-        for folder in Path("/").glob(pattern.lstrip("/")):
-            for name in ("libLLVM*.so*", "libLLVM*.dylib"):
-                yield from (path for path in folder.glob(name) if _NAME.match(path.name))
 
 
 _LIBRARIES = (

@@ -25,7 +25,10 @@ from pipeline.renders.samples import TILE_PX, DualBuffer, by_tiles, tile_means
 from pipeline.renders.settings import Filtered, RenderSettings
 from pipeline.renders.tracer import PixelCamera
 from pipeline.renders.view_pictures import (
+    DARKER,
     LEAST_PASSES,
+    STANDARD_ERRORS,
+    STANDS_OUT,
     Group,
     MeasuredLook,
     Pixels,
@@ -34,7 +37,6 @@ from pipeline.renders.view_pictures import (
     put_together,
     require_bounded,
     require_finite,
-    stands_out,
     to_filter,
 )
 from storage.denoiser import denoise
@@ -187,8 +189,11 @@ def converged_mask(
         pixels: operations on all of these.
     """
     is_now, was = (pixels.channel_mean(pixels.double(add_up(parts))) for parts in (denoised, raw))
+    error = pixels.sqrt(squared_error)
     around = pixels.error_around(squared_error)
-    return stands_out(is_now, was, pixels.sqrt(squared_error), around)
+    bright = (was - is_now > STANDARD_ERRORS * error) & (was > STANDS_OUT * is_now)
+    dark = (is_now - was > STANDARD_ERRORS * around) & (is_now > DARKER * was)
+    return bright | dark
 
 
 def keep_in_halves(
@@ -277,8 +282,7 @@ def measure_pixels(
         a, b, denoised_a, denoised_b = (add_up(each[slice(*group)]) for each in (*raws, *corrected))
         halves = join_halves(a, b, denoised_a, denoised_b, pixels)
         if finished is None:
-            is_filtered = bool(filtered) and not pixels.are_equal(a, denoised_a)
-            rows = estimates(halves, hit, pixels, is_filtered)
+            rows = estimates(halves, hit, pixels, bool(filtered))
             errors += [error for error, _ in rows]
             surprises += [surprise for _, surprise in rows]
         else:

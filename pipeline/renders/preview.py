@@ -166,10 +166,9 @@ def timed_parts(
         resolution: pixels each way.
         clock: returns seconds; `time.process_time` counts those of all threads.
     """
-    depths = {"max_depth": RenderSettings.max_depth, "rr_depth": RenderSettings.rr_depth}
-    load_tracer(scene, **depths)  # the first one loads libraries as well
+    load_tracer(scene)  # the first one loads libraries as well
     began = clock()
-    tracer = load_tracer(scene, **depths)
+    tracer = load_tracer(scene)
     seconds = {SCENE: clock() - began}
     small, camera = (
         pixel_camera(scene.c2w[0], scene.fov_deg[0], px) for px in (_SMALL, resolution)

@@ -30,7 +30,6 @@ from pipeline.renders.preview import FIRST_LOOKS_SPP, preview_steps, usual_filte
 from pipeline.renders.samples import (
     DualBuffer,
     Floors,
-    Goal,
     TileChoice,
     expected_spp,
     gaps_db,
@@ -294,8 +293,8 @@ class SceneRenderer:
             gaps = gaps_db(targets_db, look.floor.by_metric)
             if not gaps or samples.spp >= max_spp:
                 return look
-            goal = Goal(targets_db=targets_db, step=2 * samples.pass_spp, max_spp=max_spp)
-            expected = expected_spp(measured, goal)
+            step = 2 * samples.pass_spp
+            expected = expected_spp(measured, targets_db, step=step, max_spp=max_spp)
             missing_db = max(gaps.values())
             if self._shows_looks:
                 looked_s = time.process_time()
@@ -312,7 +311,7 @@ class SceneRenderer:
                 )
             if expected >= _GUIDED_SPP:
                 samples.guide()
-            spp = next_spp(measured, goal)
+            spp = next_spp(samples.spp, expected, step)
             chosen = tiles.passes(samples, spp)
             passes = samples.passes_to(spp) if chosen is None else samples.passes_over(chosen)
             for _ in passes:

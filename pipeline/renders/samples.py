@@ -22,7 +22,6 @@ doubling of the samples bought in its own metric, and the one that needs most sa
 
 import math
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -164,8 +163,9 @@ class TileChoice:
             visible: [R, R] pixels that may have light at all.
         """
         self._weight = tile_means(visible.astype(np.float64))
-        self._seen: list[NDArray[np.int64]] = []
-        self._variance: list[NDArray[np.float64]] = []
+        self._seen: NDArray[np.int64] | None = None
+        self._variance: NDArray[np.float64] | None = None
+        """[2, T, T] of one sample, by two looks; a tile that got none keeps what was known."""
         self._filter: Filtered | None = None
 
     def learn(
@@ -179,13 +179,12 @@ class TileChoice:
             quality: of the filter. What changes with it says nothing of the samples: after that
                 nothing new is known.
         """
-        tiles = slice(None, None, TILE_PX)
-        seen = [samples.spp_by_half[half][tiles, tiles].copy() for half in range(len(changes))]
-        if self._seen and quality == self._filter:
-            known = self._variance or [np.zeros_like(self._weight)] * 2
-            self._variance = [
-                _variance(*each) for each in zip(changes, self._seen, seen, known, strict=True)
-            ]
+        seen = samples.spp_by_half[:, ::TILE_PX, ::TILE_PX].copy()
+        if self._seen is not None and quality == self._filter:
+            grown = seen > self._seen
+            less = np.where(grown, 1 / self._seen - 1 / seen, 1)
+            known = 0.0 if self._variance is None else self._variance
+            self._variance = np.where(grown, np.stack([*map(_smooth, changes)]) / less, known)
         self._seen = seen
         self._filter = quality
 
@@ -197,26 +196,15 @@ class TileChoice:
             mean_spp: samples per pixel that are wanted, both halves together.
         """
         more = mean_spp - samples.spp
-        started = self._variance and self._seen[0].min() >= _PASS
-        if not started or more < 2 * _PASS:
+        if self._variance is None or self._seen is None:
+            return None
+        if self._seen[0].min() < _PASS or more < 2 * _PASS:
             return None
         of_tiles = [
             passes_of_tiles(other_variance, spp, self._weight, more / 2)
             for other_variance, spp in zip(self._variance[::-1], self._seen, strict=True)
         ]
         return [each.repeat(TILE_PX, axis=0).repeat(TILE_PX, axis=1) for each in of_tiles]
-
-
-def _variance(
-    change: NDArray[np.float64],
-    spp_before: NDArray[np.int64],
-    spp: NDArray[np.int64],
-    known: NDArray[np.float64],
-) -> NDArray[np.float64]:
-    """Return the variance of one sample, [T, T], by two looks; `known` where nothing was added."""
-    grown = spp > spp_before
-    less = np.where(grown, 1 / spp_before - 1 / spp, 1)
-    return np.where(grown, _smooth(change) / less, known)
 
 
 def passes_of_tiles(
@@ -294,46 +282,34 @@ _MAX_GROWTH = 2.0
 With 4 half of what these gain was lost."""
 
 
-@dataclass(frozen=True, kw_only=True)
-class Goal:
-    """Targets and cap of the samples of a view."""
-
-    targets_db: Floors
-    """Stated errors to reach, in dB by metric."""
-    step: int
-    """Samples per pixel that one pass adds, both halves together."""
-    max_spp: int
-    """Maximum samples per pixel, a multiple of `step`."""
-
-
 def gaps_db(targets_db: Floors, floors_db: Floors) -> dict[str, float]:
     """Return by how many dB each target is missed, by metric; without those that are reached."""
     gaps = {metric: target_db - floors_db[metric] for metric, target_db in targets_db.items()}
     return {metric: gap_db for metric, gap_db in gaps.items() if gap_db > 0}
 
 
-def next_spp(measured: Measured, goal: Goal) -> int:
-    """Return the number of samples at which the floors are measured next.
+def next_spp(spp: int, expected: int, step: int) -> int:
+    """Return the samples at which floors are measured next, of `expected_spp` after `spp`."""
+    growth = max(step * math.ceil(spp * _MAX_GROWTH / step), spp + step)
+    return min(expected, growth)
+
+
+def expected_spp(measured: Measured, targets_db: Floors, *, step: int, max_spp: int) -> int:
+    """Return the number of samples that should reach all targets, or the cap.
 
     Args:
-        measured: of this view so far; the last floors miss a target of the goal, and their samples
-            are a multiple of its step below its cap.
-        goal: when sampling ends.
+        measured: of this view so far; the last floors miss a target, and their samples are a
+            multiple of `step` below the cap.
+        targets_db: stated errors to reach, in dB by metric.
+        step: samples per pixel that one pass adds, both halves together.
+        max_spp: the cap, a multiple of `step`.
     """
-    spp = measured[-1][0]
-    step = goal.step
-    growth = max(step * math.ceil(spp * _MAX_GROWTH / step), spp + step)
-    return min(expected_spp(measured, goal), growth)
-
-
-def expected_spp(measured: Measured, goal: Goal) -> int:
-    """Return the number of samples that should reach all targets, or the cap; as `next_spp`."""
     spp, floors_db = measured[-1]
-    gaps = gaps_db(goal.targets_db, floors_db)
+    gaps = gaps_db(targets_db, floors_db)
     needed_doublings = max(gap_db / slope_db(measured, metric) for metric, gap_db in gaps.items())
-    doublings = min(needed_doublings, math.log2(goal.max_spp / spp) + 1)
-    target_spp = goal.step * math.ceil(spp * 2**doublings / goal.step)
-    return min(goal.max_spp, max(target_spp, spp + goal.step))
+    doublings = min(needed_doublings, math.log2(max_spp / spp) + 1)
+    target_spp = step * math.ceil(spp * 2**doublings / step)
+    return min(max_spp, max(target_spp, spp + step))
 
 
 def slope_db(measured: Measured, metric: str) -> float:

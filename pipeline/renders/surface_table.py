@@ -4,7 +4,7 @@ A row is 29 floats padded to 32, so that a lane loads it as aligned groups of fo
 component by component). Nothing about a scene is a literal in the kernel: one kernel serves all.
 """
 
-from collections.abc import Mapping
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -19,7 +19,7 @@ from storage.optics.bsdf import MIN_ALPHA, bsdf_lobes
 from storage.optics.multiscatter import ROUGHNESS_STEPS, mean_albedo, scattered_again
 from storage.records.lookup import LEAST_TANGENT_SQ, LEAST_Z, u_directions
 from storage.records.scene import Scene
-from storage.records.texture import CONSTANT, TEXTURED, Texture
+from storage.records.texture import TEXTURED, Texture
 
 _GROUPS = 8
 """Groups of four floats per row."""
@@ -60,23 +60,19 @@ class SurfaceTable:
         corners = scene.vertex_positions[scene.faces[order]]
         normals = scene.vertex_normals[scene.faces[order]]
         lobes = bsdf_lobes(scene.materials[scene.material_index[order]])
-        rows = np.concatenate(
-            [
-                np.concatenate([corners[:, 0], normals[:, 0, 0:1]], axis=1),
-                np.concatenate([corners[:, 1] - corners[:, 0], normals[:, 0, 1:2]], axis=1),
-                np.concatenate([corners[:, 2] - corners[:, 0], normals[:, 0, 2:3]], axis=1),
-                normals[:, 1:].reshape(-1, 6),
-                lobes.diffuse,
-                lobes.specular,
-                lobes.alpha[:, None],
-                lobes.weight[:, None],
-                scattered_again(lobes.specular, lobes.alpha, "correlated"),
-            ],
-            axis=1,
-        )
-        padded = np.zeros((len(rows), 4 * _GROUPS), np.float32)
-        padded[:, : rows.shape[1]] = rows
-        self._rows = own_floats(padded)
+        # The first corner and both edges from it, each with a component of the first normal.
+        edges = np.concatenate([corners[:, :1], corners[:, 1:] - corners[:, :1]], axis=1)
+        rows = [
+            np.concatenate([edges, normals[:, 0, :, None]], axis=2).reshape(-1, 12),
+            normals[:, 1:].reshape(-1, 6),
+            lobes.diffuse,
+            lobes.specular,
+            lobes.alpha,
+            lobes.weight,
+            scattered_again(lobes.specular, lobes.alpha, "correlated"),
+            np.zeros((len(order), 3)),
+        ]
+        self._rows = own_floats(np.column_stack(rows))
         self._textures = KernelTextures(scene, order) if scene.textures else None
 
     def point(self, hit: Hit, active: Any) -> SurfacePoint:
@@ -151,18 +147,17 @@ class KernelTextures:
         corners -= np.floor(corners.min(axis=1, keepdims=True))
         self._corners = own_floats(np.pad(corners.reshape(-1, 6), ((0, 0), (0, 2))))
         self._material = own_integers(scene.material_index[order])
-        colours = [each for each in scene.textures if each.channels == 3]
-        numbers = [each for each in scene.textures if each.channels == 1]
-        self._colours = _texels(colours, _COLOUR)
-        self._numbers = _texels(numbers, _NUMBER)
-        places = _places(colours) | _places(numbers)
-        self._rows = _lookups(scene, scene.material_textures, places)
+        # By row of a texture: first texel, width, height and 1. The last row is that of CONSTANT.
+        lookups = np.zeros((len(scene.textures) + 1, 4), np.uint32)
+        self._colours = _load_texels(scene.textures, 3, _COLOUR, lookups)
+        self._numbers = _load_texels(scene.textures, 1, _NUMBER, lookups)
+        self._rows = own_integers(lookups[scene.material_textures])
         roughness = np.linspace(0, 1, ROUGHNESS_STEPS)
         self._mean_albedo = own_floats(mean_albedo(np.square(roughness), "correlated"))
         self._u_directions: Any = None
         if scene.normal_textures is None:
             return
-        self._maps = _lookups(scene, scene.normal_textures, places)
+        self._maps = own_integers(lookups[scene.normal_textures])
         positions = scene.vertex_positions[scene.faces[order]]
         self._u_directions = own_floats(np.pad(u_directions(positions, corners), ((0, 0), (0, 1))))
 
@@ -275,36 +270,27 @@ def _neighbours(place: Any, count: Any) -> tuple[Any, Any, Any]:
     return first, second, scaled - below
 
 
-Place = tuple[int, int, int, int]
+def _load_texels(
+    textures: Sequence[Texture], channels: int, floats: int, lookups: NDArray[np.uint32]
+) -> Any:
+    """Return the linear values of the texels of textures with so many channels, row by row.
 
-
-def _places(textures: list[Texture]) -> dict[str, Place]:
-    """Return where each texture begins, in texels, its width and height, and 1: it is there."""
-    places = {}
+    Args:
+        textures: all of a scene.
+        channels: 3 for colors, 1 for numbers.
+        floats: numbers of each texel, 0 beyond its channels.
+        lookups: rows of `textures`, in which the places of these are filled in.
+    """
+    rows = [row for row, each in enumerate(textures) if each.channels == channels]
+    sizes = np.array([textures[row].texels.shape[:2] for row in rows], np.int64).reshape(-1, 2)
+    values = np.zeros((max(1, sizes.prod(axis=1).sum()), floats), np.float32)
     first = 0
-    for texture in textures:
-        height, width = texture.texels.shape[:2]
-        places[texture.sha256] = (first, width, height, 1)
-        first += height * width
-    return places
-
-
-def _lookups(scene: Scene, index: NDArray[np.int32], places: Mapping[str, Place]) -> Any:
-    """Return the places of textures by their rows; zeros for CONSTANT."""
-    shas = [None if row == CONSTANT else scene.textures[row].sha256 for row in index.ravel()]
-    return own_integers(np.array([(0,) * 4 if sha is None else places[sha] for sha in shas]))
-
-
-def _texels(textures: list[Texture], floats: int) -> Any:
-    """Return the linear values of all texels, row by row, `floats` of each; 0 beyond its own."""
-    count = sum(each.texels.shape[0] * each.texels.shape[1] for each in textures)
-    values = np.zeros((max(1, count), floats), np.float32)
-    first = 0
-    for texture in textures:
-        flat = texture.texels.reshape(-1, texture.channels)
+    for row, (height, width) in zip(rows, sizes, strict=True):
+        lookups[row] = first, width, height, 1
+        flat = textures[row].texels.reshape(-1, channels)
         for start in range(0, len(flat), _BLOCK):
-            linear = texture.linear(flat[start : start + _BLOCK])
+            linear = textures[row].linear(flat[start : start + _BLOCK])
             begin = first + start
-            values[begin : begin + len(linear), : texture.channels] = linear
+            values[begin : begin + len(linear), :channels] = linear
         first += len(flat)
     return own_floats(values)

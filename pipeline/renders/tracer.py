@@ -6,12 +6,13 @@ that estimates the same integral.
 
 import dataclasses
 import math
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from pipeline.renders.settings import RenderSettings
 from storage.errors import Rejected
 from storage.records.retextured import without_constant_textures
 from storage.records.scene import Scene
@@ -30,12 +31,6 @@ class PixelCamera:
     """Full field of view, equal in width and height."""
     resolution: int
     """Width and height in pixels."""
-
-    def at_scale(self, factor: float) -> "PixelCamera":
-        """Return the camera that sees the same of a scene that is so many times as large."""
-        c2w = self.c2w.copy()
-        c2w[:3, 3] *= factor
-        return replace(self, c2w=c2w)
 
 
 def pixel_camera(c2w: ArrayLike, fov_deg: float, resolution: int) -> PixelCamera:
@@ -58,7 +53,12 @@ SIZES_AS_THEY_ARE_M = (0.1, 10.0)
 """Scenes between these sizes are traced as they are; all presets' scenes are."""
 
 
-def load_tracer(scene: Scene, *, max_depth: int, rr_depth: int) -> "VectorTracer":
+def load_tracer(
+    scene: Scene,
+    *,
+    max_depth: int = RenderSettings.max_depth,
+    rr_depth: int = RenderSettings.rr_depth,
+) -> "VectorTracer":
     """Return the tracer of a scene; call after `activate`.
 
     Textures of one value are the constants that they are: they cost nothing.

@@ -1,28 +1,31 @@
-"""Run as a process of its own: renders a small picture with the variant that its argument names.
+"""Run as a process of its own: renders a small picture with a variant, to try or to time it.
 
-LLVM's library is the one of the environment. Ends with status 0 only when the picture is the right
-one (PROBE_PICTURE) within its noise. The scene needs every kind of ray: it has a
+Its argument is the name of a variant that is tried, or a whole `Variant`, whose facts are printed.
+LLVM's library of a trial is the one of the environment. It ends with status 0 only when the picture
+is the right one (PROBE_PICTURE) within its noise. The scene needs every kind of ray: it has a
 lamp beside the view, a glossy wall that reflects light, and a screen that hides and shades what is
 behind it. Where a kernel misses one kind of hit, some block of the picture is wrong.
 
 On a GPU it then prints why pictures cannot be denoised there, if so.
 """
 
+import json
 import resource
+import subprocess
 import sys
+import time
 from collections.abc import Callable
 from functools import partial
 from typing import TYPE_CHECKING, Literal
 
-import drjit
-import mitsuba
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from pipeline.isolation import die_with_parent
-from pipeline.renders.mitsuba_variant import PROBE_PICTURE
+from pipeline.renders.mitsuba_variant import PROBE_PICTURE, Variant, activate, run_probe
 from storage.conventions import look_at_c2w
-from storage.denoiser import DenoiserDevice, gpu_is_supported, set_denoiser_device
+from storage.denoiser import DenoiserDevice, gpu_is_supported, open_device, set_denoiser_device
+from storage.installation import child_environment
 from storage.records.material import completed_rows
 from storage.records.scene import ObjectKind, Scene, SceneObject
 
@@ -45,17 +48,58 @@ through many layers; a picture that a GPU gets wrong is off by far more."""
 
 _DEVICES: tuple[DenoiserDevice, ...] = ("CPU", "CUDA")
 
+_FACTS_S = 120
+
+VIEW_PX = 256
+"""Width of the picture that is timed, pixels."""
+VIEW_SPP = 128
+"""Its samples per pixel."""
+
 
 def main() -> None:
     die_with_parent()
+    name = sys.argv[1]
+    if name.startswith("{"):
+        sys.stdout.write(json.dumps(_measure_facts(Variant(**json.loads(name)))))
+        return
     resource.setrlimit(resource.RLIMIT_CORE, (0, 0))  # an abort is an answer, not an accident
-    mitsuba.set_variant(sys.argv[1])
+    import drjit
+    import mitsuba
+
+    mitsuba.set_variant(name)
     drjit.set_log_level(drjit.LogLevel.Warn)  # of rays that it leaves out, Dr.Jit says no more
-    wrong = wrong_picture()
-    if wrong:
+    if wrong := wrong_picture():
         raise SystemExit(wrong)
-    if sys.argv[1] == "cuda_ad_rgb":
+    if name == "cuda_ad_rgb":
         sys.stdout.write(denoiser_problem())
+
+
+def render_facts(variant: Variant) -> dict[str, str]:
+    """Return the denoiser, threads and seconds of a view by name; empty if unknown in time."""
+    try:
+        result = run_probe(json.dumps(vars(variant)), _FACTS_S, child_environment())
+    except subprocess.TimeoutExpired:  # a busy machine
+        return {}
+    return dict(json.loads(result.stdout)) if result.returncode == 0 else {}
+
+
+def _measure_facts(variant: Variant) -> dict[str, str]:
+    activate(variant)
+    import drjit
+
+    version = open_device(variant.denoiser).get_int("version")
+    render_view = load_probe(VIEW_PX, VIEW_SPP)
+    seconds = []
+    for seed in range(3):  # the first one compiles kernels
+        began = time.perf_counter()
+        render_view(seed)
+        seconds.append(time.perf_counter() - began)
+    return {
+        "threads": str(drjit.thread_count()),
+        "denoiser": f"{version // 10000}.{version // 100 % 100}.{version % 100}",
+        "denoiser_device": variant.denoiser,
+        "view_s": f"{min(seconds):.2g}",
+    }
 
 
 def wrong_picture() -> str:

@@ -19,13 +19,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pipeline.renders.device_memory import KernelInputs, own_integers, read_back, record_launches
-from pipeline.renders.emitter_table import EmitterTable
 from pipeline.renders.film import Film, Splats, SplatUnit
-from pipeline.renders.guide_table import GuideCells, GuideTable, learn
+from pipeline.renders.guide_table import GuideCells, GuideTable, PhotonRecords, learn
 from pipeline.renders.kernel_scene import KernelParts, KernelScene, hit_of
-from pipeline.renders.light_kernel import CameraJoin, PhotonRecords, trace_light
-from pipeline.renders.path_kernel import trace
-from pipeline.renders.sky_table import SkyTable
+from pipeline.renders.light_tables import EmitterTable, SkyTable
+from pipeline.renders.path_kernel import CameraJoin, trace, trace_light
 from pipeline.renders.tracer import Chosen, PixelCamera, split_triangles
 from storage.denoiser import Features
 from storage.records.lights import shining_sky
@@ -166,52 +164,27 @@ class VectorTracer:
         """
         return _with_fields(self, _scene=_with_fields(self._scene, guide=self._guide()))
 
-    def radiance(
-        self, camera: PixelCamera, *, seed: int, spp: int, chosen: Chosen = None
-    ) -> NDArray[np.float32]:
-        """Return the mean of one pass of samples, linear radiance [R, R, 3]; 0 if not chosen.
+    def radiance(self, camera: PixelCamera, *, seed: int, spp: int) -> NDArray[np.float32]:
+        """Return the mean of one pass of samples, linear radiance [R, R, 3].
 
-        Equal arguments give equal bits, whatever the number of threads. With other pixels chosen,
-        a pixel's samples may be others.
+        Equal arguments give equal bits, whatever the number of threads.
 
         Args:
             camera: the view.
             seed: 31 bits; passes with different seeds are independent.
             spp: samples per pixel, a square of a power of two.
-            chosen: the pixels that are wanted. A tracer may trace the others too.
         """
-        pixels = _pixels(camera, chosen)
-        picture = dr.zeros(mi.Color3f, camera.resolution**2)
-        means = _means(*self._pass(camera, self._film(camera), pixels, seed, spp))
-        dr.scatter(picture, sum(means), pixels)
-        return _picture(camera, picture)
+        samples = self.pass_sum(camera)
+        samples.add(seed=seed, spp=spp)
+        means = [mi.Color3f(total / spp) for total in samples.sums[:-3]]  # a power of two: exact
+        return _picture(camera, sum(means))
 
     def pass_sum(self, camera: PixelCamera) -> "DeviceSum":
         self._landed.begin(camera)
         return DeviceSum(self, camera)
 
     def _film(self, camera: PixelCamera) -> Film:
-        return Film(camera.at_scale(self._scale))
-
-    def _pass(
-        self,
-        camera: PixelCamera,
-        film: Film,
-        pixels: Any,
-        seed: int,
-        spp: int,
-        light_seed: int | None = None,
-    ) -> tuple[Any, ...]:
-        """Return the arguments of `_trace_pass` for a pass.
-
-        Light paths are as many as for the whole picture, so that the weights of the strategies stay
-        the same; what lands in other pixels is dropped. In proportion to the chosen pixels they
-        saved 10 to 25 % of the time and lost 0.7 to 1.0 dB in hard views.
-        """
-        numbers = _PassNumbers(camera, seed, spp, self._light_paths)
-        light = self._light(camera, light_seed, spp)
-        inputs = KernelInputs(self._scene, film, self._parts, light, numbers)
-        return inputs, pixels, camera.resolution, spp
+        return Film(camera, self._scale)
 
     def _light(self, camera: PixelCamera, seed: int | None, spp: int) -> Any:
         """Return the light (Color3f) of each lobe that paths of a seed throw on a whole picture.
@@ -275,29 +248,6 @@ class _PassNumbers:
         self.share = dr.opaque(mi.Float64, light_paths / self.count)
 
 
-def _trace_pass(objects: Any, pixels: Any, resolution: int, spp: int) -> list[Any]:
-    """Return the means of some pixels (Color3f) of each part.
-
-    Light of whole pictures that was traced before (Color3f) is added to what camera paths find.
-    """
-    scene, film, parts, light, numbers = objects
-    pixel = dr.gather(mi.UInt32, pixels, dr.arange(mi.UInt32, len(pixels) * spp) // spp)
-    dr.eval(pixel)  # from its size a replay reads how many lanes there are
-    sampler = mi.load_dict({"type": "multijitter", "sample_count": spp})
-    sampler.set_samples_per_wavefront(spp)
-    sampler.seed(numbers.camera_seed, len(pixels) * spp)
-    jitter = sampler.next_2d()
-    (column, row) = film.corners(pixel)
-    ray = film.rays(column + jitter.x, row + jitter.y)
-    traced = trace(scene, film, parts, numbers.light_paths, sampler, ray)
-    dr.eval(traced)  # all parts in one kernel
-    means = [_pixel_means(spp, part) for part in traced]
-    if not isinstance(light, list):
-        (light,) = land((scene, [film], parts, light, numbers), resolution)
-    gathered = [dr.gather(mi.Color3f, each, pixels) for each in light]
-    return [part + each for part, each in zip(means, parts.of_indirect(gathered), strict=True)]
-
-
 def land(objects: Any, resolution: int) -> list[list[Any]]:
     """Return the light (Color3f) of each lobe that light paths throw on each picture."""
     scene, films, parts, unit, numbers = objects
@@ -319,18 +269,38 @@ def _trace_light_paths(scene: Any, seed: Any, shifts: list[Any], count: int, rec
 
 
 _land = record_launches(land)
-_means = record_launches(_trace_pass)
 
 
 @record_launches
-def _sums(objects: Any, pixels: Any, resolution: int, spp: int, sums: list[Any]) -> list[Any]:
-    """Return the sums with those of a pass."""
-    means: list[Any] = [mi.Color3d(part) for part in _trace_pass(objects, pixels, resolution, spp)]
+def _add_pass(objects: Any, pixels: Any, resolution: int, spp: int, sums: list[Any]) -> list[Any]:
+    """Return the sums of `DeviceSum` with those of a pass over some pixels.
+
+    Light of whole pictures that was traced before (Color3f) is added to what camera paths find.
+    """
+    scene, film, parts, light, numbers = objects
+    pixel = dr.gather(mi.UInt32, pixels, dr.arange(mi.UInt32, len(pixels) * spp) // spp)
+    dr.eval(pixel)  # from its size a replay reads how many lanes there are
+    sampler = mi.load_dict({"type": "multijitter", "sample_count": spp})
+    sampler.set_samples_per_wavefront(spp)
+    sampler.seed(numbers.camera_seed, len(pixels) * spp)
+    jitter = sampler.next_2d()
+    (column, row) = film.corners(pixel)
+    ray = film.rays(column + jitter.x, row + jitter.y)
+    traced = trace(scene, film, parts, numbers.light_paths, sampler, ray)
+    dr.eval(traced)  # all parts in one kernel
+    means: list[Any] = [_pixel_means(spp, part) for part in traced]
+    if not isinstance(light, list):
+        (light,) = land((scene, [film], parts, light, numbers), resolution)
+    gathered = [dr.gather(mi.Color3f, each, pixels) for each in light]
+    means = [
+        mi.Color3d(part + each)
+        for part, each in zip(means, parts.of_indirect(gathered), strict=True)
+    ]
     mean: Any = sum(means)
     square = dr.square((mean.x + mean.y + mean.z) / 3)
     new = [*(part * spp for part in means), square * spp, mi.Float64(spp), mi.Float64(1)]
-    for total, values in zip(sums, new, strict=True):
-        _add(total, values, pixels)
+    for total, values in zip(sums, new, strict=True):  # a pixel once: no order could matter
+        dr.scatter(total, dr.gather(type(total), total, pixels) + values, pixels)
     dr.eval(sums)
     return sums
 
@@ -390,13 +360,23 @@ class DeviceSum:
     def add(
         self, *, seed: int, spp: int, chosen: Chosen = None, light_seed: int | None = None
     ) -> None:
-        """Add all samples of one pass: `VectorTracer.radiance` times `spp`.
+        """Add all samples of one pass, whose pixels have others where others are chosen.
 
-        It may return before they are traced. With `light_seed` its light paths have that seed.
+        It may return before they are traced. With `light_seed` its light paths have that seed. They
+        are as many as for the whole picture, so that the weights of the strategies stay the same;
+        what lands in other pixels is dropped. In proportion to the chosen pixels they saved 10 to
+        25 % of the time and lost 0.7 to 1.0 dB in hard views.
         """
-        pixels = _pixels(self._camera, chosen)
-        arguments = self._tracer._pass(self._camera, self._film, pixels, seed, spp, light_seed)
-        self.sums = _sums(*arguments, self.sums)
+        tracer = self._tracer
+        camera = self._camera
+        numbers = _PassNumbers(camera, seed, spp, tracer._light_paths)
+        light = tracer._light(camera, light_seed, spp)
+        inputs = KernelInputs(tracer._scene, self._film, tracer._parts, light, numbers)
+        pixels = dr.arange(mi.UInt32, camera.resolution**2)
+        if chosen is not None:
+            pixels = own_integers(np.flatnonzero(chosen))
+        dr.eval(pixels)  # in memory even where they are all: one kernel serves any choice
+        self.sums = _add_pass(inputs, pixels, camera.resolution, spp, self.sums)
 
     def guide(self) -> None:
         """Let the passes from now on be guided (pipeline.renders.guide_table), if they can be.
@@ -430,7 +410,7 @@ def _learn_guide(record: Scene, scene: KernelScene) -> GuideTable | None:
     records = PhotonRecords(cells, PHOTON_PATHS)
     seed = seed_for(_PHOTON_SEED, "photons")
     _trace_light_paths(scene, seed, even_shifts(_PHOTON_SEED), PHOTON_PATHS, records)
-    return learn(cells, records.photons())
+    return learn(cells, *records.photons())
 
 
 def even_shifts(seed: int) -> list[Any]:
@@ -450,23 +430,6 @@ def even_numbers(count: int, shifts: Sequence[Any]) -> list[Any]:
         mi.Float((lane * stride + shift) >> 8) * 2.0**-24
         for stride, shift in zip(strides, shifts, strict=True)
     ]
-
-
-def _pixels(camera: PixelCamera, chosen: Chosen = None) -> Any:
-    """Return the numbers of the chosen pixels (UInt32), row by row.
-
-    They are in memory even where they are all: one kernel serves any choice.
-    """
-    if chosen is not None:
-        return own_integers(np.flatnonzero(chosen))
-    numbers = dr.arange(mi.UInt32, camera.resolution**2)
-    dr.eval(numbers)
-    return numbers
-
-
-def _add(total: Any, values: Any, pixels: Any) -> None:
-    """Add to some pixels of an array, each of them once: in no order that could matter."""
-    dr.scatter(total, dr.gather(type(total), total, pixels) + values, pixels)
 
 
 def _pixel_means(spp: int, samples: Any) -> Any:

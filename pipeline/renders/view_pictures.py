@@ -86,25 +86,17 @@ class Pixels:
     clamp = staticmethod(clamped_radiance)
     sqrt: Any = np.sqrt
     maximum: Any = np.maximum
-
-    def single(self, color: Any) -> Any:
-        return color.astype(np.float32)
-
-    def double(self, color: Any) -> Any:
-        return color.astype(np.float64)
+    single: Any = staticmethod(functools.partial(np.asarray, dtype=np.float32))
+    double: Any = staticmethod(functools.partial(np.asarray, dtype=np.float64))
+    channel_mean: Any = staticmethod(functools.partial(np.mean, axis=-1))
+    brightest: Any = staticmethod(functools.partial(np.max, axis=-1))
+    """Largest channel of each pixel."""
 
     def select(self, mask: Any, first: Any, second: Any) -> Any:
         return np.where(mask[..., None] if np.ndim(first) > mask.ndim else mask, first, second)
 
     def channels(self, color: Any) -> Sequence[Any]:
         return list(np.moveaxis(color, -1, 0))
-
-    def channel_mean(self, color: Any) -> Any:
-        return color.mean(axis=-1)
-
-    def brightest(self, color: Any) -> Any:
-        """Return the largest channel of each pixel."""
-        return color.max(axis=-1)
 
     def is_finite(self, color: Any) -> Any:
         return np.isfinite(color).all(axis=-1)
@@ -116,10 +108,6 @@ class Pixels:
     def difference(self, first: Any, second: Any) -> Any:
         """Return the difference of single colors in double precision."""
         return (first - second).astype(np.float64)
-
-    def are_equal(self, first: Any, second: Any) -> bool:
-        """Return whether pictures are known to be equal."""
-        return np.array_equal(first, second)
 
     def error_around(self, squared_error: Any) -> Any:
         """Return the root of the mean over 3 x 3 pixels."""
@@ -143,10 +131,11 @@ class Pixels:
 
     def shares(self, parts: Sequence[Any]) -> list[Any]:
         """Return what share of their sum each of some pictures is: equal ones where all are 0."""
-        parts_rgb = np.stack(parts)
-        total = parts_rgb.sum(axis=0, dtype=np.float64)
-        equal = np.full(parts_rgb.shape, 1 / len(parts_rgb))
-        return list(np.divide(parts_rgb, total, out=equal, where=total > 0).astype(np.float32))
+        doubles = [self.double(part) for part in parts]
+        total = add_up(doubles)
+        with np.errstate(invalid="ignore"):  # 0 / 0, which is not selected
+            shares = [self.select(total > 0, part / total, 1 / len(parts)) for part in doubles]
+        return [self.single(share) for share in shares]
 
     def tile_sums(self, values: Sequence[Any]) -> Sequence[Any]:
         """Return the sums over tiles of each of some values of pixels."""
@@ -195,13 +184,6 @@ def representable(radiance_rgb: NDArray[np.float32]) -> NDArray[np.float32]:
     if radiance_rgb.max() >= HALF_FLOAT_MAX:
         raise Rejected("radiance_overflow", f"a pixel of radiance {radiance_rgb.max():.3g}")
     return radiance_rgb
-
-
-def stands_out(denoised: Any, raw: Any, standard_error: Any, error_around: Any) -> Any:
-    """Return where the raw grey values are right, by their standard errors and the neighbours'."""
-    bright = (raw - denoised > STANDARD_ERRORS * standard_error) & (raw > STANDS_OUT * denoised)
-    dark = (denoised - raw > STANDARD_ERRORS * error_around) & (denoised > DARKER * raw)
-    return bright | dark
 
 
 def to_filter(pictures: Sequence[Any], names: Sequence[str]) -> Iterator[tuple[Any, str]]:

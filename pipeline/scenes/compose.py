@@ -23,9 +23,9 @@ from pipeline.scenes.pieces import (
     Skin,
     concatenate_pieces,
     emitter_piece,
-    object_piece,
     shell_piece,
     source_skins,
+    surface_piece,
     with_drawn_columns,
     with_drawn_textures,
     with_source_emission,
@@ -245,7 +245,7 @@ def scene_pieces(
         taken.append(entry.name)
         positions = pose_points(shape.points, placement.pose)
         surface = placement.surface
-        objects.append(object_piece(entry, positions, shape.faces, surface, rng, angle_deg, skin))
+        objects.append(surface_piece(entry, positions, shape.faces, surface, rng, angle_deg, skin))
     objects, lights = with_source_emission(objects, emitters, settings.materials.own_emission)
     pieces = [*shell, *objects, *emitters, *lights]
     return pieces if settings.fill_to is None else fill_triangles(pieces, settings.fill_to)

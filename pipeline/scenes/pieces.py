@@ -15,7 +15,6 @@ the camera does not see them.
 import dataclasses
 from collections.abc import Sequence
 from dataclasses import dataclass
-from itertools import accumulate
 from typing import Any
 
 import numpy as np
@@ -92,10 +91,10 @@ def shell_piece(part: ShellPart, rng: np.random.Generator, smooth_angle_deg: flo
     """Return a floor or wall; if it has many colors, `rng` draws one per triangle."""
     entry = SceneObject(name=part.name, kind="shell")
     positions = part.positions.astype(np.float32)
-    return _shaded_piece(entry, positions, part.faces, part.surface, rng, smooth_angle_deg)
+    return surface_piece(entry, positions, part.faces, part.surface, rng, smooth_angle_deg)
 
 
-def object_piece(
+def surface_piece(
     entry: SceneObject,
     positions: NDArray[np.float32],
     faces: NDArray[np.uint32],
@@ -104,7 +103,9 @@ def object_piece(
     smooth_angle_deg: float,
     skin: Skin | None = None,
 ) -> ScenePiece:
-    """Return an object of posed vertices [V, 3] in world space, and faces [F, 3].
+    """Return the piece of posed vertices [V, 3] in world space, and faces [F, 3].
+
+    It has one row of materials, or one per shading group or triangle. Slivers are left out.
 
     Args:
         skin: textures that replace the material; it covers all faces, slivers included.
@@ -115,7 +116,23 @@ def object_piece(
     solid = has_area(positions, faces)
     if not solid.any():
         raise Rejected("no_faces", f"{entry.uid}: no triangle of the level has an area")
-    piece = _shaded_piece(entry, positions, faces[solid], surface, rng, smooth_angle_deg)
+    if surface.smooth:
+        mesh = smooth_shaded(positions, faces[solid], smooth_angle_deg)
+    else:
+        mesh = flat_shaded(positions, faces[solid])
+    rows = {
+        "one": np.zeros(len(mesh.faces), np.int64),
+        "groups": mesh.groups,
+        "triangles": np.arange(len(mesh.faces)),
+    }[surface.colours]
+    diffuse = np.array([surface.diffuse_rgb])
+    if surface.colours != "one":
+        diffuse = surface.diffuse_scale * rng.random((int(rows.max()) + 1, 3))
+    materials = default_rows(len(diffuse))
+    materials[:, DIFFUSE] = diffuse
+    materials[:, SPECULAR] = surface.specular_rgb
+    materials[:, ROUGHNESS] = surface.roughness
+    piece = ScenePiece(entry=entry, mesh=mesh, materials=materials, material_index=rows)
     return with_skin(piece, skin.of_triangles(solid)) if skin else piece
 
 
@@ -154,54 +171,24 @@ def lamp_piece(
     return ScenePiece(entry=entry, mesh=mesh, materials=materials, material_index=index.ravel())
 
 
-def _shaded_piece(
-    entry: SceneObject,
-    positions: NDArray[np.float32],
-    faces: NDArray[np.uint32],
-    surface: SurfaceLook,
-    rng: np.random.Generator,
-    smooth_angle_deg: float,
-) -> ScenePiece:
-    """Return the piece of a mesh with materials: one row, or one per shading group or triangle."""
-    if surface.smooth:
-        mesh = smooth_shaded(positions, faces, smooth_angle_deg)
-    else:
-        mesh = flat_shaded(positions, faces)
-    rows = {
-        "one": np.zeros(len(mesh.faces), np.int64),
-        "groups": mesh.groups,
-        "triangles": np.arange(len(mesh.faces)),
-    }[surface.colours]
-    diffuse = np.array([surface.diffuse_rgb])
-    if surface.colours != "one":
-        diffuse = surface.diffuse_scale * rng.random((int(rows.max()) + 1, 3))
-    materials = default_rows(len(diffuse))
-    materials[:, DIFFUSE] = diffuse
-    materials[:, SPECULAR] = surface.specular_rgb
-    materials[:, ROUGHNESS] = surface.roughness
-    return ScenePiece(entry=entry, mesh=mesh, materials=materials, material_index=rows)
-
-
 def concatenate_pieces(pieces: Sequence[ScenePiece]) -> dict[str, Any]:
     """Return the geometry, materials and textures of a Scene, in the order of the pieces."""
-    vertex_starts = accumulate((len(piece.mesh.positions) for piece in pieces), initial=0)
-    material_starts = accumulate((len(piece.materials) for piece in pieces), initial=0)
-    counts = [len(piece.mesh.faces) for piece in pieces]
+    meshes = [piece.mesh for piece in pieces]
+    counts = [len(mesh.faces) for mesh in meshes]
+    first_vertices, first_rows = (
+        np.repeat(np.cumsum([0, *sizes[:-1]]), counts)
+        for sizes in (
+            [len(mesh.positions) for mesh in meshes],
+            [len(piece.materials) for piece in pieces],
+        )
+    )
+    faces = np.concatenate([mesh.faces for mesh in meshes]) + first_vertices[:, None]
+    rows = np.concatenate([piece.material_index for piece in pieces]) + first_rows
     return {
-        "vertex_positions": np.concatenate([piece.mesh.positions for piece in pieces]),
-        "vertex_normals": np.concatenate([piece.mesh.normals for piece in pieces]),
-        "faces": np.concatenate(
-            [
-                piece.mesh.faces + np.uint32(start)
-                for piece, start in zip(pieces, vertex_starts, strict=False)
-            ]
-        ),
-        "material_index": np.concatenate(
-            [
-                piece.material_index + start
-                for piece, start in zip(pieces, material_starts, strict=False)
-            ]
-        ).astype(np.uint16),
+        "vertex_positions": np.concatenate([mesh.positions for mesh in meshes]),
+        "vertex_normals": np.concatenate([mesh.normals for mesh in meshes]),
+        "faces": faces.astype(np.uint32),
+        "material_index": rows.astype(np.uint16),
         "materials": np.concatenate([piece.materials for piece in pieces]),
         "object_index": np.repeat(np.arange(len(pieces)), counts).astype(np.uint16),
         **_skins(pieces),
@@ -386,28 +373,23 @@ def _skin(skin: LevelSkin, locked: LockedObject) -> Skin:
     Raises:
         Rejected: law_broken if the textures are invalid: an old version may have prepared them.
     """
+
+    def with_rights(texture: Texture, column: str) -> Texture:
+        source = MapSource(
+            name=f"{locked.uid} {column}",
+            licence=locked.licence,
+            attribution=locked.attribution,
+            source_url=locked.source_url,
+        )
+        return dataclasses.replace(texture, source=source)
+
     try:
-        textures = [*skin.textures, *(() if skin.normal is None else (skin.normal,))]
+        first, second, third = map(with_rights, skin.textures, TEXTURED)
+        normal = skin.normal and with_rights(skin.normal, NORMAL)
     except TrilightError as error:
         raise Rejected("law_broken", f"object {locked.uid}: {error}") from error
-    first, second, third, *normal = (
-        dataclasses.replace(
-            texture,
-            source=MapSource(
-                name=f"{locked.uid} {column}",
-                licence=locked.licence,
-                attribution=locked.attribution,
-                source_url=locked.source_url,
-            ),
-        )
-        for texture, column in zip(textures, (*TEXTURED, NORMAL), strict=False)
-    )
-    return Skin(
-        uv=skin.uv.reshape(-1, 2),
-        textures=(first, second, third),
-        normal=normal[0] if normal else None,
-        emission=skin.emission,
-    )
+    uv = skin.uv.reshape(-1, 2)
+    return Skin(uv=uv, textures=(first, second, third), normal=normal, emission=skin.emission)
 
 
 def with_source_emission(
@@ -422,9 +404,9 @@ def with_source_emission(
         share: fraction of the lamps' power for all emitting triangles; 0 without lamps.
     """
     scale = _scale(objects, lamps, share)
-    skins = [each.skin and dataclasses.replace(each.skin, emission=None) for each in objects]
     plain = [
-        dataclasses.replace(piece, skin=skin) for piece, skin in zip(objects, skins, strict=True)
+        dataclasses.replace(each, skin=each.skin and dataclasses.replace(each.skin, emission=None))
+        for each in objects
     ]
     if scale == 0:
         return plain, []
@@ -436,8 +418,10 @@ def with_source_emission(
         emits: NDArray[np.bool_] = np.asarray(emission.any(axis=1))
         if not emits.any():
             continue
-        entry = _entry(piece.entry, taken)
-        taken.add(entry.name)
+        names = (f"{piece.entry.name}_light{number or ''}" for number in range(len(taken) + 1))
+        name = next(name for name in names if name not in taken)
+        taken.add(name)
+        entry = dataclasses.replace(piece.entry, name=name, kind="emitter")
         mesh = _part(plain[row], emits).mesh
         emitter = lamp_piece(entry, mesh, scale * emission[emits], reflected)
         if emits.all():
@@ -488,9 +472,3 @@ def _emission(piece: ScenePiece) -> NDArray[np.float32]:
 def _areas(piece: ScenePiece) -> NDArray[np.float64]:
     cross = face_crosses(piece.mesh.positions, piece.mesh.faces)
     return np.asarray(np.linalg.norm(cross, axis=1) / 2)
-
-
-def _entry(of: SceneObject, taken: set[str]) -> SceneObject:
-    names = (f"{of.name}_light{number or ''}" for number in range(len(taken) + 1))
-    name = next(name for name in names if name not in taken)
-    return dataclasses.replace(of, name=name, kind="emitter")

@@ -8,7 +8,6 @@ import dataclasses
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from pipeline.scenes.pieces import concatenate_pieces, emitter_piece, with_drawn_columns
 from pipeline.scenes.views import object_boxes
@@ -84,42 +83,31 @@ def with_new_lights(
     centres = list(object_boxes(scene).sum(axis=1).astype(np.float64) / 2)
     emitters = sample_lights(rng, settings, TEMPLATES[name].lights, count, centres)
     lamps = [emitter_piece(emitter, row) for row, emitter in enumerate(emitters)]
-    dark = _without(scene, lit)
-    new = concatenate_pieces(lamps)
-    vertices = len(dark.vertex_positions)
-    rows = len(dark.materials)
-    triangles, materials = (
-        np.append(np.arange(count), np.full(len(more), NEW))
-        for count, more in ((len(dark.faces), new["faces"]), (rows, new["materials"]))
-    )
-    new["faces"] += np.uint32(vertices)
-    new["material_index"] += np.uint16(rows)
-    new["object_index"] += np.uint16(len(dark.objects))
-    arrays: dict[str, Any] = {
-        name: np.concatenate([getattr(dark, name), array]) for name, array in new.items()
-    }
-    return dataclasses.replace(
-        dark,
-        **chosen_maps(dark, triangles, materials),
-        **arrays,
-        objects=(*dark.objects, *(lamp.entry for lamp in lamps)),
-    )
-
-
-def _without(scene: Scene, gone: NDArray[np.bool_]) -> Scene:
-    """Return the scene without some objects, and without vertices and materials only they use."""
-    stays = ~gone[scene.object_index]
+    stays = ~lit[scene.object_index]
     faces = scene.faces[stays]
     vertices, faces_of = np.unique(faces, return_inverse=True)
-    materials, rows_of = np.unique(scene.material_index[stays], return_inverse=True)
+    rows, rows_of = np.unique(scene.material_index[stays], return_inverse=True)
+    unlit = {
+        "vertex_positions": scene.vertex_positions[vertices],
+        "vertex_normals": scene.vertex_normals[vertices],
+        "faces": faces_of.reshape(faces.shape).astype(np.uint32),
+        "material_index": rows_of.ravel().astype(np.uint16),
+        "materials": scene.materials[rows],
+        "object_index": (np.cumsum(~lit) - 1)[scene.object_index[stays]].astype(np.uint16),
+    }
+    objects = [entry for entry in scene.objects if not entry.is_lamp]
+    new = concatenate_pieces(lamps)
+    new["faces"] += np.uint32(len(vertices))
+    new["material_index"] += np.uint16(len(rows))
+    new["object_index"] += np.uint16(len(objects))
+    triangles = np.append(np.flatnonzero(stays), np.full(len(new["faces"]), NEW))
+    materials = np.append(rows, np.full(len(new["materials"]), NEW))
+    arrays: dict[str, Any] = {
+        name: np.concatenate([array, new[name]]) for name, array in unlit.items()
+    }
     return dataclasses.replace(
         scene,
-        **chosen_maps(scene, np.flatnonzero(stays), materials),
-        vertex_positions=scene.vertex_positions[vertices],
-        vertex_normals=scene.vertex_normals[vertices],
-        faces=faces_of.reshape(faces.shape).astype(np.uint32),
-        material_index=rows_of.ravel().astype(np.uint16),
-        materials=scene.materials[materials],
-        object_index=(np.cumsum(~gone) - 1)[scene.object_index[stays]].astype(np.uint16),
-        objects=tuple(entry for entry, out in zip(scene.objects, gone, strict=True) if not out),
+        **chosen_maps(scene, triangles, materials),
+        **arrays,
+        objects=(*objects, *(lamp.entry for lamp in lamps)),
     )

@@ -56,7 +56,11 @@ def smooth_shaded(
     groups = shading_groups(faces, normals, angle_deg)
     corner_key = groups[:, None] * len(positions) + faces
     angles = _corner_angles(positions, faces)
-    corner_normals = _sum_by_key(corner_key, normals[:, None] * angles[..., None])
+    # the sum over all corners of the same key, for every corner
+    _, row = np.unique(corner_key.ravel(), return_inverse=True)
+    weighted = (normals[:, None] * angles[..., None]).reshape(-1, 3)
+    sums = np.array([np.bincount(row, weights=column) for column in weighted.T], np.float64)
+    corner_normals = sums.T[row].reshape(*faces.shape, 3)
     length = np.sqrt(np.sum(np.square(corner_normals), axis=-1))
     facing = np.einsum("tci,ti->tc", corner_normals, normals)
     turned_away = facing <= LEAST_FACING * length
@@ -123,11 +127,3 @@ def _corner_angles(
     backward = np.roll(corners, 1, axis=1) - corners
     across = np.sqrt(np.sum(np.square(np.cross(forward, backward)), axis=-1))
     return np.arctan2(across, np.sum(forward * backward, axis=-1))
-
-
-def _sum_by_key(keys: NDArray[np.int64], values: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Return, for every corner, the sum of `values` [T, 3, 3] over all corners of the same key."""
-    _, row = np.unique(keys.ravel(), return_inverse=True)
-    flat = values.reshape(-1, 3)
-    sums = np.array([np.bincount(row, weights=column) for column in flat.T], np.float64)
-    return sums.T[row].reshape(values.shape)

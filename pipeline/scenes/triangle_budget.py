@@ -129,9 +129,10 @@ def draw_rows(
     remaining = num_triangles
     rows = list[int]()
     for following in range(count - 1, -1, -1):
-        rooms = {
-            camp: remaining - following * _simplest_after(table, camp, allowed) for camp in allowed
-        }
+        rooms = dict[str, int]()
+        for camp in allowed:  # after this row and the others there must be room for the simplest
+            camps = allowed & {"", camp} if camp else allowed
+            rooms[camp] = remaining - following * min(table.sizes[each].least for each in camps)
         row = table.draw_row(rng, rooms)
         if row is None:
             least = min(sizes.least for sizes in table.sizes.values())
@@ -145,12 +146,6 @@ def draw_rows(
         if camp := table.camp(row):
             allowed &= {"", camp}
     return rows
-
-
-def _simplest_after(table: FitTable, camp: str, allowed: set[str]) -> int:
-    """Return the triangles of the simplest object that is allowed after one of a camp."""
-    camps = allowed & {"", camp} if camp else allowed
-    return min(table.sizes[other].least for other in camps)
 
 
 def levels_within(

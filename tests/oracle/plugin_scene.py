@@ -13,7 +13,7 @@ import mitsuba as mi
 import numpy as np
 from numpy.typing import NDArray
 
-from pipeline.renders.sky_table import lamp_power, sky_share
+from pipeline.renders.light_tables import lamp_power, sky_share
 from pipeline.renders.tracer import split_triangles
 from storage.optics.bsdf import Lobes, bsdf_lobes
 from storage.optics.multiscatter import Smith, scattered_again

@@ -61,11 +61,8 @@ class PluginTracer:
         )
         self._depth = _integrator(type="aov", aovs="depth:depth")
 
-    def radiance(
-        self, camera: PixelCamera, *, seed: int, spp: int, chosen: Chosen = None
-    ) -> NDArray[np.float32]:
-        picture = _render(self._scene, self._path, camera, seed=seed, spp=spp)
-        return picture if chosen is None else picture * chosen[..., None]
+    def radiance(self, camera: PixelCamera, *, seed: int, spp: int) -> NDArray[np.float32]:
+        return _render(self._scene, self._path, camera, seed=seed, spp=spp)
 
     def hits(self, camera: PixelCamera) -> NDArray[np.bool_]:
         depth = _render(self._feature_scene, self._depth, camera, seed=0, spp=1, jitter=False)

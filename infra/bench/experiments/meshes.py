@@ -31,7 +31,7 @@ from pipeline.isolation import ChildFailed
 from pipeline.objects.sources import list_objects
 from pipeline.renders.renderer import SceneRenderer
 from pipeline.renders.settings import RenderSettings
-from pipeline.scenes.pieces import emitter_piece, object_piece, shell_piece
+from pipeline.scenes.pieces import emitter_piece, shell_piece, surface_piece
 from scene_templates.layout import Emitter
 from storage.cache import cache_folder
 from storage.conventions import look_at_c2w
@@ -154,7 +154,7 @@ def _scene(mesh: TriangleMesh, *, floor_z: float) -> Scene:
     faces = mesh.faces.astype(np.uint32)
     pieces = [
         shell_piece(quad("floor", corners, matt), rng, _SMOOTH_ANGLE_DEG),
-        object_piece(entry, positions, faces, glossy, rng, _SMOOTH_ANGLE_DEG),
+        surface_piece(entry, positions, faces, glossy, rng, _SMOOTH_ANGLE_DEG),
         emitter_piece(lamp, 0),
     ]
     return scene_of_pieces(

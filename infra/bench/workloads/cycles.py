@@ -17,7 +17,6 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from pipeline.exchange.usd.write_usd import write_usd
 from storage.cache import cache_folder
 from storage.errors import TrilightError
 from storage.records.scene import Scene
@@ -68,6 +67,8 @@ def render_with_cycles(
     Raises:
         TrilightError: Blender cannot be installed (`blender_python`), or it failed.
     """
+    from pipeline.exchange.usd.write_usd import write_usd  # slow to load
+
     with tempfile.TemporaryDirectory() as name:
         folder = Path(name).resolve()
         write_usd(folder / "scene.usdc", scene)

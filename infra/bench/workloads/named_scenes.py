@@ -27,8 +27,8 @@ from pipeline.scenes.pieces import (
     ScenePiece,
     concatenate_pieces,
     emitter_piece,
-    object_piece,
     shell_piece,
+    surface_piece,
 )
 from scene_templates.layout import Emitter, ShellPart, SurfaceLook
 from scene_templates.settings import SceneSettings
@@ -223,7 +223,7 @@ def _object(
     )
     placed: NDArray[np.float32] = (positions + np.array(centre)).astype(np.float32)
     entry = SceneObject(name=name, kind="object")
-    return object_piece(entry, placed, faces.astype(np.uint32), surface, rng, _SMOOTH_ANGLE_DEG)
+    return surface_piece(entry, placed, faces.astype(np.uint32), surface, rng, _SMOOTH_ANGLE_DEG)
 
 
 def _light(row: int, num_lights: int) -> Emitter:

@@ -37,7 +37,6 @@ from pipeline.foreign.mesh_materials import read_textured_mesh
 from pipeline.foreign.numbers import FINITE
 from pipeline.foreign.picture import Decode, Decoder, spread_points
 from pipeline.foreign.source_file import SourceFile
-from pipeline.foreign.usd.materials import usd_textured_mesh
 from storage.conventions import linear_from_srgb8, srgb8
 from storage.errors import Rejected, TrilightError
 from storage.records.asset import Level, LevelSkin, OwnMaterials, SkinQuality
@@ -530,6 +529,8 @@ def _parts(source: SourceFile, decode: Decode, settings: OwnMaterialSettings) ->
     emission = settings.emission
     normals = settings.normal_maps
     if source.usd is not None:  # whose normal maps its limits have chosen
+        from pipeline.foreign.usd.materials import usd_textured_mesh  # slow to load
+
         return usd_textured_mesh(source.usd, decode, emission=emission)
     if source.gltf is not None:
         materials = GltfMaterials(source.gltf, decode, emission=emission, normals=normals)

@@ -22,9 +22,10 @@ from pipeline.exchange.textured_triangles import (
     SceneParts,
     TexturedTriangles,
     build_lamp,
+    octahedron,
     rigid_pose,
+    sum_area,
 )
-from pipeline.exchange.usd.foreign_lights import octahedron, sum_area
 from pipeline.foreign.gltf.document import GltfDocument, refuse_malformed
 from pipeline.foreign.gltf.materials import DEFAULT, GltfMaterials
 from pipeline.foreign.gltf.nodes import PlacedNode, entry, extension, placed_nodes
@@ -86,10 +87,9 @@ class _GltfReader:
         """Build the scene of the file."""
         tree = self.document.tree
         nodes = list(placed_nodes(tree))
-        visible = [placed for placed in nodes if placed.is_visible]
         parts = SceneParts(self.name)
-        for placed in visible:
-            if "mesh" not in placed.node:
+        for placed in nodes:
+            if not placed.is_visible or "mesh" not in placed.node:
                 continue
             mesh = entry(tree, "meshes", placed.node["mesh"])
             name = placed.node.get("name") or mesh.get("name") or "object"
@@ -98,9 +98,9 @@ class _GltfReader:
         reach = float(np.linalg.norm(np.ptp(parts.surface_points(), axis=0)))
         suns = []
         lights = extension(tree, "KHR_lights_punctual")
-        for placed in visible:
+        for placed in nodes:
             reference = extension(placed.node, "KHR_lights_punctual")
-            if "light" not in reference:
+            if not placed.is_visible or "light" not in reference:
                 continue
             light = entry(lights, "lights", reference["light"])
             if light.get("type") == "directional":

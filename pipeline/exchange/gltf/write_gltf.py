@@ -7,7 +7,9 @@ at every angle, as in Trilight; the tint gives the other channels. The base colo
 diffuse / (1 - F). Lamps are surfaces that emit (KHR_materials_emissive_strength).
 """
 
+import itertools
 import json
+import operator
 import struct
 from collections.abc import Mapping
 from pathlib import Path
@@ -37,8 +39,6 @@ _TO_Y_UP = (-(0.5**0.5), 0.0, 0.0, 0.5**0.5)
 
 MOST_SPECULAR = 25.0
 """Specular factor of a mirror: 25 times the F0 = 0.04 of an ordinary dielectric."""
-_JSON = 0x4E4F534A
-_BIN = 0x004E4942
 _COMPONENTS = {"f": 5126, "u": 5125}
 """Component types of glTF accessors: float32, and unsigned 32-bit integers."""
 
@@ -67,14 +67,13 @@ def write_gltf(path: Path, scene: Scene) -> tuple[str, ...]:
 def encode_scene_glb(scene: Scene) -> bytes:
     """Return a scene as the bytes of a GLB file; its environment and rights are left out."""
     file = GlbFile()
-    parts = group_triangles(scene)
     nodes: list[dict[str, Any]] = [{"rotation": list(_TO_Y_UP), "children": []}]
     meshes = list[dict[str, Any]]()
-    for row, entry in enumerate(scene.objects):
-        primitives = [_scene_primitive(file, scene, *part[1:]) for part in parts if part[0] == row]
-        if primitives:
-            nodes.append({"name": entry.name, "mesh": len(meshes)})
-            meshes.append({"name": entry.name, "primitives": primitives})
+    for row, parts in itertools.groupby(group_triangles(scene), key=operator.itemgetter(0)):
+        name = scene.objects[row].name
+        nodes.append({"name": name, "mesh": len(meshes)})
+        primitives = [_scene_primitive(file, scene, *part[1:]) for part in parts]
+        meshes.append({"name": name, "primitives": primitives})
     cameras = []
     for view, (c2w, fov_deg) in enumerate(zip(scene.c2w, scene.fov_deg, strict=True)):
         matrix = c2w.T.astype(float).reshape(-1).tolist()  # column by column
@@ -212,7 +211,6 @@ class GlbFile:
             "asset": {"version": "2.0", "generator": "trilight"},
             "scene": 0,
             "scenes": [{"nodes": [0]}],
-            "nodes": [{"mesh": 0}],
             "accessors": [],
             "bufferViews": [],
         }
@@ -242,8 +240,8 @@ class GlbFile:
         text = json.dumps(self.tree, sort_keys=True).encode()
         text += b" " * (-len(text) % 4)
         data = bytes(self._data) + bytes(-len(self._data) % 4)
-        chunks = struct.pack("<II", len(text), _JSON) + text
-        chunks += struct.pack("<II", len(data), _BIN) + data
+        chunks = struct.pack("<I4s", len(text), b"JSON") + text
+        chunks += struct.pack("<I4s", len(data), b"BIN\0") + data
         return struct.pack("<4sII", b"glTF", 2, 12 + len(chunks)) + chunks
 
     def _view(self, data: bytes) -> int:

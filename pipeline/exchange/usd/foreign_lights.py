@@ -13,8 +13,10 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
+from pxr import UsdGeom, UsdLux
 
 from pipeline.exchange.pictures import MAX_BYTES, decode_pixels
+from pipeline.exchange.textured_triangles import octahedron, sum_area
 from pipeline.exchange.usd import layout
 from pipeline.foreign.numbers import FINITE, read_number, read_numbers
 from pipeline.foreign.picture import Picture
@@ -84,8 +86,6 @@ def compute_radiance(
 
 def _read_light_color(prim: Any, time: Any, lost: list[str]) -> NDArray[np.float64]:
     """Return intensity x 2^exposure x color [3] of a light, tinted by its temperature."""
-    from pxr import UsdLux
-
     light = UsdLux.LightAPI(prim)
     strength = _read(light.GetIntensityAttr(), time)
     strength *= 2.0 ** _read(light.GetExposureAttr(), time, _EXPOSURES)
@@ -125,12 +125,6 @@ def _note_losses(prim: Any, time: Any, lost: list[str]) -> None:
             lost.append(f"{where}.{relation.GetName()}: has no place here")
 
 
-def sum_area(triangles: NDArray[np.floating]) -> float:
-    """Return the area of triangles [T, 3, 3]."""
-    edges = np.diff(triangles.astype(np.float64), axis=1)
-    return float(np.linalg.norm(np.cross(edges[:, 0], edges[:, 1]), axis=1).sum() / 2)
-
-
 def _square() -> NDArray[np.float64]:
     """Return a square of side 1 in XY that faces -Z, the direction of RectLight."""
     a, b, c, d = np.array([[-0.5, -0.5, 0], [-0.5, 0.5, 0], [0.5, 0.5, 0], [0.5, -0.5, 0]])
@@ -155,17 +149,6 @@ def _build_tube() -> NDArray[np.float64]:
     ahead = np.roll(low, -1, axis=0)
     sides = [(low, ahead, high), (high, ahead, ahead + along)]
     return np.concatenate([np.stack(side, axis=1) for side in sides])
-
-
-def octahedron() -> NDArray[np.float64]:
-    """Return the triangles [8, 3, 3] of an octahedron of radius 1, facing out."""
-    faces = np.array(
-        [[[x, 0, 0], [0, y, 0], [0, 0, z]] for x in (1, -1) for y in (1, -1) for z in (1, -1)],
-        float,
-    )
-    faces_inward = np.prod(faces.sum(axis=1), axis=1) < 0
-    faces[faces_inward] = faces[faces_inward][:, ::-1]
-    return faces
 
 
 def _sphere() -> NDArray[np.float64]:
@@ -247,8 +230,6 @@ def _take_held(sky: Environment, dome: Any, time: Any) -> Environment:
 
 def _pole_rotation(prim: Any) -> NDArray[np.float64]:
     """Return the rotation of a dome from its pole +Y to the axis that a DomeLight_1 states."""
-    from pxr import UsdGeom
-
     stated = prim.GetAttribute("poleAxis")
     axis = stated.Get() if stated else UsdGeom.Tokens.y
     if axis == "scene":

@@ -12,6 +12,7 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
+from pxr import UsdGeom
 
 from pipeline.exchange.from_description import SMOOTH_ANGLE_DEG
 from pipeline.exchange.part_materials import Part, PartConverter, drop_empty, unit_normals
@@ -32,7 +33,7 @@ from pipeline.exchange.usd.foreign_lights import (
 from pipeline.exchange.usd.held_materials import HeldMaterial, keep_exact, read_columns
 from pipeline.foreign.numbers import read_number
 from pipeline.foreign.usd.materials import MeshMaterials
-from pipeline.foreign.usd.object_source import UsdStage, read_stage_materials
+from pipeline.foreign.usd.object_source import read_stage_materials
 from pipeline.foreign.usd.placed import DOMES, SOLIDS, PlacedPrim, placed_prims
 from pipeline.foreign.usd.polygons import CutMesh, as_array, cut_mesh
 from pipeline.foreign.usd.shaders import StatedMaterial, read_material
@@ -77,8 +78,6 @@ def _smooth(positions: NDArray[np.float32], cut: CutMesh) -> NDArray[np.float32]
 
 
 def _stated_normals(prim: Any, time: Any) -> tuple[NDArray[np.float64], str] | None:
-    from pxr import UsdGeom
-
     mesh = UsdGeom.Mesh(prim)
     if not mesh:
         return None
@@ -110,11 +109,11 @@ class StageReader:
         stage: Any,
         time: Any,
         opened: OpenedStage,
-        written: Mapping[str, NDArray[np.float32]],
+        written: Mapping[str, Mapping[str, NDArray[np.float32]]],
     ) -> None:
         """Read all materials of a Usd.Stage; `opened.lost` receives notes on losses.
 
-        `written` has material rows as Trilight wrote them, by the paths of their prims, if known.
+        `written` has columns as Trilight wrote them, by the paths of materials, if known.
 
         Raises:
             Rejected: a picture is outside of the folder, or too large.
@@ -126,12 +125,11 @@ class StageReader:
         self._written = written
         self._converter = PartConverter(self._lost)
         self._placed = sorted(placed_prims(stage, time, self._lost), key=_read_row)
-        meshes = tuple(each for each in self._placed if each.prim.GetTypeName() in _MESHES)
-        usd_stage = UsdStage(opened=opened, composed=stage, meshes=meshes, time=time)
+        meshes = [each for each in self._placed if each.prim.GetTypeName() in _MESHES]
         # of each material: name of its prim, added columns, and exact columns if Trilight wrote it
         self._extras: list[tuple[str, dict[str, Any], dict[str, Texture] | None]] = []
         self._looks = MeshMaterials(
-            read_stage_materials(usd_stage, _MAX_PICTURE_BYTES, self._read),
+            read_stage_materials(meshes, time, _MAX_PICTURE_BYTES, self._read),
             lambda data, name: decode_values(data, name, self._lost),
             time,
             emission=True,
@@ -191,15 +189,10 @@ class StageReader:
 
     def _read_camera(self, placed: PlacedPrim) -> tuple[NDArray[np.float64], float] | None:
         """Return pose [4, 4] and full angle in degrees of a camera; None for an unusable one."""
-        from pxr import UsdGeom
-
         time = self._time
         camera = UsdGeom.Camera(placed.prim)
-        lens = (
-            camera.GetFocalLengthAttr(),
-            camera.GetHorizontalApertureAttr(),
-            camera.GetVerticalApertureAttr(),
-        )
+        names = ("focalLength", "horizontalAperture", "verticalAperture")
+        lens = map(placed.prim.GetAttribute, names)
         focal, wide, high = (read_number(each.Get(time), str(each.GetPath())) for each in lens)
         pose = rigid_pose(placed.to_world)
         if camera.GetProjectionAttr().Get(time) != "perspective" or pose is None or not focal > 0:
@@ -296,7 +289,7 @@ class StageReader:
         def coordinates(number: int) -> NDArray[np.float64] | None:
             primvar = self._looks.primvars[number]
             uv = cut.read_coordinates(primvar, self._time)
-            if uv is None or not np.isfinite(uv).all():
+            if not np.isfinite(uv).all():
                 self._lost.append(f"{where}: no coordinates {primvar!r:.60}")
                 return None
             return uv[mask]

@@ -13,6 +13,7 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
+from pxr import UsdShade
 
 from pipeline.exchange.pictures import MAX_BYTES
 from pipeline.exchange.textured_triangles import (
@@ -35,8 +36,8 @@ from pipeline.exchange.usd.write_materials import (
 from pipeline.foreign.usd.shaders import (
     DEFAULTS,
     IOR_OF_CONSTANT_ALBEDOS,
+    ShaderReader,
     StatedMaterial,
-    note_unsupported,
     parse_color,
     reflect_head_on,
     surface_shader,
@@ -107,24 +108,21 @@ class HeldMaterial:
         self,
         material: Any,
         columns: Mapping[str, NDArray[np.float32]],
-        written: Mapping[str, NDArray[np.float32]],
+        written: Mapping[str, Mapping[str, NDArray[np.float32]]],
         time: Any,
         opened: OpenedStage,
     ) -> None:
         """Read the values of a UsdShade.Material, whose exact columns are known.
 
-        `written` has material rows as Trilight wrote them, by the paths of their prims, where
-        known; the notes of `opened` receive what is lost.
+        `written` has the columns as Trilight wrote them, by the paths of materials, where known;
+        the notes of `opened` receive what is lost.
         """
         prim = material.GetPrim()
-        row = written.get(str(prim.GetPath()))
         root = prim.GetParent().GetParent()
         self._where = str(prim.GetPath())
         self._shader = surface_shader(material)
         self._columns = columns
-        self._written = (
-            {} if row is None else {name: row[part] for name, part in column_places().items()}
-        )
+        self._written = written.get(self._where, {})
         self._time = time
         self._opened = opened
         self._maps: dict[str, tuple[str, MapSource]] = {}
@@ -162,8 +160,6 @@ class HeldMaterial:
         Blender writes no specular albedo: the exact one is taken, or the texture that the roughness
         of the absent coat still refers to.
         """
-        from pxr import UsdShade
-
         textures = dict(stated.textures)
         constants = {**stated.constants, **_WORKFLOW}
         if stated.has_strength and "emissiveColor" not in {*stated.textures, *stated.primvars}:
@@ -206,11 +202,6 @@ class HeldMaterial:
             name=self._where.rpartition("/")[2],
             where=self._where,
             constants={name: _fill(value) for name, value in constants.items()},
-            textures={},
-            primvars={},
-            has_strength=False,
-            lost=(),
-            has_networks=False,
         )
 
     def _find_exact(self, stated: StatedMaterial) -> tuple[StatedMaterial, dict[str, Texture]]:
@@ -275,8 +266,9 @@ class HeldMaterial:
         node = textures[name]
         is_used_alike = all(
             each.wrap == ("repeat", "repeat")
-            and each.chart.primvar == node.chart.primvar
-            and not each.chart.is_moved
+            and each.primvar == node.primvar
+            and (each.uv_matrix == np.eye(2)).all()
+            and not each.uv_offset.any()
             and (each.scale == 1).all()
             and not each.bias.any()
             for each in textures.values()
@@ -329,7 +321,8 @@ def _read_openpbr(material: Any, time: Any, opened: OpenedStage) -> dict[str, ND
             opened.lost.append(f"{shader.GetPath()}.{name}: no finite constant; it is not read")
         else:
             values[name] = value
-    note_unsupported(shader, time, opened, ("specular_weight", "specular_color"))
+    reader = ShaderReader(shader, time, opened)
+    reader.note_unsupported(("specular_weight", "specular_color"))
     return _multiply(values)
 
 

@@ -23,6 +23,7 @@ from collections.abc import Callable, Mapping, Sequence
 from typing import Any
 
 import numpy as np
+from pxr import Sdf
 
 from storage.digests import canonical_json
 from storage.records.texture import MapSource
@@ -168,8 +169,6 @@ def text_attributes(fields: Mapping[str, str], record: Any) -> dict[str, tuple[s
 
 def add_prim(layer: Any, path: str, type_name: str, schemas: Sequence[str] = ()) -> Any:
     """Return a new prim of a type, with API schemas applied."""
-    from pxr import Sdf
-
     prim = Sdf.CreatePrimInLayer(layer, path)
     prim.specifier = Sdf.SpecifierDef
     prim.typeName = type_name
@@ -180,8 +179,6 @@ def add_prim(layer: Any, path: str, type_name: str, schemas: Sequence[str] = ())
 
 def add_attributes(prim: Any, attributes: Attributes, material: str = "") -> None:
     """Write attributes with default values, and connections to outputs below `material`."""
-    from pxr import Sdf
-
     for name, (kind, value, *sources) in attributes.items():
         uniform = kind.startswith(UNIFORM)
         attribute = Sdf.AttributeSpec(
@@ -200,31 +197,23 @@ def add_attributes(prim: Any, attributes: Attributes, material: str = "") -> Non
 
 def add_relationship(prim: Any, name: str, target: str) -> None:
     """Write a relationship to one prim."""
-    from pxr import Sdf
-
     relationship = Sdf.RelationshipSpec(prim, name, False)
     relationship.targetPathList.explicitItems = [_target(target)]
 
 
 def _target(path: str) -> Any:
     """Return the path of a prim as other prims name it, without variant selections."""
-    from pxr import Sdf
-
     return Sdf.Path(path).StripAllVariantSelections()
 
 
 @functools.cache
 def _value_type(kind: str) -> Any:
-    from pxr import Sdf
-
     return Sdf.ValueTypeNames.Find(kind.removeprefix(UNIFORM))
 
 
 @functools.cache
 def usd_converter(kind: str) -> Callable[[Any], Any]:
     """Return the converter of values to a USD type; cached, since scenes have 10^5 values."""
-    from pxr import Sdf
-
     python_class = Sdf.AssetPath if kind == "asset" else _value_type(kind).type.pythonClass
     if hasattr(python_class, "FromNumpy"):
         return lambda values: python_class.FromNumpy(np.ascontiguousarray(values))

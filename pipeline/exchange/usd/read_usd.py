@@ -9,15 +9,17 @@ errors of `_NOT_AS_WRITTEN` mean that a layer is not as export writes it.
 Only child processes with limits import this (pipeline.isolation): native code parses the file.
 """
 
+import contextlib
 import dataclasses
 import json
 from collections import defaultdict
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from pathlib import Path
-from typing import Any, TypeVar
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
+from pxr import Usd
 
 from pipeline.exchange.pictures import MAX_BYTES
 from pipeline.exchange.textured_triangles import MAX_ROWS, LoadedScene
@@ -46,6 +48,7 @@ from storage.records.exr import decode_exr
 from storage.records.material import (
     PUBLISHED_COLUMNS,
     UndeclaredColumn,
+    column_places,
     declared_column,
     default_rows,
     laid_out,
@@ -53,8 +56,6 @@ from storage.records.material import (
 from storage.records.scene import OBJECT_KINDS, Scene, SceneObject
 from storage.records.scene_file import scene_digest, scene_provenance
 from storage.records.texture import CONSTANT, TEXTURED, MapSource, Texture
-
-Read = TypeVar("Read")
 
 MAX_FRAMES = 10_000
 """Maximum number of scenes in a stage with time samples."""
@@ -66,7 +67,8 @@ def usd_keys(path: Path, folder: Path | None = None) -> list[str]:
     Raises:
         TrilightError: the file is unusable (pipeline.foreign.usd.stage).
     """
-    return _read_file(path, lambda: _keys(OpenedStage(path, folder)))
+    with _name_errors(path):
+        return _keys(OpenedStage(path, folder))
 
 
 def read_usd(path: Path, key: str | None = None, folder: Path | None = None) -> LoadedScene:
@@ -80,14 +82,16 @@ def read_usd(path: Path, key: str | None = None, folder: Path | None = None) -> 
     Raises:
         TrilightError: the file is unusable, lacks the scene, or a `Scene` cannot hold it.
     """
-    return _read_file(path, lambda: _read(OpenedStage(path, folder), key))
+    with _name_errors(path):
+        return _read(OpenedStage(path, folder), key)
 
 
-def _read_file(path: Path, read: Callable[[], Read]) -> Read:
-    """Return the result of `read` for a file, whose name begins every message."""
+@contextlib.contextmanager
+def _name_errors(path: Path) -> Iterator[None]:
+    """Begin every message on a file with its name."""
     try:
         with read_quietly(path):
-            return read()
+            yield
     except (TrilightError, Rejected) as error:
         message = error.message if isinstance(error, Rejected) else str(error)
         if isinstance(error, TrilightError) and message.startswith(path.name):
@@ -97,8 +101,6 @@ def _read_file(path: Path, read: Callable[[], Read]) -> Read:
 
 
 def _read(opened: OpenedStage, key: str | None) -> LoadedScene:
-    from pxr import Usd
-
     shard = _scene_keys(opened.root)
     if shard is not None:
         return _read_shard_scene(opened, shard, key or shard[0])
@@ -117,7 +119,7 @@ def _read(opened: OpenedStage, key: str | None) -> LoadedScene:
     if frames and key is None:
         opened.lost.append(f"time codes other than {chosen} of {len(frames)}")
     time = Usd.TimeCode(float(chosen)) if chosen else Usd.TimeCode.EarliestTime()
-    scene = StageReader(stage, time, opened, _read_written_rows(opened)).scene()
+    scene = StageReader(stage, time, opened, _read_written_columns(opened)).scene()
     return LoadedScene(scene=scene, notes=opened.notes)
 
 
@@ -144,8 +146,6 @@ def _keys(opened: OpenedStage) -> list[str]:
 
 def _frames(stage: Any) -> Iterator[str]:
     """Yield the time codes of an animated stage: its frames, or else its samples."""
-    from pxr import Usd
-
     if len({t for layer in stage.GetUsedLayers() for t in layer.ListAllTimeSamples()}) < 2:
         return
     if not stage.HasAuthoredTimeCodeRange():
@@ -208,8 +208,8 @@ def _read_exact(opened: OpenedStage, key: str | None = None) -> Scene | None:
         return None
 
 
-def _read_written_rows(opened: OpenedStage) -> dict[str, NDArray[np.float32]]:
-    """Return the material rows that Trilight wrote, by the paths of their prims; else none.
+def _read_written_columns(opened: OpenedStage) -> dict[str, dict[str, NDArray[np.float32]]]:
+    """Return the columns that Trilight wrote, by the paths of materials; else none.
 
     The digest of the scene tells whether the attributes still are what was written, or the preview
     shaders. It cannot where the meshes were changed too.
@@ -217,21 +217,22 @@ def _read_written_rows(opened: OpenedStage) -> dict[str, NDArray[np.float32]]:
     root = _find_root(opened.root, None)
     if root is None:
         return {}
-    try:
+    with contextlib.suppress(UndeclaredColumn, *_NOT_AS_WRITTEN):
         scene = _read_scene(root, opened)
         prims = _list_by_row(root.nameChildren["Materials"], layout.material_name)
         of_preview = scene.materials.copy()
+        places = column_places()
         for row, prim in enumerate(prims):
             inputs = prim.nameChildren[PREVIEW].attributes
-            for column, part in laid_out():
-                if column.name in PREVIEW_INPUTS:
-                    of_preview[row, part] = inputs[f"inputs:{PREVIEW_INPUTS[column.name]}"].default
+            for column, name in PREVIEW_INPUTS.items():
+                of_preview[row, places[column]] = inputs[f"inputs:{name}"].default
         for rows in (scene.materials, of_preview):
             digest = scene_digest(dataclasses.replace(scene, materials=rows))
             if digest == root.attributes[layout.DIGEST].default:
-                return {str(prim.path): rows[row] for row, prim in enumerate(prims)}
-    except (UndeclaredColumn, *_NOT_AS_WRITTEN):
-        pass
+                return {
+                    str(prim.path): {name: rows[row, part] for name, part in places.items()}
+                    for row, prim in enumerate(prims)
+                }
     return {}
 
 

@@ -25,6 +25,7 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
+from pxr import Sdf
 
 from pipeline.documents.png import encode_png
 from pipeline.exchange.pictures import MAX_PIXELS
@@ -98,8 +99,6 @@ def add_materials(layer: Any, folder: str, scene: Scene) -> None:
     Rows without textures are copies of the first such prim with other values, which takes half the
     time of writing each prim.
     """
-    from pxr import Sdf
-
     layout.add_prim(layer, folder, "Scope")
     first = None
     columns = stored_columns(scene.materials)

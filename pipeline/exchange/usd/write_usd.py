@@ -25,9 +25,11 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
+from pxr import Sdf, Tf
 
 from pipeline.exchange.usd import layout
 from pipeline.exchange.usd.write_materials import ST, add_materials, map_files, sky_file
+from pipeline.foreign.limits import WRITTEN_USD_SUFFIXES
 from storage.atomic import write_atomically
 from storage.conventions import SCHEMA_VERSION
 from storage.digests import canonical_json
@@ -36,8 +38,6 @@ from storage.records.environment import Environment
 from storage.records.retextured import without_constant_textures
 from storage.records.scene import Scene
 from storage.records.scene_file import scene_digest
-
-SUFFIXES = (".usda", ".usdc", ".usdz")
 
 ENVIRONMENT = "Environment"
 """Name of the prim of an environment."""
@@ -63,8 +63,6 @@ def write_usd_shard(path: Path, scenes: Iterable[tuple[str, Scene]]) -> None:
     Raises:
         TrilightError: as `write_usd`, or there is no scene.
     """
-    from pxr import Sdf
-
     layer = new_layer(layout.SHARD_ROOT)
     root = layout.add_prim(layer, layout.SHARD_ROOT, "Xform")
     root.variantSetNameList.Prepend(layout.VARIANT_SET)
@@ -114,8 +112,6 @@ def _add_scene(layer: Any, path: str, scene: Scene) -> dict[str, bytes]:
 
 def author_scene(layer: Any, path: str, scene: Scene) -> Any:
     """Write the prims of a scene into a layer; return its root prim."""
-    from pxr import Sdf
-
     with Sdf.ChangeBlock():
         root = layout.add_prim(layer, path, "Xform")
         layout.add_attributes(root, root_attributes(scene))
@@ -130,8 +126,6 @@ def author_scene(layer: Any, path: str, scene: Scene) -> Any:
 
 def new_layer(root: str) -> Any:
     """Return an empty layer in meters with +Z up, whose default prim is `root`."""
-    from pxr import Sdf
-
     layer = Sdf.Layer.CreateAnonymous(".usdc")
     layer.defaultPrim = root.removeprefix("/")
     layer.pseudoRoot.SetInfo("upAxis", "Z")
@@ -141,8 +135,9 @@ def new_layer(root: str) -> Any:
 
 def _save(path: Path, layer: Any, files: Mapping[str, bytes]) -> None:
     suffix = path.suffix.lower()
-    if suffix not in SUFFIXES:
-        raise TrilightError(f"{path.name}: expected a name that ends in {', '.join(SUFFIXES)}.")
+    if suffix not in WRITTEN_USD_SUFFIXES:
+        expected = ", ".join(WRITTEN_USD_SUFFIXES)
+        raise TrilightError(f"{path.name}: expected a name that ends in {expected}.")
     if suffix == ".usda":  # Export would change file modes, which a child may not
         data = layer.ExportToString().encode()
     else:
@@ -195,8 +190,6 @@ def _add_objects(layer: Any, folder: str, scene: Scene, materials: str) -> None:
 
 def prim_names(scene: Scene) -> list[str]:
     """Return a unique and valid USD name for each object."""
-    from pxr import Tf
-
     taken: set[str] = set()
     unique = []
     for row, entry in enumerate(scene.objects):
@@ -334,11 +327,11 @@ _PADDING_ID = 0x1986
 """Identifier of the extra field that aligns the bytes of a zip member; readers skip it."""
 
 
-def encode_usdz(layer: bytes, files: Mapping[str, bytes] | None = None) -> bytes:
+def encode_usdz(layer: bytes, files: Mapping[str, bytes]) -> bytes:
     """Return the `.usdz` archive of a `.usdc` layer and its files, without time stamps."""
     stream = io.BytesIO()
     with zipfile.ZipFile(stream, "w", zipfile.ZIP_STORED) as archive:
-        for name, data in {_LAYER_NAME: layer, **(files or {})}.items():
+        for name, data in {_LAYER_NAME: layer, **files}.items():
             entry = zipfile.ZipInfo(name, date_time=(1980, 1, 1, 0, 0, 0))
             begin = stream.tell() + _HEADER_BYTES + len(name)
             padding = -(begin + 4) % _ALIGNMENT

@@ -20,13 +20,11 @@ from pipeline.foreign.gltf.nodes import (
     entry,
     extension,
     list_unread_parts,
+    num_instances,
     transforms,
 )
 from pipeline.foreign.limits import ReadLimits
-from pipeline.foreign.material_files import (
-    MaterialFiles,
-    SourceFolder,
-)
+from pipeline.foreign.material_files import MaterialFiles, SourceFolder
 from pipeline.foreign.numbers import Malformed, read_count
 from storage.errors import Rejected, TrilightError
 
@@ -106,16 +104,12 @@ class GltfDocument:
             raise Malformed(f"indices are of type {elements.dtype} x {elements.shape[1]}")
         return elements[:, 0].astype(np.int64)
 
-    def count(self, index: Any) -> int:
-        """Return the number of values of an accessor."""
-        return read_count(entry(self.tree, "accessors", index), "count")
-
     def instances(self, placed: PlacedNode) -> NDArray[np.float64]:
         """Return the matrices [N, 4, 4] of all instances of a node's mesh."""
         attributes = extension(placed.node, INSTANCING).get("attributes", {})
         if not attributes:
             return placed.to_world[None]
-        count = self.count(next(iter(attributes.values())))
+        count = num_instances(self.tree, placed.node)
         components = [np.tile(np.array(default, np.float64), (count, 1)) for _, default in TRS]
         for row, (name, default) in enumerate(TRS):
             if (number := attributes.get(name.upper())) is not None:
@@ -230,7 +224,7 @@ def open_gltf(data: bytes, suffix: str, files: SourceFolder, limits: ReadLimits)
         unread = list_unread_parts(tree)
         uris = [row["uri"] for row in tree.get("buffers", ()) if "uri" in row]
         named = [uri for uri in uris if not is_data_uri(uri)]
-    folder = SourceFolder(files.folder, files.folder, files.read)
+    folder = SourceFolder(files.folder, files.folder)
     bytes_left = limits.max_bytes - len(data)
     buffers = folder.read_all(named, bytes_left, is_uri=True)
     for why in buffers.refused.values():

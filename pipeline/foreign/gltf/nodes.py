@@ -178,7 +178,7 @@ def _list_unread(kind: str, row: Mapping[str, Any]) -> Iterator[str]:
         unknown = (name for name in names if not name.startswith(_ATTRIBUTES[kind]))
         yield from (f"attribute {name!r:.60} of {kind}" for name in unknown)
     if kind == "primitives":
-        if row.get("mode", 4) in (0, 1, 2, 3):
+        if row.get("mode", TRIANGLES) in POINTS_AND_LINES:
             yield "points and lines"
         elif "POSITION" not in row.get("attributes", ()):
             yield "primitives without positions"

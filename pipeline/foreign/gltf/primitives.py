@@ -20,7 +20,7 @@ from pipeline.foreign.gltf.nodes import (
 )
 from pipeline.foreign.material import MOST_UV_SETS, TexturedMesh
 from pipeline.foreign.mesh import TriangleMesh, join_meshes
-from pipeline.foreign.numbers import read_number
+from pipeline.foreign.numbers import read_count, read_number
 from storage.errors import Rejected
 
 
@@ -39,7 +39,7 @@ class PlacedPrimitive:
         self._primitive = primitive
         self._weights = weights
         attributes = primitive["attributes"]
-        count = document.count(attributes["POSITION"])
+        count = read_count(entry(document.tree, "accessors", attributes["POSITION"]), "count")
         order = (
             document.indices(primitive["indices"]) if "indices" in primitive else np.arange(count)
         )

@@ -21,7 +21,7 @@ from pipeline.foreign.material import (
     with_normal_map,
 )
 from pipeline.foreign.picture import Decode, Picture, has_colors
-from pipeline.foreign.usd.object_source import StageMaterials, UsdSource, name_unsupported
+from pipeline.foreign.usd.object_source import TIME, StageMaterials, UsdSource, name_unsupported
 from pipeline.foreign.usd.polygons import CutMesh
 from pipeline.foreign.usd.shaders import (
     IOR_OF_CONSTANT_ALBEDOS,
@@ -57,8 +57,7 @@ def usd_textured_mesh(source: UsdSource, decode: Decode, *, emission: bool = Fal
         Rejected: no_materials, materials_unreadable, no_texture_coordinates, or as reading a
             picture.
     """
-    time = source.stage.time
-    looks = MeshMaterials(source.materials, decode, time, emission=emission)
+    looks = MeshMaterials(source.materials, decode, TIME, emission=emission)
     if len(looks.primvars) > MOST_UV_SETS:
         count = len(looks.primvars)
         raise Rejected("no_texture_coordinates", f"textures lie on {count} sets of them")
@@ -69,11 +68,15 @@ def usd_textured_mesh(source: UsdSource, decode: Decode, *, emission: bool = Fal
     if (material == looks.plain).all() and (tint == _UNBOUND).all():
         raise Rejected("no_materials", "the stage has no materials and no display colors")
     sets = looks.primvars or ["st"]
+    uv = [
+        np.stack([cut.read_coordinates(name, TIME) for name in sets], axis=1)
+        for cut in cuts.values()
+    ]
     return TexturedMesh(
         mesh=source.mesh,
         material=material,
         materials=tuple(looks.materials),
-        uv=np.concatenate([cut.read_coordinate_sets(sets, time) for cut in cuts.values()]),
+        uv=np.concatenate(uv),
         color=None if (tint == 1).all() else tint,
     )
 
@@ -104,7 +107,7 @@ class MeshMaterials:
         """
         stated_materials = self.stage.materials
         nodes = [node for stated in stated_materials for node in stated.textures.values()]
-        self.primvars = list(dict.fromkeys(node.chart.primvar for node in nodes))
+        self.primvars = list(dict.fromkeys(node.primvar for node in nodes))
         """Names of the sets of texture coordinates, by the numbers in slots."""
         self.materials = [self._convert(stated) for stated in stated_materials]
         """Materials by row; those of primvars are added when they are met."""
@@ -181,7 +184,10 @@ class MeshMaterials:
         return np.array(rows, np.int64)[index.reshape(-1)]
 
     def _convert(self, stated: StatedMaterial) -> SourceMaterial:
-        is_lit = any(_glow(stated, "emissiveColor" in stated.textures))
+        glows = (
+            "emissiveColor" in stated.textures or _read_constant(stated, "emissiveColor").max() > 0
+        )
+        is_lit = glows and _read_strength(stated) > 0
         lost = name_unsupported(stated)
         if is_lit or "emissiveColor" in stated.primvars:
             lost = ("emission", *lost)
@@ -212,8 +218,9 @@ class MeshMaterials:
             slot = self._slot(stated, name)
             is_tint = slot is not None or (name in stated.primvars and name == "diffuseColor")
             value = np.ones(3) if is_tint else _read_constant(stated, name)
-            glow = name == "emissiveColor"
-            fields[factor] = _glow(stated, is_tint) if glow else _factor(name, value)
+            if name == "emissiveColor":
+                value = value.astype(float) * _read_strength(stated)
+            fields[factor] = _factor(name, value)
             fields[picture] = slot
         return dataclasses.replace(material, **fields)
 
@@ -256,24 +263,20 @@ class MeshMaterials:
         if node.color_space not in ("sRGB", "raw"):
             is_srgb = has_colors(self.stage.pictures.require(node.resolved or node.named))
         channel = _CHANNELS[node.output]
+        channels = [channel] * 3 + [3] if is_grey else [0, 1, 2, 3]
         if is_grey:
-            values = np.ascontiguousarray(values[..., [channel] * 3 + [3]])
+            values = np.ascontiguousarray(values[..., channels])
             is_srgb = is_srgb and channel != 3
         picture = Picture(values=values, is_srgb=is_srgb, wrap=node.wrap)
         if (node.scale != 1).any() or node.bias.any():
-            scale = node.scale
-            bias = node.bias
-            if is_grey:
-                scale = scale[[channel] * 3 + [3]]
-                bias = bias[[channel] * 3 + [3]]
-            picture = _scale_picture(picture, scale, bias)
+            picture = _scale_picture(picture, node.scale[channels], node.bias[channels])
             if self.notes is not None and picture.values[..., :3].max() > 1:
                 self.notes.append(f"{where}: texels above 1 are clamped, but for emission")
         return Slot(
             picture=picture,
-            uv_set=self.primvars.index(node.chart.primvar),
-            uv_matrix=node.chart.matrix,
-            uv_offset=node.chart.offset,
+            uv_set=self.primvars.index(node.primvar),
+            uv_matrix=node.uv_matrix,
+            uv_offset=node.uv_offset,
             channel=channel,
         )
 
@@ -319,14 +322,6 @@ def _factor(name: str, value: NDArray) -> float | RGB:
     if name not in _COLORS:
         return float(value[0])
     red, green, blue = np.maximum(value, 0).tolist()
-    return red, green, blue
-
-
-def _glow(stated: StatedMaterial, has_picture: bool) -> RGB:
-    """Return the emission, or the factor of its picture."""
-    strength = _read_strength(stated)
-    value = np.ones(3) if has_picture else _read_constant(stated, "emissiveColor")
-    red, green, blue = (strength * channel for channel in np.maximum(value, 0).tolist())
     return red, green, blue
 
 

@@ -11,12 +11,13 @@ import dataclasses
 import hashlib
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
-from functools import cached_property, partial
+from functools import cached_property
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
+from pxr import Usd
 
 from pipeline.foreign.limits import ReadLimits
 from pipeline.foreign.material_files import MaterialFiles
@@ -50,18 +51,8 @@ _MAX_OFFSET = 1e5
 and off by 1 % of the size beyond it."""
 
 
-@dataclass(frozen=True, kw_only=True, eq=False)
-class UsdStage:
-    """A composed stage with its visible meshes."""
-
-    opened: OpenedStage
-    """Opened layers of the stage, with notes on unread contents."""
-    composed: Any
-    """The Usd.Stage, kept because its prims expire with it."""
-    meshes: tuple[PlacedPrim, ...]
-    """Visible meshes with transforms to meters, +Z up."""
-    time: Any
-    """The Usd.TimeCode at which values are read: the first of an animated stage."""
+TIME = Usd.TimeCode.EarliestTime()
+"""Time at which an object's values are read: the first of an animated stage."""
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -76,11 +67,14 @@ class StageMaterials:
     """Contents of pictures by resolved path."""
 
 
-def read_stage_materials(stage: UsdStage, max_bytes: int, read: ReadMaterial) -> StageMaterials:
+def read_stage_materials(
+    meshes: Sequence[PlacedPrim], time: Any, max_bytes: int, read: ReadMaterial
+) -> StageMaterials:
     """Return the materials of the visible meshes of a stage.
 
     Args:
-        stage: the open stage.
+        meshes: the meshes, which receive notes on what is not read.
+        time: time of the values.
         max_bytes: maximum bytes of all pictures together.
         read: function that reads a UsdShade.Material; None leaves it out.
 
@@ -90,23 +84,23 @@ def read_stage_materials(stage: UsdStage, max_bytes: int, read: ReadMaterial) ->
     rows: dict[str, int] = {}
     materials: list[StatedMaterial] = []
 
-    def find_row(material: Any) -> int:
+    def find_row(material: Any, lost: list[str]) -> int:
         if not material:
             return -1
         name = str(material.GetPath())
         if name not in rows:
             stated = read(material)
             rows[name] = -1 if stated is None else len(materials)
-            materials.extend([] if stated is None else [_drop_ior_texture(stage, stated)])
+            materials.extend([] if stated is None else [_drop_ior_texture(stated, lost)])
         return rows[name]
 
     try:
         bindings = tuple(
             tuple(
-                (find_row(material), polygons)
-                for material, polygons in read_bindings(placed.prim, stage.time)
+                (find_row(material, placed.lost), polygons)
+                for material, polygons in read_bindings(placed.prim, time)
             )
-            for placed in stage.meshes
+            for placed in meshes
         )
     except OutsideFile as error:
         raise Rejected("texture_outside", f"{error!s:.200}") from error
@@ -118,19 +112,10 @@ def read_stage_materials(stage: UsdStage, max_bytes: int, read: ReadMaterial) ->
     )
 
 
-def _read_strictly(stage: UsdStage, material: Any, *, normals: bool) -> StatedMaterial:
-    """Return the inputs of a material; a shader that is not understood is refused."""
-    stated = read_material(material, stage.time, stage.opened, normals=normals)
-    if stated is None:
-        name = str(material.GetPath())
-        raise TrilightError(f"{name!r:.100} has no shader that is understood")
-    return stated
-
-
-def _drop_ior_texture(stage: UsdStage, stated: StatedMaterial) -> StatedMaterial:
+def _drop_ior_texture(stated: StatedMaterial, lost: list[str]) -> StatedMaterial:
     textures = dict(stated.textures)
     if textures.pop("ior", None):
-        stage.opened.lost.append(f"{stated.where}.ior: its texture is not read; 1.5 taken")
+        lost.append(f"{stated.where}.ior: its texture is not read; 1.5 taken")
     return dataclasses.replace(stated, textures=textures)
 
 
@@ -167,12 +152,12 @@ def _read_pictures(nodes: Sequence[TextureNode], bytes_left: int) -> MaterialFil
     return MaterialFiles(data=data, refused=refused)
 
 
-def _cut_meshes(stage: UsdStage, max_faces: int) -> Mapping[int, CutMesh]:
+def _cut_meshes(placed: Sequence[PlacedPrim], max_faces: int) -> Mapping[int, CutMesh]:
     meshes: dict[int, CutMesh] = {}
     faces_left = max_faces
     farthest = 0.0
-    for number, each in enumerate(stage.meshes):
-        cut = cut_mesh(each, stage.time, faces_left)
+    for number, each in enumerate(placed):
+        cut = cut_mesh(each, TIME, faces_left)
         faces_left -= cut.num_faces
         if len(cut.corners):
             scale = np.linalg.norm(each.to_world[:3, :3], 2)
@@ -203,10 +188,12 @@ class UsdSource:
         self._path = path
         self._limits = limits
         with _reject_errors(path):
-            self.stage = _read_stage(path, limits)
+            self.opened = OpenedStage(path, max_file_bytes=limits.max_bytes)
+            """Opened layers, with notes on unread contents."""
+            self._placed = _place_meshes(self.opened, limits)
         digest = hashlib.sha256()
         bytes_left = limits.max_bytes
-        for layer in self.stage.opened.files:
+        for layer in self.opened.files:
             data = layer.read_bytes()
             if len(data) > bytes_left:
                 why = f"the layers together; {bytes_left} bytes are left"
@@ -230,7 +217,7 @@ class UsdSource:
                 mesh contradict each other, or are not finite.
         """
         with _reject_errors(self._path):
-            return _cut_meshes(self.stage, self._limits.max_faces)
+            return _cut_meshes(self._placed, self._limits.max_faces)
 
     @cached_property
     def mesh(self) -> TriangleMesh:
@@ -256,10 +243,18 @@ class UsdSource:
         """
         if not self._limits.with_materials:
             return Rejected("no_materials", "materials were not asked for")
-        read = partial(_read_strictly, self.stage, normals=self._limits.with_normal_maps)
+
+        def read(material: Any) -> StatedMaterial:
+            normals = self._limits.with_normal_maps
+            stated = read_material(material, TIME, self.opened, normals=normals)
+            if stated is None:
+                name = str(material.GetPath())
+                raise TrilightError(f"{name!r:.100} has no shader that is understood")
+            return stated
+
         try:
             with _reject_errors(self._path):
-                return read_stage_materials(self.stage, bytes_left, read)
+                return read_stage_materials(self._placed, TIME, bytes_left, read)
         except Rejected as why:
             return Rejected(why.reason, why.message)
 
@@ -279,15 +274,12 @@ def _reject_errors(path: Path) -> Iterator[None]:
         raise Rejected(reasons.get(type(error), "load_error"), f"{error!s:.300}") from error
 
 
-def _read_stage(path: Path, limits: ReadLimits) -> UsdStage:
-    from pxr import Usd
-
-    opened = OpenedStage(path, max_file_bytes=limits.max_bytes)
+def _place_meshes(opened: OpenedStage, limits: ReadLimits) -> list[PlacedPrim]:
+    """Return the visible meshes of a stage with transforms to meters, +Z up."""
     stage = opened.compose()
-    time = Usd.TimeCode.EarliestTime()
     if opened.unresolved:
         raise Rejected("missing_file", f"{opened.unresolved[0]}; an object needs all of its parts")
-    placed = placed_prims(stage, time, opened.lost, ("Mesh", *SOLIDS, "NurbsPatch"))
+    placed = placed_prims(stage, TIME, opened.lost, ("Mesh", *SOLIDS, "NurbsPatch"))
     if len(placed) > limits.max_instances:
         raise Rejected("too_many_instances", f"{len(placed)} meshes; <= {limits.max_instances}")
     for each in placed:
@@ -298,4 +290,4 @@ def _read_stage(path: Path, limits: ReadLimits) -> UsdStage:
         scheme = each.prim.GetAttribute("subdivisionScheme")
         if scheme and scheme.Get() != "none":
             opened.lost.append(f"{where}: subdivision; its cage was read")
-    return UsdStage(opened=opened, composed=stage, meshes=tuple(placed), time=time)
+    return placed

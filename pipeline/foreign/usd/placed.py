@@ -13,6 +13,7 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
+from pxr import Usd, UsdGeom, UsdSkel, Vt
 
 from pipeline.foreign.numbers import FINITE, read_number
 from storage.errors import TrilightError
@@ -45,8 +46,6 @@ class BoundSkin:
         Raises:
             UnposedMesh: joints, weights and points contradict each other.
         """
-        from pxr import UsdGeom, Vt
-
         points = Vt.Vec3fArray(stated)
         if self.binding.HasBlendShapes():
             _blend_shapes(self.skeleton, self.binding, prim, points, time)
@@ -64,8 +63,6 @@ class BoundSkin:
 
 def bind_skins(prim: Any, predicate: Any, cache: Any) -> dict[Any, BoundSkin]:
     """Return the skins that a SkelRoot binds below it, by the paths of their meshes."""
-    from pxr import UsdSkel
-
     root = UsdSkel.Root(prim)
     cache.Populate(root, predicate)
     return {
@@ -106,8 +103,6 @@ def find_skin(skins: Mapping[Any, BoundSkin], prim: Any) -> BoundSkin | None:
 
 def _blend_shapes(skeleton: Any, binding: Any, prim: Any, points: Any, time: Any) -> None:
     """Deform points in place by the blend shapes of an animation, if there is one."""
-    from pxr import UsdSkel
-
     animation = skeleton.GetAnimQuery() if skeleton else None
     weights = animation.ComputeBlendShapeWeights(time) if animation else None
     if not weights:
@@ -159,22 +154,24 @@ def placed_prims(
         TrilightError: more than MAX_PLACED prims with all instances, prims or prototypes that are
             nested more than MAX_NESTED deep, a transform that is not finite, or UnposedMesh.
     """
-    from pxr import UsdGeom, UsdSkel
-
     placed: list[PlacedPrim] = []
     unread = Counter[str]()
     known: dict[Any, list[str]] = {}
     skins: dict[Any, BoundSkin] = {}
     skeletons = UsdSkel.Cache()
-    visits = 0
     above_zero = Within(0, FINITE.high, low_open=True)
     meters_per_unit = read_number(UsdGeom.GetStageMetersPerUnit(stage), "metersPerUnit", above_zero)
-    for visit in _visit_prims(stage, _stage_to_world(stage, meters_per_unit), time, lost):
-        visits += 1
-        if visits > MAX_PLACED:
+    base = _stage_to_world(stage, meters_per_unit)
+    root = _Visit(
+        prim=stage.GetPseudoRoot(),
+        to_world=base,
+        origin=base,
+        predicate=Usd.TraverseInstanceProxies(),
+    )
+    for number, visit in enumerate(_visit_below(_visit_children(root), time, lost)):
+        if number >= MAX_PLACED:
             raise TrilightError(f"more than {MAX_PLACED} prims with all instances.")
         prim = visit.prim
-        to_world = visit.to_world
         kind = str(prim.GetTypeName())
         path = prim.GetPath()
         if path not in known:  # instances of one prototype have one path
@@ -183,15 +180,14 @@ def placed_prims(
                 skins |= bind_skins(prim, visit.predicate, skeletons)
         unread.update(known[path])
         if kind in kinds:
-            if not np.isfinite(to_world).all():
-                raise TrilightError(f"{prim.GetPath()}: its place is not finite.")
-            skin = find_skin(skins, prim)
+            if not np.isfinite(visit.to_world).all():
+                raise TrilightError(f"{path}: its place is not finite.")
             placed.append(
                 PlacedPrim(
                     prim=prim,
-                    to_world=to_world,
+                    to_world=visit.to_world,
                     meters_per_unit=meters_per_unit,
-                    skin=skin,
+                    skin=find_skin(skins, prim),
                     lost=lost,
                 )
             )
@@ -201,8 +197,6 @@ def placed_prims(
 
 def _stage_to_world(stage: Any, meters_per_unit: float) -> NDArray[np.float64]:
     """Return the matrix [4, 4] from a stage's units and up axis to meters with +Z up."""
-    from pxr import UsdGeom
-
     base = np.diag([meters_per_unit, meters_per_unit, meters_per_unit, 1.0])
     if UsdGeom.GetStageUpAxis(stage) == UsdGeom.Tokens.y:
         base[:3, :3] = meters_per_unit * np.array([[1, 0, 0], [0, 0, -1], [0, 1, 0]])
@@ -215,34 +209,19 @@ class _Visit:
 
     prim: Any
     to_world: NDArray[np.float64]  # of its parent until its own transform is applied
-    origin: NDArray[
-        np.float64
-    ]  # start of `!resetXformStack!`: that of the stage, or of an instance
+    origin: NDArray[np.float64]  # start of `!resetXformStack!`: of the stage, or of an instance
     purpose: str = "default"
     is_render_shown: bool = True  # VisibilityAPI's answer for the purpose `render`
     predicate: Any = None  # selects the children to visit
 
 
-def _visit_prims(
-    stage: Any, base: NDArray[np.float64], time: Any, lost: list[str]
+def _visit_below(
+    visits: Iterator[_Visit], time: Any, lost: list[str], depth: int = 1
 ) -> Iterator[_Visit]:
-    """Yield the visible prims of a stage with world transforms, in the order of the tree."""
-    from pxr import Usd, UsdGeom
-
-    root = _Visit(
-        prim=stage.GetPseudoRoot(),
-        to_world=base,
-        origin=base,
-        predicate=Usd.TraverseInstanceProxies(),
-    )
-    levels = [_visit_children(root)]
-    while levels:
-        above = next(levels[-1], None)
-        if above is None:
-            levels.pop()
-            continue
+    """Yield the visible ones of prims and of all below them, placed, in the order of the tree."""
+    for above in visits:
         prim = above.prim
-        if len(levels) > MAX_NESTED:
+        if depth > MAX_NESTED:
             raise TrilightError(
                 f"{prim.GetPath()}: nested more than {MAX_NESTED} deep, prototypes counted."
             )
@@ -258,9 +237,8 @@ def _visit_prims(
             yield visit
         is_instancer = prim.IsA(UsdGeom.PointInstancer)
         if is_shown or not is_instancer:
-            levels.append(
-                _visit_instances(visit, time, lost) if is_instancer else _visit_children(visit)
-            )
+            below = _visit_instances(visit, time, lost) if is_instancer else _visit_children(visit)
+            yield from _visit_below(below, time, lost, depth + 1)
 
 
 def _visit_children(above: _Visit) -> Iterator[_Visit]:
@@ -270,8 +248,6 @@ def _visit_children(above: _Visit) -> Iterator[_Visit]:
 
 def _inherit_purpose(above: _Visit, imageable: Any, time: Any) -> _Visit:
     """Return a visit with the prim's authored purpose, if any, which its children inherit."""
-    from pxr import UsdGeom
-
     if not imageable:
         return above
     purpose = imageable.GetPurposeAttr()
@@ -284,8 +260,6 @@ def _inherit_purpose(above: _Visit, imageable: Any, time: Any) -> _Visit:
 
 
 def _compute_world(visit: _Visit, time: Any) -> NDArray[np.float64]:
-    from pxr import UsdGeom
-
     move = UsdGeom.Xformable(visit.prim)
     if not move:
         return visit.to_world
@@ -295,8 +269,6 @@ def _compute_world(visit: _Visit, time: Any) -> NDArray[np.float64]:
 
 
 def _visit_instances(above: _Visit, time: Any, lost: list[str]) -> Iterator[_Visit]:
-    from pxr import Usd, UsdGeom
-
     prim = above.prim
     instancer = UsdGeom.PointInstancer(prim)
     targets = instancer.GetPrototypesRel().GetForwardedTargets()

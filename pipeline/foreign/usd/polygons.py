@@ -12,6 +12,7 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
+from pxr import UsdGeom
 
 from pipeline.foreign.numbers import read_number
 from pipeline.foreign.polygons import triangulate
@@ -80,8 +81,6 @@ class CutMesh:
 
         None where there is none, or not for every corner.
         """
-        from pxr import UsdGeom
-
         primvar = UsdGeom.PrimvarsAPI(self.prim).FindPrimvarWithInheritance(name)
         if not primvar or not primvar.HasValue():
             return None
@@ -98,21 +97,12 @@ class CutMesh:
             )
         return fitting
 
-    def read_coordinates(self, primvar: str, time: Any) -> NDArray[np.float64] | None:
-        """Return texture coordinates [T, 3, 2], perhaps not finite; None where one is missing."""
+    def read_coordinates(self, primvar: str, time: Any) -> NDArray[np.float64]:
+        """Return texture coordinates [T, 3, 2], perhaps not finite; NaN where one is missing."""
         values = self.read_primvar(primvar, time)
         if values is None or values.ndim != 3 or values.shape[2] < 2:
-            return None
+            return np.full((len(self.corners), 3, 2), np.nan)
         return np.asarray(values[..., :2], np.float64)
-
-    def read_coordinate_sets(self, primvars: Sequence[str], time: Any) -> NDArray[np.float64]:
-        """Return the values [T, S, 3, 2] of primvars at corners; NaN where there are none."""
-        uv = np.full((len(self.corners), len(primvars), 3, 2), np.nan)
-        for row, name in enumerate(primvars):
-            values = self.read_coordinates(name, time)
-            if values is not None:
-                uv[:, row] = values
-        return uv
 
 
 def cut_mesh(placed: PlacedPrim, time: Any, max_faces: int | None = None) -> CutMesh:
@@ -125,8 +115,6 @@ def cut_mesh(placed: PlacedPrim, time: Any, max_faces: int | None = None) -> Cut
         Rejected: too_many_faces.
         TrilightError: its arrays contradict each other, or are not finite.
     """
-    from pxr import UsdGeom
-
     prim = placed.prim
     holes = as_array(None, np.int64, (-1,))
     if prim.GetTypeName() in SOLIDS:
@@ -262,8 +250,6 @@ def _revolve(profile: NDArray[np.float64]) -> tuple[NDArray[np.float64], list[li
 
 
 def _read_tetrahedra(prim: Any, time: Any) -> Polygons:
-    from pxr import UsdGeom
-
     mesh = UsdGeom.TetMesh(prim)
     faces = mesh.GetSurfaceFaceVertexIndicesAttr().Get(time)
     if not faces:

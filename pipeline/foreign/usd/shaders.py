@@ -5,11 +5,12 @@ An input is a constant, a texture, or a primvar of the mesh.
 """
 
 from collections.abc import Collection, Iterator, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
+from pxr import UsdShade
 
 from pipeline.foreign.usd.polygons import CutMesh, as_array
 from pipeline.foreign.usd.stage import OpenedStage
@@ -118,15 +119,15 @@ class StatedMaterial:
     """Path of its shader, for notes."""
     constants: Mapping[str, NDArray[np.float32]]
     """Values [3] of all inputs by name in UsdPreviewSurface; fallbacks for primvars."""
-    textures: Mapping[str, TextureNode]
+    textures: Mapping[str, TextureNode] = field(default_factory=dict)
     """Textures by name of the input; they override constants."""
-    primvars: Mapping[str, str]
+    primvars: Mapping[str, str] = field(default_factory=dict)
     """Names of primvars by name of the input; they override constants."""
-    has_strength: bool
+    has_strength: bool = False
     """True where emission is multiplied with `strength`."""
-    lost: tuple[str, ...]
+    lost: tuple[str, ...] = ()
     """Names of unsupported inputs that have an effect."""
-    has_networks: bool
+    has_networks: bool = False
     """True where nodes that are not read, or values that are not finite, feed an input."""
 
     @property
@@ -135,12 +136,10 @@ class StatedMaterial:
         return bool(self.constants["useSpecularWorkflow"].any())
 
     def read_values(self, name: str, cut: CutMesh, time: Any) -> NDArray[np.float64] | None:
-        """Return the primvar of an input at corners [T, 3, 3]; None where there is none."""
-        if name not in self.primvars:
-            return None
-        values = read_colors(cut, self.primvars[name], time)
+        """Return the primvar of an input at corners [T, 3, 3]; None, with a note, without one."""
+        primvar = self.primvars[name]
+        values = read_colors(cut, primvar, time)
         if values is None:
-            primvar = self.primvars[name]
             cut.placed.lost.append(
                 f"{cut.prim.GetPath()}: no primvar {primvar!r:.60}; its fallback taken"
             )
@@ -170,8 +169,6 @@ def read_bindings(prim: Any, time: Any) -> Iterator[tuple[Any, NDArray[np.int64]
     The binding for full rendering, or else that for previews, counts if its shader is supported.
     Later subsets override earlier ones.
     """
-    from pxr import UsdShade
-
     yield _find_material(prim), None
     for subset in UsdShade.MaterialBindingAPI(prim).GetMaterialBindSubsets():
         bound = _find_material(subset.GetPrim())
@@ -180,8 +177,6 @@ def read_bindings(prim: Any, time: Any) -> Iterator[tuple[Any, NDArray[np.int64]
 
 
 def _find_material(prim: Any) -> Any:
-    from pxr import UsdShade
-
     first = None
     for purpose in (UsdShade.Tokens.full, UsdShade.Tokens.preview):
         material = UsdShade.MaterialBindingAPI(prim).ComputeBoundMaterial(purpose)[0]
@@ -225,12 +220,12 @@ def read_material(
     shader = surface_shader(material)
     if shader is None:
         return None
-    reader = _Reader(shader, time, opened)
+    reader = ShaderReader(shader, time, opened)
     notes = len(opened.lost)
     for name in TEXTURED:
         reader.read_connection(name)
-    if normals:
-        reader.read_normal_map()
+    if normals and shader.GetShaderId() == PREVIEW:
+        reader.read_connection("normal")
     constants = {name: reader.constant(name) for name in DEFAULTS}
     has_networks = len(opened.lost) > notes
     constants["diffuseColor"] = constants["diffuseColor"] * reader.weight()
@@ -243,21 +238,17 @@ def read_material(
         constants=constants,
         textures=reader.textures,
         primvars=reader.primvars,
-        has_strength=reader.has("strength"),
+        has_strength="strength" in NAMES[shader.GetShaderId()],
         lost=lost,
         has_networks=has_networks,
     )
 
 
-def note_unsupported(shader: Any, time: Any, opened: OpenedStage, known: Collection[str]) -> None:
-    """Note the unsupported inputs of a supported shader that have an effect, but for known ones."""
-    _Reader(shader, time, opened).note_unsupported(known)
-
-
-class _Reader:
-    """Reads the inputs of one shader."""
+class ShaderReader:
+    """Reads the inputs of one supported shader."""
 
     def __init__(self, shader: Any, time: Any, opened: OpenedStage) -> None:
+        """Take the names and defaults of the shader; the notes of `opened` receive what is lost."""
         self._shader = shader
         self._time = time
         self._opened = opened
@@ -269,14 +260,8 @@ class _Reader:
         self.primvars: dict[str, str] = {}
         self._fallbacks: dict[str, Any] = {}
 
-    def has(self, name: str) -> bool:
-        """Return whether this shader has an input for a name of UsdPreviewSurface."""
-        return name in self._names
-
     def read_connection(self, name: str) -> None:
         """Store the texture or the primvar that an input is connected to."""
-        from pxr import UsdShade
-
         sources = self._sources(name)
         if not sources or not is_output(sources[0]):
             return
@@ -284,22 +269,14 @@ class _Reader:
         if node.GetShaderId() == "UsdUVTexture":
             output = UsdShade.Output(sources[0]).GetBaseName()
             self.textures[name] = read_texture_node(node, output, self._time, self._opened)
+        elif name == "normal":  # other connections stay unsupported
+            return
         elif node.GetShaderId() in _READERS:
             primvar, fallback = _READERS[node.GetShaderId()]
             self.primvars[name] = str(read_input(node, primvar, self._time, ""))
             self._fallbacks[name] = read_input(node, fallback, self._time, 0.0)
         else:
             self._lose(name, f"{node.GetShaderId() or 'a network'} that is not read")
-
-    def read_normal_map(self) -> None:
-        """Store the texture of the normal; other connections stay unsupported."""
-        from pxr import UsdShade
-
-        sources = find_sources(self._shader, "normal")
-        if self._shader.GetShaderId() != PREVIEW or not sources or not is_output(sources[0]):
-            return
-        if UsdShade.Shader(sources[0].GetPrim()).GetShaderId() == "UsdUVTexture":
-            self.read_connection("normal")
 
     def constant(self, name: str) -> NDArray[np.float32]:
         """Return the constant [3] of an input; a number fills all channels."""

@@ -26,6 +26,8 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import Any, NoReturn
 
+from pxr import Ar, Pcp, Sdf, Tf, Usd, UsdUtils
+
 from pipeline.foreign.numbers import Malformed
 from storage.errors import TrilightError
 
@@ -36,6 +38,14 @@ MAX_NOTES = 40
 """Maximum number of notes on one file; further notes are only counted."""
 MAX_MEMBERS = 10_000
 """Maximum number of members in a usdz archive."""
+
+MAX_PRIMS = 500_000
+"""Maximum number of composed prims; instances of one prototype count once."""
+MAX_DEPTH = 150
+"""Maximum nesting of prims."""
+MAX_COMPOSITION_S = 20.0
+"""Maximum CPU seconds for all prims: 500,000 of few arcs each take 4 to 10; chains of thousands of
+references, or prims of thousands of sites, take hours."""
 
 _LOOKS = (".mtlx",)
 """Suffixes of files that hold materials only; a stage is complete in shape without them."""
@@ -48,8 +58,6 @@ def file_and_member(name: str) -> tuple[Path, str]:
 
     Brackets in folder names do not count: only those at the end of `a.usdz[b.usda]` hold a member.
     """
-    from pxr import Ar
-
     outer, member = Ar.SplitPackageRelativePathOuter(name)
     return Path(outer), str(member)
 
@@ -74,8 +82,6 @@ class OpenedStage:
         Raises:
             TrilightError: not a readable USD file, or larger than it may be.
         """
-        from pxr import Ar
-
         self.path = path.resolve()
         self.folder = (folder or self.path.parent).resolve()
         self.lost: list[str] = []
@@ -112,8 +118,6 @@ class OpenedStage:
             OutsideFile: it is on the network, outside of the folder, no plain file, or named by a
                 variable expression.
         """
-        from pxr import Ar, Sdf
-
         plain, arguments = Sdf.Layer.SplitIdentifier(asset_path)
         if arguments:
             self._refuse(plain, " with arguments for its file format; expected a name alone")
@@ -139,18 +143,16 @@ class OpenedStage:
         return resolved or None
 
     def compose(self) -> Any:
-        """Return the composed stage; all of its files have been checked.
+        """Return the composed stage; all of its files have been checked, and its prims stay valid.
 
         Raises:
             TrilightError: a file outside, the network, value clips, a circle, or too much of
                 something.
         """
-        from pxr import Usd
-
         self._open_all()
-        for error in composition_errors(self.root, self._context, self.path.name):
+        for error in self._compose_prims():
             self._note_error(error)
-        stage = Usd.Stage.Open(self.root, self._context, Usd.Stage.LoadAll)
+        self._composed = stage = Usd.Stage.Open(self.root, self._context, Usd.Stage.LoadAll)
         for layer in stage.GetUsedLayers():
             real = file_and_member(layer.realPath)[0].resolve()
             if not layer.anonymous and not real.is_relative_to(self.folder):
@@ -185,10 +187,54 @@ class OpenedStage:
                 f"{self.path.name}: {clipped[0]} uses value clips, which are not read; bake them."
             )
 
+    def _compose_prims(self) -> Sequence[Any]:
+        """Compose all prims, payloads too, and return USD's errors; every file must be open.
+
+        Raises:
+            TrilightError: too many prims, nested too deep, or not composed in time.
+        """
+        cache = Pcp.Cache(Pcp.LayerStackIdentifier(self.root, None, self._context), "usd", True)
+        _, errors = cache.ComputeLayerStack(cache.GetLayerStackIdentifier())
+        waiting = [Sdf.Path.absoluteRootPath]
+        prototypes = set()
+        num_prims = 0
+        start_s = time.process_time()
+        while waiting:
+            path = waiting.pop()
+            num_prims += 1
+            self._require_bounds(path, num_prims, time.process_time() - start_s)
+            index, prim_errors = cache.ComputePrimIndex(path)
+            if index.hasAnyPayloads:
+                cache.RequestPayloads([path], [])
+                index, prim_errors = cache.ComputePrimIndex(path)
+            errors += prim_errors
+            if index.IsInstanceable():
+                prototype = Pcp.InstanceKey(index)
+                if prototype in prototypes:
+                    continue
+                prototypes.add(prototype)
+            children, _ = index.ComputePrimChildNames()
+            waiting += [path.AppendChild(child) for child in children]
+        return errors
+
+    def _require_bounds(self, path: Any, num_prims: int, elapsed_s: float) -> None:
+        name = self.path.name
+        if num_prims > MAX_PRIMS:
+            raise TrilightError(
+                f"{name}: composes more than {MAX_PRIMS} prims, the most that is read."
+            )
+        if path.pathElementCount > MAX_DEPTH:
+            raise TrilightError(
+                f"{name}: prims are nested more than {MAX_DEPTH} deep ({str(path)[:60]}...)."
+            )
+        if elapsed_s > MAX_COMPOSITION_S:
+            raise TrilightError(
+                f"{name}: {num_prims} prims took {elapsed_s:.0f} processor seconds to compose and "
+                f"more follow; expected all within {MAX_COMPOSITION_S:.0f}. Flatten the stage."
+            )
+
     def _note_error(self, error: Any) -> None:
         """Note an error of composition; raises TrilightError for one that makes it unreadable."""
-        from pxr import Pcp
-
         if isinstance(error, Pcp.ErrorInvalidAssetPath | Pcp.ErrorInvalidSublayerPath):
             return  # noted by `_named_layer`
         site = re.search(r"<[^<>]*>$", str(error.rootSite))
@@ -201,8 +247,6 @@ class OpenedStage:
 
     def _named_layer(self, anchor: Any, asset_path: str) -> Any:
         """Return the layer that another one names, or None with a note where it is missing."""
-        from pxr import Sdf
-
         resolved = self.resolve(anchor, asset_path)
         if resolved is None or Sdf.FileFormat.FindByExtension(resolved) is None:
             why = "is missing" if resolved is None else "is no USD file"
@@ -222,8 +266,6 @@ class OpenedStage:
         raise OutsideFile(f"{self.path.name}: names {named!r:.100}{why}.")
 
     def _open(self, resolved: str) -> Any:
-        from pxr import Sdf, Tf
-
         if resolved in self._layers:
             return self._layers[resolved]
         if len(self._layers) >= MAX_LAYERS:
@@ -283,8 +325,6 @@ def read_quietly(path: Path) -> Iterator[None]:
     Raises:
         TrilightError: as the block, or the file is broken or has a value of a wrong type.
     """
-    from pxr import Tf, UsdUtils
-
     delegate = UsdUtils.CoalescingDiagnosticDelegate()
     try:
         yield
@@ -310,64 +350,3 @@ def _find_line(error: Exception) -> str:
     except UnicodeDecodeError:  # the message cites bytes of the file
         line = None
     return f" from line {line[1]} on" if line else ""
-
-
-MAX_PRIMS = 500_000
-"""Maximum number of composed prims; instances of one prototype count once."""
-MAX_DEPTH = 150
-"""Maximum nesting of prims."""
-MAX_COMPOSITION_S = 20.0
-"""Maximum CPU seconds for all prims: 500,000 of few arcs each take 4 to 10; chains of thousands of
-references, or prims of thousands of sites, take hours."""
-
-
-def composition_errors(root: Any, context: Any, name: str) -> Sequence[Any]:
-    """Compose all prims below a root layer, payloads too, and return USD's errors.
-
-    Args:
-        root: the layer; every file it names must have been checked (pipeline.foreign.usd.stage).
-        context: resolver context of the stage that will be opened.
-        name: name of the file, for messages.
-
-    Raises:
-        TrilightError: too many prims, nested too deep, or not composed in time.
-    """
-    from pxr import Pcp, Sdf
-
-    cache = Pcp.Cache(Pcp.LayerStackIdentifier(root, None, context), "usd", True)
-    _, errors = cache.ComputeLayerStack(cache.GetLayerStackIdentifier())
-    waiting = [Sdf.Path.absoluteRootPath]
-    prototypes = set()
-    num_prims = 0
-    start_s = time.process_time()
-    while waiting:
-        path = waiting.pop()
-        num_prims += 1
-        _require_bounds(name, path, num_prims, time.process_time() - start_s)
-        index, prim_errors = cache.ComputePrimIndex(path)
-        if index.hasAnyPayloads:
-            cache.RequestPayloads([path], [])
-            index, prim_errors = cache.ComputePrimIndex(path)
-        errors += prim_errors
-        if index.IsInstanceable():
-            prototype = Pcp.InstanceKey(index)
-            if prototype in prototypes:
-                continue
-            prototypes.add(prototype)
-        children, _ = index.ComputePrimChildNames()
-        waiting += [path.AppendChild(child) for child in children]
-    return errors
-
-
-def _require_bounds(name: str, path: Any, num_prims: int, elapsed_s: float) -> None:
-    if num_prims > MAX_PRIMS:
-        raise TrilightError(f"{name}: composes more than {MAX_PRIMS} prims, the most that is read.")
-    if path.pathElementCount > MAX_DEPTH:
-        raise TrilightError(
-            f"{name}: prims are nested more than {MAX_DEPTH} deep ({str(path)[:60]}...)."
-        )
-    if elapsed_s > MAX_COMPOSITION_S:
-        raise TrilightError(
-            f"{name}: {num_prims} prims took {elapsed_s:.0f} processor seconds to compose and more "
-            f"follow; expected all within {MAX_COMPOSITION_S:.0f}. Flatten the stage."
-        )

@@ -7,6 +7,7 @@ from typing import Any, cast, get_args
 
 import numpy as np
 from numpy.typing import NDArray
+from pxr import Gf, Usd, UsdShade, Vt
 
 from pipeline.foreign.numbers import Malformed, read_number, read_numbers
 from pipeline.foreign.picture import Wrap
@@ -17,23 +18,6 @@ _MOST_NODES = 8
 """Maximum number of transforms in a row."""
 
 _WRAPS = get_args(Wrap)
-
-
-@dataclass(frozen=True, kw_only=True, eq=False)
-class UvChart:
-    """The texture coordinates of a texture: matrix x primvar + offset."""
-
-    primvar: str
-    """Name of the mesh's primvar of coordinates."""
-    matrix: NDArray[np.float64]
-    """[2, 2] factors for column vectors: scales and rotations."""
-    offset: NDArray[np.float64]
-    """[2] offset that is added after the matrix."""
-
-    @property
-    def is_moved(self) -> bool:
-        """Return whether coordinates differ from the primvar."""
-        return bool((self.matrix != np.eye(2)).any() or self.offset.any())
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -52,8 +36,12 @@ class TextureNode:
     """[4] factors of the picture's RGBA values."""
     bias: NDArray[np.float32]
     """[4] offsets added after `scale`."""
-    chart: UvChart
-    """Texture coordinates at which it is sampled."""
+    primvar: str
+    """Name of the mesh's primvar of texture coordinates; `st` where none is stated."""
+    uv_matrix: NDArray[np.float64]
+    """[2, 2] factors of those, as column vectors: scales and rotations."""
+    uv_offset: NDArray[np.float64]
+    """[2] offset that is added after the matrix."""
     output: str
     """Name of the connected output: rgb, r, g, b or a."""
     fallback: NDArray[np.float64] | None
@@ -93,16 +81,14 @@ def read_texture_node(shader: Any, output: str, time: Any, opened: OpenedStage) 
         wrap=(_wrap(shader, "wrapS", time), _wrap(shader, "wrapT", time)),
         scale=np.array(_vector(shader, "scale", time, (1, 1, 1, 1)), np.float32),
         bias=np.array(_vector(shader, "bias", time, (0, 0, 0, 0)), np.float32),
-        chart=read_chart(shader, time, opened.lost),
+        **_read_coordinates(shader, time, opened.lost),
         output=output if output in ("r", "g", "b", "a") else "rgb",
         fallback=None if fallback is None else np.array(fallback, np.float64),
     )
 
 
-def read_chart(shader: Any, time: Any, lost: list[str]) -> UvChart:
-    """Return the texture coordinates of a shader; `st` where it states none."""
-    from pxr import UsdShade
-
+def _read_coordinates(shader: Any, time: Any, lost: list[str]) -> dict[str, Any]:
+    """Return the fields of `TextureNode` on the texture coordinates of a shader."""
     sources = find_sources(shader, "st")
     moves: list[tuple[NDArray[np.float64], tuple[float, ...]]] = []
     primvar = "st"
@@ -125,7 +111,7 @@ def read_chart(shader: Any, time: Any, lost: list[str]) -> UvChart:
         offset = move @ offset + translation
     if not (np.isfinite(matrix).all() and np.isfinite(offset).all()):
         raise Malformed(f"{shader.GetPath()}: coordinates are moved by what is no number")
-    return UvChart(primvar=primvar, matrix=matrix, offset=offset)
+    return {"primvar": primvar, "uv_matrix": matrix, "uv_offset": offset}
 
 
 def _read_transform(node: Any, time: Any) -> tuple[NDArray[np.float64], tuple[float, ...]]:
@@ -165,16 +151,12 @@ def _require_size(size: int, max_bytes: int, name: str) -> None:
 
 def find_sources(shader: Any, name: str) -> Any:
     """Return the attributes that produce the value of a shader's input, its material's included."""
-    from pxr import UsdShade
-
     stated = shader.GetInput(name)
     return UsdShade.Utils.GetValueProducingAttributes(stated) if stated else []
 
 
 def is_output(attribute: Any) -> bool:
     """Return whether an attribute is the output of another node."""
-    from pxr import UsdShade
-
     return bool(UsdShade.Output.IsOutput(attribute))
 
 
@@ -200,8 +182,6 @@ def convert_to_rec709(attribute: Any, stated: NDArray) -> NDArray:
 
     Colors without a space, and those declared as data, stay as they are.
     """
-    from pxr import Gf, Usd, Vt
-
     is_color = attribute.GetTypeName().scalarType.role == "Color" and stated.shape[-1:] != ()
     space = Usd.ColorSpaceAPI.ComputeColorSpace(attribute, None) if is_color else None
     ours = Gf.ColorSpace(Gf.ColorSpaceNames.LinearRec709)

@@ -20,7 +20,6 @@ from pipeline.renders.guide_table import (
     Guidance,
     GuideCells,
     GuideTable,
-    Photons,
     apportion_entries,
     bin_of,
     learn,
@@ -417,7 +416,7 @@ def test_a_matt_scene_has_nothing_to_learn() -> None:
     assert _tracer(scene).with_guide()._scene.guide is None
     nothing = np.zeros(0, np.int64)
     cells = GuideCells(np.random.default_rng(5).normal(size=(9, 3, 3)))
-    assert learn(cells, Photons(cell=nothing, bin=nothing, power=np.zeros(0))) is None
+    assert learn(cells, nothing, nothing, np.zeros(0)) is None
 
 
 def test_only_views_that_miss_their_floor_are_guided(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -546,12 +545,9 @@ def test_a_table_is_bounded_however_many_cells_have_photons(
     far_apart = rng.uniform(0, 10, (2000, 1, 3)) + 0.3 * rng.normal(size=(2000, 3, 3))
     cells = GuideCells(far_apart)
     count = 100_001
-    photons = guide_table.Photons(
-        cell=rng.integers(0, len(cells.facing), count),
-        bin=rng.integers(0, BINS, count),
-        power=rng.exponential(size=count),
-    )
-    table = guide_table.learn(cells, photons)
+    hit_cells = rng.integers(0, len(cells.facing), count)
+    bins = rng.integers(0, BINS, count)
+    table = guide_table.learn(cells, hit_cells, bins, rng.exponential(size=count))
     assert table is not None
     assert len(table.densities) <= (1 + 4 * 200) * BINS
 

@@ -10,8 +10,13 @@ import pytest
 from numpy.typing import NDArray
 
 from pipeline.renders import kernel_scene
-from pipeline.renders.emitter_table import alias_table
-from pipeline.renders.sky_table import SkyTable, alias_rows, peaked_radiance, sky_share
+from pipeline.renders.light_tables import (
+    SkyTable,
+    alias_rows,
+    alias_table,
+    peaked_radiance,
+    sky_share,
+)
 from pipeline.renders.surface_table import KernelTextures
 from pipeline.renders.tracer import load_tracer
 from pipeline.renders.vector_tracer import VectorTracer

@@ -1,6 +1,8 @@
 """How many samples, where they go, when they end, and what error is stated of them."""
 
 from collections.abc import Sequence
+from functools import partial
+from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
@@ -18,7 +20,6 @@ from pipeline.renders.renderer import SceneRenderer
 from pipeline.renders.samples import (
     TILE_PX,
     DualBuffer,
-    Goal,
     TileChoice,
     expected_spp,
     gaps_db,
@@ -157,8 +158,12 @@ def test_targets_go_by_the_name_of_their_metric() -> None:
         assert RenderSettings(**{**GOOD, **target_overrides(targets)}).targets_db == expected
 
 
-def log_goal(target_db: float, step: int, max_spp: int) -> Goal:
-    return Goal(targets_db={"psnr_log_db": target_db}, step=step, max_spp=max_spp)
+def log_goal(target_db: float, step: int, max_spp: int) -> dict[str, Any]:
+    return {"targets_db": {"psnr_log_db": target_db}, "step": step, "max_spp": max_spp}
+
+
+def following_spp(measured: list[tuple[int, dict[str, float]]], goal: dict[str, Any]) -> int:
+    return next_spp(measured[-1][0], expected_spp(measured, **goal), goal["step"])
 
 
 def logs(*measured: tuple[int, float]) -> list[tuple[int, dict[str, float]]]:
@@ -170,12 +175,12 @@ def test_samples_grow_in_whole_steps_up_to_the_cap(
     steps: int, gap_db: float, wider_gap_db: float, step: int
 ) -> None:
     spp, cap = steps * step, 64 * step
-    chosen = next_spp(logs((spp, 0.0)), log_goal(gap_db, step, cap))
+    chosen = following_spp(logs((spp, 0.0)), log_goal(gap_db, step, cap))
     assert chosen % step == 0
     assert spp < chosen <= cap
     assert chosen <= max(2 * spp, spp + step)
     if wider_gap_db >= gap_db:
-        assert chosen <= next_spp(logs((spp, 0.0)), log_goal(wider_gap_db, step, cap))
+        assert chosen <= following_spp(logs((spp, 0.0)), log_goal(wider_gap_db, step, cap))
 
 
 def test_samples_go_by_what_a_doubling_buys() -> None:
@@ -192,8 +197,8 @@ def test_samples_go_by_what_a_doubling_buys() -> None:
         (slow, 44.0, 1024, 2048),
     ):
         goal = log_goal(target_db, 128, 4096)
-        assert next_spp(measured, goal) == following
-        assert expected_spp(measured, goal) == in_all
+        assert following_spp(measured, goal) == following
+        assert expected_spp(measured, **goal) == in_all
     assert (slope_db(fast, "psnr_log_db"), slope_db(slow, "psnr_log_db")) == (2.0, 1.0)
     assert slope_db(logs((128, 40.0), (256, 39.0)), "psnr_log_db") == 0.6
     assert slope_db(logs((128, 40.0), (256, 50.0)), "psnr_log_db") == 3.0
@@ -210,14 +215,14 @@ def test_the_target_that_needs_most_samples_governs() -> None:
     assert gaps_db(missed, TWICE[-1][1]) == {"psnr_linear_db": 4.0}
     assert gaps_db({"psnr_log_db": 41.0}, TWICE[-1][1]) == {}
     # 2 dB a doubling of the log floor, 1 dB of both others
-    both = Goal(targets_db={"psnr_log_db": 45.0, "psnr_linear_db": 33.0}, step=128, max_spp=8192)
-    assert expected_spp(TWICE, both) == 1024  # two doublings: the gap of 3 dB takes 1.5
-    alone = Goal(targets_db={"psnr_log_db": 46.0}, step=128, max_spp=8192)
-    assert expected_spp(TWICE, alone) == 1024
+    both = {"psnr_log_db": 45.0, "psnr_linear_db": 33.0}
+    assert expected_spp(TWICE, both, step=128, max_spp=8192) == 1024  # two doublings: of 3 dB 1.5
+    alone = {"psnr_log_db": 46.0}
+    assert expected_spp(TWICE, alone, step=128, max_spp=8192) == 1024
     reached = {"psnr_log_db": 44.0, "psnr_linear_db": 31.0, "object_psnr_log_db": 39.0}
     for targets_db in ({"psnr_log_db": 44.0}, reached):  # what is reached costs nothing
-        goal = Goal(targets_db=targets_db, step=128, max_spp=8192)
-        assert expected_spp(TWICE, goal) == next_spp(TWICE, goal) == 512
+        goal: dict[str, Any] = {"targets_db": targets_db, "step": 128, "max_spp": 8192}
+        assert expected_spp(TWICE, **goal) == following_spp(TWICE, goal) == 512
 
 
 NOISE = 0.05
@@ -452,13 +457,23 @@ def test_the_choice_is_that_of_handing_out_passes_one_by_one(
     assert ((found == given_out) | (found == given_out + 1)).all()
 
 
+def one_pass(
+    tracer: Any, camera: PixelCamera, *, seed: int, spp: int, chosen: Chosen = None
+) -> NDArray[np.float32]:
+    """Return `VectorTracer.radiance` of some pixels; 0 in the others."""
+    samples = tracer.pass_sum(camera)
+    samples.add(seed=seed, spp=spp, chosen=chosen)
+    (picture,) = samples.read() / spp
+    return np.asarray(picture.astype(np.float32))
+
+
 def test_a_pass_over_some_pixels_agrees_with_passes_over_all() -> None:
     """The slow twin traces the whole picture. Each pixel is off by less than 5.5 of its standard
     errors, and the mean square of the scores is 1: they go by 15 degrees of freedom each."""
     tracer, camera = load_tracer(_noisy(), max_depth=6, rr_depth=2), camera_of(_noisy(), 16)
     chosen = np.random.default_rng(0).random((16, 16)) < 0.6
     some, all_ = (
-        np.array([tracer.radiance(camera, seed=seed, spp=64, chosen=pixels) for seed in seeds])
+        np.array([one_pass(tracer, camera, seed=seed, spp=64, chosen=pixels) for seed in seeds])
         .astype(np.float64).mean(axis=-1)
         for seeds, pixels in ((range(32), chosen), (range(500, 532), None))
     )  # fmt: skip
@@ -470,7 +485,7 @@ def test_a_pass_over_some_pixels_agrees_with_passes_over_all() -> None:
     assert np.abs(score).max() < 5.5
     assert 0.7 < np.sqrt(np.mean(score**2)) < 1.4
     np.testing.assert_array_equal(
-        tracer.radiance(camera, seed=3, spp=16, chosen=np.ones_like(chosen)),
+        one_pass(tracer, camera, seed=3, spp=16, chosen=np.ones_like(chosen)),
         tracer.radiance(camera, seed=3, spp=16),
     )
 
@@ -478,7 +493,8 @@ def test_a_pass_over_some_pixels_agrees_with_passes_over_all() -> None:
 def test_sums_over_chosen_pixels_are_those_of_the_passes() -> None:
     tracer, camera = load_tracer(_noisy(), max_depth=6, rr_depth=2), camera_of(_noisy(), 32)
     rng = np.random.default_rng(2)
-    fast, slow = tracer.pass_sum(camera), HostSum(tracer, camera)
+    passes = SimpleNamespace(radiance=partial(one_pass, tracer))
+    fast, slow = tracer.pass_sum(camera), HostSum(passes, camera)
     for seed, share in enumerate((0.2, 1.1, 0.5)):
         chosen = rng.random((32, 32)) < share
         for part in (fast, slow):

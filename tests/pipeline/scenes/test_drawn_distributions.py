@@ -15,7 +15,7 @@ import trimesh
 from numpy.typing import NDArray
 
 from pipeline.presets.registry import preset_settings
-from pipeline.scenes.pieces import object_piece
+from pipeline.scenes.pieces import surface_piece
 from pipeline.scenes.triangle_budget import PooledAsset
 from scene_templates.layout import SurfaceLook
 from scene_templates.out_of_range import median_settings
@@ -89,7 +89,7 @@ def test_colours_go_by_triangle_by_group_or_are_one() -> None:
     positions, faces = rod.vertices.astype(np.float32), rod.faces.astype(np.uint32)
     for colours, count in (("one", 1), ("groups", 3), ("triangles", len(faces))):
         rng = np.random.default_rng(0)
-        piece = object_piece(entry, positions, faces, _surface(colours), rng, 30.0)
+        piece = surface_piece(entry, positions, faces, _surface(colours), rng, 30.0)
         assert len(piece.materials) == count
         assert sorted(set(piece.material_index.tolist())) == list(range(count))
         assert len(np.unique(piece.materials[:, DIFFUSE], axis=0)) == count

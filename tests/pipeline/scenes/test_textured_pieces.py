@@ -18,8 +18,8 @@ from pipeline.scenes.pieces import (
     concatenate_pieces,
     cube_coordinates,
     emitter_piece,
-    object_piece,
     source_skins,
+    surface_piece,
     with_drawn_textures,
     with_source_emission,
 )
@@ -212,7 +212,7 @@ def _piece(mesh: trimesh.Trimesh, *, smooth: bool) -> ScenePiece:
     faces = mesh.faces.astype(np.uint32)
     rng = np.random.default_rng(0)
     look = dataclasses.replace(LOOK, smooth=smooth, colours="triangles" if smooth else "one")
-    return object_piece(entry, positions, faces, look, rng, 30.0)
+    return surface_piece(entry, positions, faces, look, rng, 30.0)
 
 
 def _open_and_odd() -> trimesh.Trimesh:
@@ -406,7 +406,7 @@ def test_subdivision_moves_no_colour() -> None:
     entries = [pooled("a", [trimesh.creation.box()])]
     (skin,) = source_skins(entries, [level], OWN.materials, SceneKey(0, 0))
     assert skin is not None
-    whole = object_piece(box, positions, level.faces, LOOK, rng, 30.0, skin)
+    whole = surface_piece(box, positions, level.faces, LOOK, rng, 30.0, skin)
     more = subdivide(whole, 100)
     assert more.skin is not None and len(more.mesh.faces) > 90
 
@@ -431,7 +431,7 @@ def test_a_picture_has_the_colours_of_a_file_in_their_corners(tmp_path: Path) ->
     assert skin is not None
     shape = level.positions, level.faces
     named, rng = SceneObject(name="square", kind="object"), np.random.default_rng(0)
-    square = object_piece(named, *shape, LOOK, rng, 30.0, skin)
+    square = surface_piece(named, *shape, LOOK, rng, 30.0, skin)
     scene = Scene(
         **concatenate_pieces([square]),
         c2w=look_at_c2w(eye=[0, -2, 0], target=[0, 0, 0], up=[0, 0, 1])[None].astype(np.float32),
@@ -498,7 +498,7 @@ def _object(emission: list[list[float]], name: str = "screen") -> ScenePiece:
         textures=(first, second, third),
         emission=np.array(emission, np.float32),
     )
-    return object_piece(entry, QUAD, FACES, LOOK, rng, 30.0, skin)
+    return surface_piece(entry, QUAD, FACES, LOOK, rng, 30.0, skin)
 
 
 def _lamp(corners: np.ndarray, radiance: tuple[float, float, float]) -> ScenePiece:

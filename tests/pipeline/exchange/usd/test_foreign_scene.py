@@ -12,7 +12,8 @@ from pxr import Gf, Sdf, Usd, UsdGeom, UsdLux, UsdShade, UsdUtils
 
 from pipeline.exchange.textured_triangles import LoadedScene
 from pipeline.exchange.usd.read_usd import read_usd, usd_keys
-from pipeline.exchange.usd.write_usd import SUFFIXES, write_usd
+from pipeline.exchange.usd.write_usd import write_usd
+from pipeline.foreign.limits import WRITTEN_USD_SUFFIXES
 from pipeline.isolation import ChildFailed, ChildLimits, IsolatedChild
 from storage.conventions import linear_from_srgb8
 from storage.errors import TrilightError
@@ -319,7 +320,7 @@ def damaged(data: bytes, rng: np.random.Generator) -> bytes:
 
 
 @pytest.mark.parametrize("ours", [True, False], ids=["ours", "strangers"])
-@pytest.mark.parametrize("suffix", SUFFIXES)
+@pytest.mark.parametrize("suffix", WRITTEN_USD_SUFFIXES)
 def test_damage_ends_in_one_line(
     tmp_path: Path, child: IsolatedChild, suffix: str, ours: bool
 ) -> None:

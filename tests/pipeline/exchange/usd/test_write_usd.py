@@ -17,7 +17,8 @@ from pxr import Gf, Sdf, Usd, UsdGeom, UsdLux, UsdShade
 from pipeline.exchange.formats import FORMATS, drop_uncarried_maps, list_lost_members
 from pipeline.exchange.textured_triangles import LoadedScene
 from pipeline.exchange.usd.read_usd import read_usd, usd_keys
-from pipeline.exchange.usd.write_usd import SUFFIXES, write_usd, write_usd_shard
+from pipeline.exchange.usd.write_usd import write_usd, write_usd_shard
+from pipeline.foreign.limits import WRITTEN_USD_SUFFIXES
 from scene_templates.rotations import uniform_rotation
 from storage.conventions import linear_from_srgb8
 from storage.errors import TrilightError
@@ -124,7 +125,7 @@ def scenes(draw: st.DrawFn) -> Scene:
 
 
 @settings(max_examples=20, deadline=None)
-@given(scene=scenes(), suffix=st.sampled_from(SUFFIXES))
+@given(scene=scenes(), suffix=st.sampled_from(WRITTEN_USD_SUFFIXES))
 def test_any_scene_comes_back(tmp_path_factory: Any, scene: Scene, suffix: str) -> None:
     path = tmp_path_factory.mktemp("usd") / f"a{suffix}"
     write_usd(path, scene)
@@ -189,7 +190,7 @@ def test_an_emitter_is_a_light_and_glows_on_both_sides(tmp_path: Path) -> None:
     assert floor.GetAttribute("trilight:licence").Get() == "CC0-1.0"
 
 
-@pytest.mark.parametrize("suffix", SUFFIXES)
+@pytest.mark.parametrize("suffix", WRITTEN_USD_SUFFIXES)
 def test_a_shard_shows_one_scene_at_a_time(tmp_path: Path, suffix: str) -> None:
     scenes = [tiny_scene(), odd_scene(), bumpy_scene()]
     scenes += [tiny_scene(environment=sky) for sky in (smooth(), None, smooth(is_seen=True))]
@@ -369,7 +370,7 @@ def _all_textured() -> Scene:
     )
 
 
-@pytest.mark.parametrize("suffix", SUFFIXES)
+@pytest.mark.parametrize("suffix", WRITTEN_USD_SUFFIXES)
 def test_there_and_back_is_exact_and_valid(tmp_path: Path, suffix: str) -> None:
     """Bytes as bytes and floats as floats; a sun above what half floats hold, turned anyhow."""
     scenes = [odd_scene(), textured_scene(), textured_scene(environment=sky()), _all_textured()]
