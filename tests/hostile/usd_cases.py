@@ -97,10 +97,6 @@ def _png(path: Path, size: tuple[int, int] = (4, 4)) -> None:
     Image.fromarray(np.zeros((*size, 3), np.uint8)).save(path, "PNG")
 
 
-def _write(data: bytes, path: Path) -> None:
-    path.write_bytes(data)
-
-
 def _socket(path: Path) -> None:
     with socket.socket(socket.AF_UNIX) as bound:
         bound.bind(str(path))
@@ -174,22 +170,28 @@ def packages() -> Iterator[tuple[str, Make, str]]:
         "texture": root + MATERIAL.replace("FILE", "../outside/secret.png"),
     }
     for kind, content in arcs.items():
-        within = kind in ("upwards", "texture")  # what leads out of an archive is not in it
-        yield (
-            f"usdz {kind}",
-            package({"s.usda": content, "lib.usda": LIBRARY}),
-            "read" if within else "refused",
-        )
-    yield (
-        "usdz compressed",
-        package({"s.usda": root * 99}, compress_type=zipfile.ZIP_DEFLATED),
-        "refused",
-    )
+        # what leads out of an archive is not in it
+        ended = "read" if kind in ("upwards", "texture") else "refused"
+        yield f"usdz {kind}", package({"s.usda": content, "lib.usda": LIBRARY}), ended
+    packed = package({"s.usda": root * 99}, compress_type=zipfile.ZIP_DEFLATED)
+    yield "usdz compressed", packed, "refused"
     yield "usdz with a path out", package({"s.usda": root, "../x.usda": root}), "refused"
     yield "usdz with an absolute path", package({"s.usda": root, "/x.usda": root}), "refused"
     yield "usdz without a layer", package({"readme.txt": "x"}), "refused"
     yield "usdz of nothing", package({}), "refused"
     yield "usdz as it should be", package({"s.usda": root}), "any"
+
+
+def chain(length: int) -> str:
+    """Return prims of which each refers to the next one."""
+    return "".join(f'def "L{i}" (references = </L{i + 1}>) {{}}\n' for i in range(length))
+
+
+def paired_arcs(levels: int) -> str:
+    """Return two prims a level, each of which refers to both of the next level."""
+    pair = "(references = [</A{0}>, </B{0}>]) {{}}\n"
+    arcs = [pair.format(level) for level in range(1, levels + 1)]
+    return "".join(f'def "{name}{i}" {arc}' for i, arc in enumerate(arcs) for name in "AB")
 
 
 def bombs() -> Iterator[tuple[str, Make, str]]:
@@ -208,14 +210,8 @@ def bombs() -> Iterator[tuple[str, Make, str]]:
     yield "2^40 prims by ancestors", text(inner), "refused"
     instanced = doubled.replace("ARC", "instanceable = true\nreferences") + 'def Mesh "L40" {}'
     yield "2^40 instances", text(instanced), "refused"
-    chain = "".join(f'def "L{i}" (references = </L{i + 1}>) {{}}\n' for i in range(2100))
-    yield "a chain of 2100", text(chain), "refused"
-    met = "".join(
-        f'def "{n}{i}" (references = [</A{i + 1}>, </B{i + 1}>]) {{}}\n'
-        for i in range(30)
-        for n in "AB"
-    )
-    yield "2^30 sites in one prim", text(met), "refused"
+    yield "a chain of 2100", text(chain(2100)), "refused"
+    yield "2^30 sites in one prim", text(paired_arcs(30)), "refused"
     for deep in (200, 100_000):
         nested = text('def "a" {\n' * deep + "}\n" * deep)
         # USD's parser calls itself at every level, and crashes: that costs the child
@@ -262,19 +258,13 @@ def odd_files() -> Iterator[tuple[str, Make, str]]:
 
         yield f"layer is a {kind}", layer, "refused"
         yield f"texture is a {kind}", textured(make_odd), "refused"
-    for kind, data in {
-        "empty": b"",
-        "cut": b"\x89PNG\r\n\x1a\n\0\0\0\rIHDR",
-        "noise": bytes(range(256)) * 9,
-    }.items():
-        yield f"texture is {kind}", textured(partial(_write, data)), "read"
+    header = b"\x89PNG\r\n\x1a\n\0\0\0\rIHDR"
+    for kind, data in (("empty", b""), ("cut", header), ("noise", bytes(range(256)) * 9)):
+        yield f"texture is {kind}", textured(partial(Path.write_bytes, data=data)), "read"
     yield "texture of too many pixels", textured(lambda p: _png(p, (1100, 1100))), "any"
     yield "a layer that is missing", text('def "x" (references = @./no.usda@</A>) {}'), "read"
-    yield (
-        "a layer of another kind",
-        with_file("x.png", "", 'def "x" (references = @./x.png@</A>) {}'),
-        "read",
-    )
+    other = with_file("x.png", "", 'def "x" (references = @./x.png@</A>) {}')
+    yield "a layer of another kind", other, "read"
 
 
 def contradictions() -> Iterator[tuple[str, Make, str]]:

@@ -58,11 +58,8 @@ def _without(attempt: AssetAttempt, below: int) -> AssetAttempt:
     """Leave out the levels below a budget, as if they had failed the gate."""
     levels = attempt.asset.levels
     kept = tuple(level for level in levels if level.record.budget >= below)
-    gone = {
-        level.record.budget: ("silhouette_changed", "planned")
-        for level in levels
-        if level not in kept
-    }
+    why = ("silhouette_changed", "planned")
+    gone = {level.record.budget: why for level in levels if level not in kept}
     asset = dataclasses.replace(attempt.asset, levels=kept)
     return dataclasses.replace(attempt, asset=asset, missed={**attempt.missed, **gone})
 

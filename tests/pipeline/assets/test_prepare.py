@@ -28,36 +28,23 @@ from storage.records.asset import Asset, encode_asset
 from storage.records.objects import ObjectRecord
 from tests.conftest import ROOT
 from tests.for_each import for_each
-from tests.pipeline.assets.meshes_by_hand import (
-    WRITERS,
-    check_levels,
-    cleaned,
-    flip_some,
-    geometry,
-    gltf_tree,
-    knot,
-    moved,
-    prepare,
-    sphere,
-    write_glb,
-    write_obj,
-)
+from tests.pipeline.assets import meshes_by_hand as meshes
 from tests.pipeline.programs import printed_by
 
 SETTINGS = AssetSettings()
-SMALL = knot(segments=80)
+SMALL = meshes.knot(segments=80)
 
 
 @pytest.fixture(scope="module")
 def asset(tmp_path_factory: pytest.TempPathFactory) -> Asset:
     """A knot of 1920 faces: every level needs decimation."""
-    return prepare(write_obj(tmp_path_factory.mktemp("knot") / "knot.obj", SMALL))
+    return meshes.prepare(meshes.write_obj(tmp_path_factory.mktemp("knot") / "knot.obj", SMALL))
 
 
 def test_every_budget_is_kept_and_used_and_the_error_holds_on_other_points(asset: Asset) -> None:
-    check_levels(asset)
+    meshes.check_levels(asset)
     assert [level.record.budget for level in asset.levels] == list(SETTINGS.budgets)
-    source, _ = orient_outward(cleaned(SMALL))
+    source, _ = orient_outward(meshes.cleaned(SMALL))
     surface = Surface(source, np.random.default_rng(99).random((8192, 3)))
     for level in asset.levels:
         # pymeshlab collapses edges, which take two faces each: it stops at most one short.
@@ -69,7 +56,8 @@ def test_every_budget_is_kept_and_used_and_the_error_holds_on_other_points(asset
 
 
 def test_a_source_within_budget_is_kept_once_as_it_is(tmp_path: Path) -> None:
-    asset = prepare(write_obj(tmp_path / "a.obj", sphere(rings=13, columns=24)))
+    ball = meshes.sphere(rings=13, columns=24)
+    asset = meshes.prepare(meshes.write_obj(tmp_path / "a.obj", ball))
     assert [level.record.budget for level in asset.levels] == [1400, 500, 340, 240]
     first = asset.levels[0]
     assert (first.record.method, len(first.faces)) == ("source", 624)
@@ -79,29 +67,28 @@ def test_a_source_within_budget_is_kept_once_as_it_is(tmp_path: Path) -> None:
 
 def test_formats_agree_and_buffers_beside_a_gltf_are_read_and_counted(tmp_path: Path) -> None:
     """The same single precision numbers in six formats give the same asset."""
-    mesh = knot(segments=40)
-    single = TriangleMesh(
-        positions=mesh.positions.astype(np.float32).astype(np.float64), faces=mesh.faces
-    )
-    paths = [write(tmp_path / f"a{suffix}", single) for suffix, write in WRITERS.items()]
-    tree, buffer = gltf_tree(single)
-    paths.append(write_glb(tmp_path / "a.glb", tree, buffer))
+    mesh = meshes.knot(segments=40)
+    positions = mesh.positions.astype(np.float32).astype(np.float64)
+    single = TriangleMesh(positions=positions, faces=mesh.faces)
+    paths = [write(tmp_path / f"a{suffix}", single) for suffix, write in meshes.WRITERS.items()]
+    tree, buffer = meshes.gltf_tree(single)
+    paths.append(meshes.write_glb(tmp_path / "a.glb", tree, buffer))
     tree["buffers"][0]["uri"] = "data/its%20own.bin"
     (tmp_path / "data").mkdir()
     beside = tmp_path / "data" / "its own.bin"
     beside.write_bytes(buffer)
     paths.append(tmp_path / "a.gltf")
     paths[-1].write_text(json.dumps(tree))
-    assets = [prepare(path, AssetSettings(budgets=(500,))) for path in paths]
+    assets = [meshes.prepare(path, AssetSettings(budgets=(500,))) for path in paths]
     assert len({asset.geometry_sha256 for asset in assets}) == 1
-    assert len({geometry(asset) for asset in assets}) == 1
+    assert len({meshes.geometry(asset) for asset in assets}) == 1
     assert len({asset.source_sha256 for asset in assets}) == len(assets)
     beside.write_bytes(bytes([buffer[0] ^ 1]) + buffer[1:])
-    assert prepare(paths[-1]).source_sha256 != assets[-1].source_sha256
+    assert meshes.prepare(paths[-1]).source_sha256 != assets[-1].source_sha256
 
 
 def test_two_processes_write_the_same_bytes(tmp_path: Path, asset: Asset) -> None:
-    path = write_obj(tmp_path / "knot.obj", SMALL)
+    path = meshes.write_obj(tmp_path / "knot.obj", SMALL)
     code = (
         "import hashlib, sys; from storage.records.asset import encode_asset;"
         "from tests.pipeline.assets.meshes_by_hand import prepare; from pathlib import Path;"
@@ -148,12 +135,12 @@ def test_any_scale_place_and_winding_give_the_same_bytes(
     tmp_path: Path, method: str, scale: float, offset: tuple[float, float, float]
 ) -> None:
     """Offsets are in extents: text keeps 17 digits, which leaves 1e-13 of the object here."""
-    source = knot(segments=60)
-    plain = prepare(write_obj(tmp_path / "a.obj", source), TWO_LEVELS, method)
-    elsewhere = moved(moved(source, 1.0, offset), scale)
-    elsewhere = flip_some(elsewhere, 0.3, np.random.default_rng(5))
-    again = prepare(write_obj(tmp_path / "b.obj", elsewhere), TWO_LEVELS, method)
-    assert geometry(again) == geometry(plain)
+    source = meshes.knot(segments=60)
+    plain = meshes.prepare(meshes.write_obj(tmp_path / "a.obj", source), TWO_LEVELS, method)
+    elsewhere = meshes.moved(meshes.moved(source, 1.0, offset), scale)
+    elsewhere = meshes.flip_some(elsewhere, 0.3, np.random.default_rng(5))
+    again = meshes.prepare(meshes.write_obj(tmp_path / "b.obj", elsewhere), TWO_LEVELS, method)
+    assert meshes.geometry(again) == meshes.geometry(plain)
     assert again.geometry_sha256 == plain.geometry_sha256
     assert again.levels[0].record.quality == plain.levels[0].record.quality
 
@@ -165,9 +152,12 @@ def test_any_turn_keeps_budgets_and_surfaces(tmp_path: Path) -> None:
     cost collapse in an order that follows the coordinates.
     """
     turn = Rotation.from_rotvec([0.7, -1.1, 0.4]).as_matrix()
-    sources = [TriangleMesh(positions=knot().positions @ m, faces=knot().faces)
+    sources = [TriangleMesh(positions=meshes.knot().positions @ m, faces=meshes.knot().faces)
                for m in (np.eye(3), turn)]  # fmt: skip
-    made = [prepare(write_obj(tmp_path / "a.obj", source), TWO_LEVELS) for source in sources]
+    made = [
+        meshes.prepare(meshes.write_obj(tmp_path / "a.obj", source), TWO_LEVELS)
+        for source in sources
+    ]
     for levels in zip(*(asset.levels for asset in made), strict=True):
         placed = []
         # Both boxes add half a cell of rounding in every coordinate.
@@ -175,7 +165,7 @@ def test_any_turn_keeps_budgets_and_surfaces(tmp_path: Path) -> None:
         for level, source in zip(levels, sources, strict=True):
             assert level.record.budget - 1 <= len(level.faces) <= level.record.budget
             low, high = source.positions.min(axis=0), source.positions.max(axis=0)
-            placed.append(moved(level_mesh(level), (high - low).max(), (low + high) / 2))
+            placed.append(meshes.moved(level_mesh(level), (high - low).max(), (low + high) / 2))
             bound += level.record.quality.error_p99 * source.diagonal
         expected = TriangleMesh(positions=placed[0].positions @ turn, faces=placed[0].faces)
         uniform = np.random.default_rng(0).random((8192, 3))
@@ -200,12 +190,12 @@ def test_a_cross_section_of_them(records: list[ObjectRecord], step: int) -> None
     """A scan among them; of the other half tests/end_to_end/identity.py holds the bytes."""
     assert len(records) == 148
     for record in records[step // 2 :: step]:
-        check_levels(prepare(Path(record.path)))
+        meshes.check_levels(meshes.prepare(Path(record.path)))
 
 
 def test_copies_in_other_colours_share_their_geometry(records: list[ObjectRecord]) -> None:
     digests = {
-        record.uid: prepare(Path(record.path)).geometry_sha256
+        record.uid: meshes.prepare(Path(record.path)).geometry_sha256
         for record in records
         if "/banner_pattern" in record.uid or "/bottle_" in record.uid
     }
@@ -286,9 +276,8 @@ def test_faithful_works_without_pymeshlab_and_uniform_says_what_to_do(shared: Pa
     assert re.search("profile uniform.*pymeshlab is not installed.*faithful", told["refusal"])
     assert told["recipe"] == "assets-3 libigl" != RECIPE
     assert methods_of("faithful")[0] == "pymeshlab_collapse"
-    assert methods_of("faithful", preset_settings("pretrain-256").assets.decimator) == tuple(
-        told["methods"]
-    )
+    decimator = preset_settings("pretrain-256").assets.decimator
+    assert methods_of("faithful", decimator) == tuple(told["methods"])
 
 
 _REASONS = (

@@ -302,9 +302,8 @@ def test_a_quarter_turn_turns_the_result() -> None:
     turn = np.array([[0.0, -1, 0], [1, 0, 0], [0, 0, 1]])
     straight, mesh = cleaned(knot()), knot()
     turned = cleaned(TriangleMesh(positions=mesh.positions @ turn.T, faces=mesh.faces))
-    assert as_rows(turned.positions, turned.faces) == as_rows(
-        straight.positions @ turn.T, straight.faces
-    )
+    expected = as_rows(straight.positions @ turn.T, straight.faces)
+    assert as_rows(turned.positions, turned.faces) == expected
 
 
 def test_soup_is_welded_and_what_is_no_triangle_is_dropped() -> None:

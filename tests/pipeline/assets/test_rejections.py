@@ -19,46 +19,24 @@ from pipeline.foreign.mesh import TriangleMesh
 from storage.errors import Rejected
 from storage.records.asset import Asset
 from tests.for_each import for_each
+from tests.pipeline.assets import meshes_by_hand as meshes
 from tests.pipeline.assets.child_kit import Bench
-from tests.pipeline.assets.meshes_by_hand import (
-    OUTSIDE,
-    book,
-    check_levels,
-    cube,
-    fan,
-    geometry,
-    gltf_tree,
-    joined,
-    knot,
-    moved,
-    prepare,
-    reason_of,
-    secret_beside,
-    sphere,
-    with_faces,
-    with_vertex,
-    write_glb,
-    write_obj,
-    write_off,
-    write_ply,
-    write_stl,
-)
 from tests.pipeline.programs import printed_by
 
-BALL = sphere(rings=5, columns=8)
+BALL = meshes.sphere(rings=5, columns=8)
 NUMBERS: dict[str, tuple[str, TriangleMesh]] = {
-    "nan": ("nonfinite_vertices", with_vertex(BALL, [0, np.nan, 0])),
-    "infinity": ("nonfinite_vertices", with_vertex(BALL, [np.inf, 0, 0])),
-    "tiny": ("extent_range", moved(BALL, 1e-10)),
-    "huge": ("extent_range", moved(BALL, 1e10)),
-    "overflowing": ("extent_range", moved(BALL, 1e308)),
-    "point": ("extent_range", moved(BALL, 0.0, 1.0)),
-    "line": ("degenerate", moved(BALL, [1, 0, 0])),
-    "needle": ("degenerate", moved(BALL, [1, 1e-6, 1e-6])),
+    "nan": ("nonfinite_vertices", meshes.with_vertex(BALL, [0, np.nan, 0])),
+    "infinity": ("nonfinite_vertices", meshes.with_vertex(BALL, [np.inf, 0, 0])),
+    "tiny": ("extent_range", meshes.moved(BALL, 1e-10)),
+    "huge": ("extent_range", meshes.moved(BALL, 1e10)),
+    "overflowing": ("extent_range", meshes.moved(BALL, 1e308)),
+    "point": ("extent_range", meshes.moved(BALL, 0.0, 1.0)),
+    "line": ("degenerate", meshes.moved(BALL, [1, 0, 0])),
+    "needle": ("degenerate", meshes.moved(BALL, [1, 1e-6, 1e-6])),
     "outlier": (
         "far_outlier",
-        joined(
-            knot(),
+        meshes.joined(
+            meshes.knot(),
             TriangleMesh(positions=np.array([[0, 0, 0], [1e4, 0, 0], [1e4, 1e-3, 0]]),
                          faces=np.array([[0, 1, 2]])),
         ),
@@ -69,22 +47,23 @@ NUMBERS: dict[str, tuple[str, TriangleMesh]] = {
 @for_each("name", NUMBERS)
 def test_bad_numbers(tmp_path: Path, name: str) -> None:
     reason, mesh = NUMBERS[name]
-    assert reason_of(write_off(tmp_path / "a.off", mesh)) == reason
+    assert meshes.reason_of(meshes.write_off(tmp_path / "a.off", mesh)) == reason
 
 
 def test_an_offset_is_judged_by_the_precision_of_the_format(tmp_path: Path) -> None:
-    far = moved(BALL, 1.0, 1e6)
+    far = meshes.moved(BALL, 1.0, 1e6)
     for size in (1.0, 1e-3):  # what counts is how many of its sizes an object is away
-        away = moved(BALL, size, 1e6 * size)
-        assert reason_of(write_stl(tmp_path / "a.stl", away)) == "offset_precision"
-    near = prepare(write_obj(tmp_path / "a.obj", BALL))
-    exact = prepare(write_obj(tmp_path / "b.obj", far))
+        away = meshes.moved(BALL, size, 1e6 * size)
+        assert meshes.reason_of(meshes.write_stl(tmp_path / "a.stl", away)) == "offset_precision"
+    near = meshes.prepare(meshes.write_obj(tmp_path / "a.obj", BALL))
+    exact = meshes.prepare(meshes.write_obj(tmp_path / "b.obj", far))
     # Text keeps 17 digits: at 1e6 the ball is still known to 1e-10, far below the grid of 1e-6.
     assert exact.geometry_sha256 == near.geometry_sha256
     # A vertex without a face may be anything: exporters leave them behind.
     positions = np.concatenate([[[1e30, np.nan, 0]], BALL.positions])
-    dirty = write_off(tmp_path / "c.off", TriangleMesh(positions=positions, faces=BALL.faces + 1))
-    assert prepare(dirty).geometry_sha256 == near.geometry_sha256
+    loose = TriangleMesh(positions=positions, faces=BALL.faces + 1)
+    dirty = meshes.write_off(tmp_path / "c.off", loose)
+    assert meshes.prepare(dirty).geometry_sha256 == near.geometry_sha256
 
 
 ARCHIVES = {
@@ -155,33 +134,33 @@ def test_bad_files(tmp_path: Path, name: str) -> None:
     reason, suffix, data = RAW_FILES[name]
     path = tmp_path / f"a{suffix}"
     path.write_bytes(data)
-    assert reason_of(path) == reason
+    assert meshes.reason_of(path) == reason
 
 
-@for_each("write", [write_stl, write_ply, write_off, write_obj])
+@for_each("write", [meshes.write_stl, meshes.write_ply, meshes.write_off, meshes.write_obj])
 def test_limits_of_size(tmp_path: Path, write: Callable[[Path, TriangleMesh], Path]) -> None:
     path = write(tmp_path / f"a.{write.__name__[-3:]}", BALL)
-    assert reason_of(path, AssetSettings(max_source_faces=79)) == "too_many_faces"
+    assert meshes.reason_of(path, AssetSettings(max_source_faces=79)) == "too_many_faces"
     small = AssetSettings(max_source_bytes=path.stat().st_size - 1)
-    assert reason_of(path, small) == "too_large_bytes"
+    assert meshes.reason_of(path, small) == "too_large_bytes"
 
 
 def test_a_header_of_too_many_faces_is_enough(tmp_path: Path) -> None:
     """They are refused before anything is made of them: what follows may be no faces at all."""
-    path = write_ply(tmp_path / "a.ply", BALL)
+    path = meshes.write_ply(tmp_path / "a.ply", BALL)
     header, end, body = path.read_bytes().partition(b"end_header\n")
     path.write_bytes(header + end + b"\xff" * len(body))
-    assert reason_of(path, AssetSettings(max_source_faces=79)) == "too_many_faces"
-    assert reason_of(path, AssetSettings(max_source_faces=80)) != "too_many_faces"
+    assert meshes.reason_of(path, AssetSettings(max_source_faces=79)) == "too_many_faces"
+    assert meshes.reason_of(path, AssetSettings(max_source_faces=80)) != "too_many_faces"
 
 
 def test_errors_beyond_the_bound_are_stated_and_their_levels_left_out(tmp_path: Path) -> None:
-    path = write_obj(tmp_path / "a.obj", knot())
+    path = meshes.write_obj(tmp_path / "a.obj", meshes.knot())
     settings = AssetSettings(budgets=(1000,), gate=GateSettings(max_error_p99=1e-4))
     with pytest.raises(Rejected, match=r"error_over_bound: p99 distance \d+\.\d+%"):
-        prepare(path, settings)
+        meshes.prepare(path, settings)
     gate = GateSettings(max_error_p99=0.01)
-    asset = prepare(path, AssetSettings(budgets=(1400, 60), gate=gate))
+    asset = meshes.prepare(path, AssetSettings(budgets=(1400, 60), gate=gate))
     assert [level.record.budget for level in asset.levels] == [1400]
 
 
@@ -195,10 +174,10 @@ def test_what_is_no_file_and_odd_names_of_what_is_one(tmp_path: Path) -> None:
     for name, make in makes.items():
         make(tmp_path / f"{name}.obj")
         with pytest.raises(Rejected, match=f"^missing_file: .*'{name}.obj'"):
-            prepare(tmp_path / f"{name}.obj")
+            meshes.prepare(tmp_path / f"{name}.obj")
     for odd in (b"line\nbreak.obj", b"not-utf8-\xff\xfe.obj", b"'; --.obj"):
         path = Path(os.fsdecode(os.fsencode(tmp_path) + b"/" + odd))
-        assert prepare(write_obj(path, BALL)).levels, odd
+        assert meshes.prepare(meshes.write_obj(path, BALL)).levels, odd
 
 
 def _add_draco(tree: dict[str, Any], plain: bool = True) -> None:
@@ -279,9 +258,9 @@ TREES: dict[str, tuple[str, Change]] = {
 @for_each("name", TREES)
 def test_bad_trees(tmp_path: Path, name: str) -> None:
     reason, change = TREES[name]
-    tree, buffer = gltf_tree(BALL)
+    tree, buffer = meshes.gltf_tree(BALL)
     change(tree)
-    assert reason_of(write_glb(tmp_path / "a.glb", tree, buffer)) == reason
+    assert meshes.reason_of(meshes.write_glb(tmp_path / "a.glb", tree, buffer)) == reason
 
 
 HARMLESS: dict[str, Change] = {
@@ -296,24 +275,25 @@ HARMLESS: dict[str, Change] = {
 
 
 def test_what_changes_no_vertex_is_read_as_if_it_were_not_there(tmp_path: Path) -> None:
-    plain = prepare(write_glb(tmp_path / "a.glb", *gltf_tree(BALL)))
+    plain = meshes.prepare(meshes.write_glb(tmp_path / "a.glb", *meshes.gltf_tree(BALL)))
     for name, change in HARMLESS.items():
-        tree, buffer = gltf_tree(BALL)
+        tree, buffer = meshes.gltf_tree(BALL)
         change(tree)
-        changed = prepare(write_glb(tmp_path / "b.glb", tree, buffer))
-        assert geometry(changed) == geometry(plain), name
+        changed = meshes.prepare(meshes.write_glb(tmp_path / "b.glb", tree, buffer))
+        assert meshes.geometry(changed) == meshes.geometry(plain), name
 
 
 def test_instances_count_as_faces_and_buffers_do_not_lead_out(tmp_path: Path) -> None:
-    tree, buffer = gltf_tree(BALL)
+    tree, buffer = meshes.gltf_tree(BALL)
     tree["nodes"] = [{"children": list(range(1, 101))}] + [{"mesh": 0}] * 100
-    path = write_glb(tmp_path / "a.glb", tree, buffer)
-    assert reason_of(path, AssetSettings(max_source_faces=7999)) == "too_many_faces"
-    path = secret_beside(tmp_path, bytes(10_000)) / "a.gltf"
-    for uri in (*OUTSIDE, "gone.bin"):
+    path = meshes.write_glb(tmp_path / "a.glb", tree, buffer)
+    assert meshes.reason_of(path, AssetSettings(max_source_faces=7999)) == "too_many_faces"
+    path = meshes.secret_beside(tmp_path, bytes(10_000)) / "a.gltf"
+    for uri in (*meshes.OUTSIDE, "gone.bin"):
         tree["buffers"][0]["uri"] = uri
         path.write_text(json.dumps(tree))
-        assert reason_of(path) == ("missing_file" if uri == "gone.bin" else "external_uri"), uri
+        expected = "missing_file" if uri == "gone.bin" else "external_uri"
+        assert meshes.reason_of(path) == expected, uri
 
 
 WATCH = """
@@ -340,10 +320,10 @@ def test_an_obj_opens_no_material_and_a_gltf_its_buffers_and_no_picture(tmp_path
     """Files and sockets that a fresh process opens while it prepares each, by audit hook."""
     (tmp_path / "secret.mtl").write_text("newmtl a\nmap_Kd ../../../../../etc/hostname\n")
     (tmp_path / "objects").mkdir()
-    material = write_obj(tmp_path / "objects" / "a.obj", knot(segments=80))
+    material = meshes.write_obj(tmp_path / "objects" / "a.obj", meshes.knot(segments=80))
     heading = "mtllib ../secret.mtl\nmtllib /etc/hostname\nusemtl a\n"
     material.write_text(heading + material.read_text())
-    tree, buffer = gltf_tree(sphere())
+    tree, buffer = meshes.gltf_tree(meshes.sphere())
     tree["buffers"][0]["uri"] = "a.bin"
     tree["images"] = [{"uri": "../../etc/hostname"}, {"uri": "http://127.0.0.1:1/a.png"}]
     tree["textures"] = [{"source": 0}, {"source": 1}]
@@ -353,20 +333,18 @@ def test_an_obj_opens_no_material_and_a_gltf_its_buffers_and_no_picture(tmp_path
     textured = tmp_path / "a.gltf"
     textured.write_text(json.dumps(tree))
     output = printed_by(WATCH, str(material), str(textured))
-    assert [json.loads(line) for line in output.splitlines()[-2:]] == [
-        [str(material)],
-        [str(textured), str(tmp_path / "a.bin")],
-    ]
+    opened = [json.loads(line) for line in output.splitlines()[-2:]]
+    assert opened == [[str(material)], [str(textured), str(tmp_path / "a.bin")]]
 
 
 def outcome(bench: Bench, mesh: TriangleMesh, **settings: Any) -> Asset | str:
     """Return the asset of a mesh that a child prepares, or the reason for having none."""
-    write_off(bench.root / "a.off", mesh)
+    meshes.write_off(bench.root / "a.off", mesh)
     prepared, failures = bench.run("a.off", settings=AssetSettings(**settings))
     if failures:
         return failures[0].reason
     asset = bench.stored(prepared[0])
-    check_levels(asset)
+    meshes.check_levels(asset)
     return asset
 
 
@@ -384,11 +362,12 @@ MESHOPTIMIZER = {"meshoptimizer", "meshoptimizer_sloppy"}
 
 
 def test_faces_with_repeated_corners_are_dropped_and_both_sides_count_once(bench: Bench) -> None:
-    one = knot(80)
-    doubled = with_faces(one, np.concatenate([one.faces, one.faces[::3, [0, 1, 1]]]))
+    one = meshes.knot(80)
+    doubled = meshes.with_faces(one, np.concatenate([one.faces, one.faces[::3, [0, 1, 1]]]))
     dirty = asset_of(bench, doubled, budgets=(500,))
     tidy = asset_of(bench, one, budgets=(500,))
-    both = asset_of(bench, joined(one, with_faces(one, one.faces[:, ::-1])), budgets=(500,))
+    sides = meshes.joined(one, meshes.with_faces(one, one.faces[:, ::-1]))
+    both = asset_of(bench, sides, budgets=(500,))
     assert dirty.geometry_sha256 == tidy.geometry_sha256
     assert dirty.source.repaired and not tidy.source.repaired
     assert dirty.source.num_faces_read == 1920 + 640
@@ -398,11 +377,11 @@ def test_faces_with_repeated_corners_are_dropped_and_both_sides_count_once(bench
 
 def test_many_faces_on_one_edge_or_vertex_end_without_pymeshlab(bench: Bench) -> None:
     for pages in (8, 9, 400):
-        asset = asset_of(bench, book(pages), budgets=(1400, 340, 240))
+        asset = asset_of(bench, meshes.book(pages), budgets=(1400, 340, 240))
         assert asset.levels[0].record.method == "source"
         assert asset.source.nonmanifold_edges == 1
     assert used_methods(asset) <= {"source", *MESHOPTIMIZER}
-    assert used_methods(asset_of(bench, fan(600), budgets=(500,))) <= MESHOPTIMIZER
+    assert used_methods(asset_of(bench, meshes.fan(600), budgets=(500,))) <= MESHOPTIMIZER
 
 
 @for_each("profile", ["faithful", "uniform"])
@@ -426,13 +405,13 @@ def test_a_random_soup_ends_with_a_reason_and_two_triangles_are_an_object(
 @pytest.mark.parametrize("profile", ["faithful", "uniform"])
 def test_a_polygon_of_fifty_thousand_corners_ends(bench: Bench, profile: str) -> None:
     """Its hub has a valence of 50 000; the child of a run that used its seconds is killed."""
-    found = outcome(bench, fan(50_000), budgets=(1400,), profile=profile)
+    found = outcome(bench, meshes.fan(50_000), budgets=(1400,), profile=profile)
     assert not str(found).startswith(("timeout", "crashed", "killed", "out_of_memory"))
 
 
 @pytest.mark.parametrize("count", [50, pytest.param(5000, marks=pytest.mark.slow("hostile"))])
 def test_many_boxes_do_not_fit_into_240_triangles(bench: Bench, count: int) -> None:
     places = np.random.default_rng(0).random((count, 3)) * 50
-    boxes = joined(*(moved(cube(), 1.0, place) for place in places))
+    boxes = meshes.joined(*(meshes.moved(meshes.cube(), 1.0, place) for place in places))
     expected = {"area_changed", "error_over_bound", "parts_lost", "budget_missed"}
     assert outcome(bench, boxes, budgets=(240,)) in expected

@@ -22,43 +22,36 @@ from pipeline.isolation import is_transient
 from storage.errors import EnvironmentFailure, Rejected, TrilightError
 from tests.conftest import ROOT
 from tests.for_each import for_each
-from tests.pipeline.assets.child_kit import (
-    CALLS,
-    FIRST,
-    LIMITS,
-    SECOND,
-    SETTINGS,
-    THIRD,
-    Bench,
-    methods,
-)
+from tests.pipeline.assets import child_kit as kit
 from tests.pipeline.assets.meshes_by_hand import book, knot, sphere, write_obj
 
-ALL_FIRST = [(1000, FIRST), (500, FIRST), (340, FIRST)]
+ALL_FIRST = [(1000, kit.FIRST), (500, kit.FIRST), (340, kit.FIRST)]
 TIGHT = AssetSettings(budgets=(240,), gate=GateSettings(max_error_p99=1e-4))
 
 
 @pytest.fixture(autouse=True)
-def source(bench: Bench) -> Path:
+def source(bench: kit.Bench) -> Path:
     """1440 faces: every level needs a method."""
     return write_obj(bench.root / "knot.obj", knot(segments=60))
 
 
-def test_the_next_method_starts_in_a_new_child_where_one_crashed(bench: Bench) -> None:
+def test_the_next_method_starts_in_a_new_child_where_one_crashed(bench: kit.Bench) -> None:
     bench.set(pymeshlab_collapse="crash")
-    assert methods(bench.made()) == [(1000, SECOND), (500, SECOND), (340, SECOND)]
-    assert bench.called == [FIRST, FIRST, SECOND]
+    assert kit.methods(bench.made()) == [(1000, kit.SECOND), (500, kit.SECOND), (340, kit.SECOND)]
+    assert bench.called == [kit.FIRST, kit.FIRST, kit.SECOND]
     assert bench.num_children == 3
     assert [call["budgets"] for call in bench.calls] == 3 * [[1000, 500, 340]]
 
 
-def test_the_next_method_makes_only_what_the_first_one_missed_without_epsilon(bench: Bench) -> None:
-    bench.set(**{f"{FIRST} misses": "900"})
-    assert methods(bench.made()) == [(1000, FIRST), (500, SECOND), (340, SECOND)]
+def test_the_next_method_makes_only_what_the_first_one_missed_without_epsilon(
+    bench: kit.Bench,
+) -> None:
+    bench.set(**{f"{kit.FIRST} misses": "900"})
+    assert kit.methods(bench.made()) == [(1000, kit.FIRST), (500, kit.SECOND), (340, kit.SECOND)]
     first, second = bench.calls
     assert second["budgets"] == [500, 340]
     assert first["pid"] != second["pid"]
-    (bench.root / CALLS).unlink()
+    (bench.root / kit.CALLS).unlink()
     # A second method that only fills in coarser levels must not search for the smallest.
     bench.made(settings=AssetSettings(budgets=(1000, 240, 200), epsilon=0.005))
     finest, *others = (call["epsilon"] for call in bench.calls)
@@ -68,7 +61,7 @@ def test_the_next_method_makes_only_what_the_first_one_missed_without_epsilon(be
 
 def test_a_level_that_wastes_its_budget_is_left_out(source: Path) -> None:
     """Clusters at 1000 may come out coarser than the collapse at 500, which then serves both."""
-    made = prepare_asset(source, SETTINGS, FIRST).asset.levels
+    made = prepare_asset(source, kit.SETTINGS, kit.FIRST).asset.levels
     assert [len(level.faces) for level in made] == [1000, 500, 340]
     wasteful = dataclasses.replace(made[0], faces=made[0].faces[:450])
     for levels in ([wasteful, *made[1:]], [*made[1:], wasteful]):
@@ -77,28 +70,29 @@ def test_a_level_that_wastes_its_budget_is_left_out(source: Path) -> None:
 
 
 def test_an_object_that_no_method_serves_is_refused_as_the_first_one_failed(
-    bench: Bench, source: Path
+    bench: kit.Bench, source: Path
 ) -> None:
-    messages = [prepare_asset(source, TIGHT, name).missed[240][1] for name in (FIRST, SECOND)]
+    attempts = [prepare_asset(source, TIGHT, name) for name in (kit.FIRST, kit.SECOND)]
+    messages = [attempt.missed[240][1] for attempt in attempts]
     assert messages[0] != messages[1]
     prepared, (failure,) = bench.run("knot.obj", settings=TIGHT)
     assert not prepared
     assert (failure.stage, failure.item) == ("assets", "knot.obj")
     assert (failure.reason, failure.message) == ("error_over_bound", messages[0])
-    assert bench.called == [FIRST, SECOND, THIRD]
+    assert bench.called == [kit.FIRST, kit.SECOND, kit.THIRD]
     assert bench.num_children == 3
 
 
-def test_a_method_that_stood_in_for_another_is_not_tried_twice(bench: Bench) -> None:
+def test_a_method_that_stood_in_for_another_is_not_tried_twice(bench: kit.Bench) -> None:
     """Pymeshlab would not end on this one, so meshoptimizer takes its turn."""
     write_obj(bench.root / "book.obj", book(400))
     _, (failure,) = bench.run("book.obj", settings=TIGHT)
     assert failure.reason == "error_over_bound"
-    assert bench.called == [FIRST, THIRD]
+    assert bench.called == [kit.FIRST, kit.THIRD]
 
 
 def test_each_content_is_prepared_once_for_each_settings_and_reported_for_every_name(
-    bench: Bench, source: Path
+    bench: kit.Bench, source: Path
 ) -> None:
     (bench.root / "copy.obj").write_bytes(source.read_bytes())
     (bench.root / "junk.obj").write_text("v 0 0 0\nv 1 0 0\nv 0 1 0\nf 1 2 7\n")
@@ -117,7 +111,7 @@ def test_each_content_is_prepared_once_for_each_settings_and_reported_for_every_
     assert len(bench.calls) == calls + 1
 
 
-def test_mistakes_of_the_user_stop_the_run(bench: Bench) -> None:
+def test_mistakes_of_the_user_stop_the_run(bench: kit.Bench) -> None:
     bench.set(pymeshlab_collapse="mistake")
     with pytest.raises(TrilightError, match="planned mistake"):
         bench.run("knot.obj")
@@ -127,7 +121,7 @@ def test_mistakes_of_the_user_stop_the_run(bench: Bench) -> None:
     assert len(bench.calls) == 1
 
 
-def test_a_file_that_the_system_will_not_open_is_refused_today_only(bench: Bench) -> None:
+def test_a_file_that_the_system_will_not_open_is_refused_today_only(bench: kit.Bench) -> None:
     loop = bench.root / "loop.obj"
     loop.symlink_to(loop)
     _, (failure,) = bench.run("loop.obj")
@@ -137,16 +131,16 @@ def test_a_file_that_the_system_will_not_open_is_refused_today_only(bench: Bench
     assert bench.run("loop.obj")[1] == []
 
 
-Hurried = Callable[..., Bench]
+Hurried = Callable[..., kit.Bench]
 
 
 @pytest.fixture
-def hurried(bench: Bench) -> Iterator[Hurried]:
+def hurried(bench: kit.Bench) -> Iterator[Hurried]:
     """The same bench with other limits."""
     with contextlib.ExitStack() as stack:
 
-        def make(**limits: Any) -> Bench:
-            other = Bench(bench.root, limits=dataclasses.replace(LIMITS, **limits))
+        def make(**limits: Any) -> kit.Bench:
+            other = kit.Bench(bench.root, limits=dataclasses.replace(kit.LIMITS, **limits))
             stack.callback(other.child.close)
             return other
 
@@ -160,15 +154,15 @@ def hurried(bench: Bench) -> Iterator[Hurried]:
     ids=["deaths", "sleep"],
 )  # fmt: skip
 def test_a_child_that_dies_once_changes_no_byte(
-    bench: Bench, hurried: Hurried, actions: tuple[str, ...]
+    bench: kit.Bench, hurried: Hurried, actions: tuple[str, ...]
 ) -> None:
     """A mesh of 1440 faces takes less than a second, and far below 15 on a busy machine."""
     bench = hurried(wall_s=15.0) if "sleep" in actions else bench
     (undisturbed,), _ = bench.run("knot.obj", store="undisturbed")
     for times, action in enumerate(actions, start=1):
-        bench.set(**{FIRST: f"{action} once"})
+        bench.set(**{kit.FIRST: f"{action} once"})
         (disturbed,), _ = bench.run("knot.obj", store=action)
-        assert bench.called == [FIRST] * (1 + 2 * times), action
+        assert bench.called == [kit.FIRST] * (1 + 2 * times), action
         assert disturbed.asset_sha256 == undisturbed.asset_sha256, action
 
 
@@ -183,26 +177,26 @@ def test_a_child_that_dies_once_changes_no_byte(
     ],
 )
 def test_what_the_environment_did_is_not_kept_and_leads_to_no_other_method(
-    bench: Bench, hurried: Hurried, action: str, reason: str, tries: int
+    bench: kit.Bench, hurried: Hurried, action: str, reason: str, tries: int
 ) -> None:
-    bench.set(**{FIRST: action})
+    bench.set(**{kit.FIRST: action})
     hasty = hurried(wall_s=2.0) if action == "sleep" else bench
     prepared, (failure,) = hasty.run("knot.obj")
     assert (prepared, failure.reason) == ([], reason)
     assert is_transient(failure.reason)
-    assert bench.called == [FIRST] * tries
+    assert bench.called == [kit.FIRST] * tries
     assert bench.num_children == tries
     assert not [path for path in (bench.root.parent / "store").rglob("*.*") if path.is_file()]
     if action == "die":
         bench.set()
-        assert methods(bench.made()) == ALL_FIRST
+        assert kit.methods(bench.made()) == ALL_FIRST
 
 
-def test_no_level_is_lost_because_its_child_died(bench: Bench) -> None:
-    misses = {f"{FIRST} misses": "900"}
+def test_no_level_is_lost_because_its_child_died(bench: kit.Bench) -> None:
+    misses = {f"{kit.FIRST} misses": "900"}
     bench.set(**misses)
     (undisturbed,), _ = bench.run("knot.obj", store="undisturbed")
-    bench.set(**misses, **{SECOND: "die"})
+    bench.set(**misses, **{kit.SECOND: "die"})
     prepared, (failure,) = bench.run("knot.obj")
     assert (prepared, failure.reason) == ([], "killed")
     bench.set(**misses)
@@ -215,7 +209,7 @@ def test_no_level_is_lost_because_its_child_died(bench: Bench) -> None:
     [("crash", "crashed_signal_11", 2), ("burn", "timeout_cpu", 1), ("refuse", "degenerate", 1)],
 )
 def test_a_verdict_is_kept_as_plain_text(
-    bench: Bench,
+    bench: kit.Bench,
     hurried: Hurried,
     action: str,
     reason: str,
@@ -223,8 +217,8 @@ def test_a_verdict_is_kept_as_plain_text(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     if action != "refuse":  # an unusable object is refused whatever other methods there are
-        monkeypatch.setattr(stage, "methods_of", lambda *profile, **watertight: (FIRST,))
-    bench.set(**{FIRST: action})
+        monkeypatch.setattr(stage, "methods_of", lambda *profile, **watertight: (kit.FIRST,))
+    bench.set(**{kit.FIRST: action})
     prepared, (failure,) = hurried(cpu_s=1).run("knot.obj")
     assert (prepared, failure.reason) == ([], reason)
     assert not is_transient(failure.reason)
@@ -237,16 +231,16 @@ def test_a_verdict_is_kept_as_plain_text(
 
 @pytest.mark.parametrize("gone", [True, False])
 def test_a_source_that_changes_meanwhile_is_judged_by_the_next_run(
-    bench: Bench, source: Path, gone: bool
+    bench: kit.Bench, source: Path, gone: bool
 ) -> None:
     """What a child found in another file is neither an asset nor a refusal of this one."""
     data = source.read_bytes()
-    bench.set(**{FIRST: "vanish" if gone else "grow"})
+    bench.set(**{kit.FIRST: "vanish" if gone else "grow"})
     _, (failure,) = bench.run("knot.obj")
     assert failure.reason == ("missing_file" if gone else "unreadable_file")
     bench.set()
     source.write_bytes(data)
-    assert methods(bench.made()) == ALL_FIRST
+    assert kit.methods(bench.made()) == ALL_FIRST
 
 
 @for_each("error, kept", [(TrilightError("nan"), Rejected), (EnvironmentFailure("full"), None)])
@@ -262,7 +256,7 @@ def test_a_law_that_an_object_breaks_costs_it_alone(
 
 
 @pytest.fixture
-def sources(bench: Bench, source: Path) -> Bench:
+def sources(bench: kit.Bench, source: Path) -> kit.Bench:
     """Four names for three objects, and a plan that says to work."""
     (bench.root / "copy.obj").write_bytes(source.read_bytes())
     write_obj(bench.root / "other.obj", knot(segments=64))
@@ -270,7 +264,7 @@ def sources(bench: Bench, source: Path) -> Bench:
     return bench
 
 
-def start(bench: Bench) -> subprocess.Popen[str]:
+def start(bench: kit.Bench) -> subprocess.Popen[str]:
     """Begin to prepare all sources of a bench in a process of its own."""
     return subprocess.Popen(
         [sys.executable, "-m", "tests.pipeline.assets.child_kit", str(bench.root)],
@@ -289,7 +283,7 @@ def finish(process: subprocess.Popen[str]) -> dict[str, str]:
     return digests
 
 
-def test_two_processes_make_each_object_once(sources: Bench) -> None:
+def test_two_processes_make_each_object_once(sources: kit.Bench) -> None:
     first, other = [finish(process) for process in [start(sources) for _ in range(2)]]
     assert other == first
     assert first["copy.obj"] == first["knot.obj"]
@@ -297,7 +291,7 @@ def test_two_processes_make_each_object_once(sources: Bench) -> None:
 
 
 @pytest.mark.slow("kills")
-def test_after_a_kill_the_next_run_makes_only_what_is_missing(sources: Bench) -> None:
+def test_after_a_kill_the_next_run_makes_only_what_is_missing(sources: kit.Bench) -> None:
     """The last object never ends in the first run; its child dies with its owner."""
     late = sources.root / "other.obj"
     held = late.read_bytes()
@@ -317,7 +311,7 @@ def test_after_a_kill_the_next_run_makes_only_what_is_missing(sources: Bench) ->
 
 
 @pytest.mark.slow("kills")
-def test_half_written_files_are_never_read(sources: Bench) -> None:
+def test_half_written_files_are_never_read(sources: kit.Bench) -> None:
     """A writer that was killed leaves a file with another ending beside the place of its own."""
     whole = finish(start(sources))
     for path in (sources.root.parent / "store").rglob("*.safetensors"):

@@ -109,9 +109,8 @@ def row_at(scene: Scene, x: float, y: float) -> np.ndarray:
         if one >= -1e-9 and two >= -1e-9 and one + two <= 1 + 1e-9:
             weights = np.array([1 - one - two, one, two])
             uv = np.zeros(2) if scene.uv is None else weights @ scene.uv.reshape(-1, 3, 2)[triangle]
-            return np.asarray(
-                textured_rows(scene, scene.material_index[[triangle]], uv[None].astype(np.float64))
-            )[0]
+            row = scene.material_index[[triangle]]
+            return np.asarray(textured_rows(scene, row, uv[None].astype(np.float64)))[0]
     raise AssertionError((x, y))
 
 

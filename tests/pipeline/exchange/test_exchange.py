@@ -24,13 +24,7 @@ from storage.records.scene import Scene, SceneObject
 from storage.records.scene_file import encode_scene
 from tests.columns_kit import COAT, TINT, WAVES, declared
 from tests.for_each import for_each, with_folders
-from tests.pipeline.exchange.exchange_kit import (
-    assert_h5_keeps_light,
-    assert_json_keeps_light,
-    assert_usd_keeps_all,
-    h5_and_back,
-    json_and_back,
-)
+from tests.pipeline.exchange import exchange_kit as kit
 from tests.pipeline.scenes.example_scenes import EXAMPLES, example_scene
 from tests.pipeline.scenes.small_pool import first_scene
 from tests.scenes_by_hand import FLOOR, LIGHT, tiny_scene
@@ -94,14 +88,14 @@ def test_published_scenes_come_back_and_are_written_as_the_published_converter_r
     shared: Path, tmp_path: Path, name: str
 ) -> None:
     scene = example_scene(shared, name)
-    assert_usd_keeps_all(scene, tmp_path, ".usdc")
+    kit.assert_usd_keeps_all(scene, tmp_path, ".usdc")
     if scene.num_triangles < 1000:  # textures of 53 kB a triangle are slow to pack
-        assert_h5_keeps_light(h5_and_back(scene, tmp_path), scene)
-    back, lost = json_and_back(scene, tmp_path)
-    assert_json_keeps_light(back, scene)
+        kit.assert_h5_keeps_light(kit.h5_and_back(scene, tmp_path), scene)
+    back, lost = kit.json_and_back(scene, tmp_path)
+    kit.assert_json_keeps_light(back, scene)
     if scene.num_triangles <= 6000:
-        again, lost_again = json_and_back(back, tmp_path)
-        assert_json_keeps_light(again, back)
+        again, lost_again = kit.json_and_back(back, tmp_path)
+        kit.assert_json_keeps_light(again, back)
         assert len(lost_again) <= len(lost)
     assert_usable(written(scene, tmp_path), scene, tmp_path)
     if name == "init-template":
@@ -128,27 +122,16 @@ def test_sampled_scenes_come_back(
             left.remove(template)
             scene = first_scene(settings, pool, seed=1, scene_index=index)
             (folder := tmp_path / template).mkdir()
-            assert_usd_keeps_all(scene, folder, ".usdc")
-            assert_json_keeps_light(json_and_back(scene, folder)[0], scene)
+            kit.assert_usd_keeps_all(scene, folder, ".usdc")
+            kit.assert_json_keeps_light(kit.json_and_back(scene, folder)[0], scene)
         index += 1
 
 
-NAMES = (
-    ("light/../x", "light\\..\\x"),
-    ("A", "a"),
-    (".", ".."),
-    ("ü" * 200, "ü" * 100),
-    ("", "\0"),
-)
-
-
 def test_any_names_become_names_of_files(tmp_path: Path) -> None:
-    for folder, (shell, emitter) in with_folders(tmp_path, NAMES):
-        objects = (
-            SceneObject(name=shell, kind="shell"),
-            SceneObject(name=emitter, kind="emitter"),
-        )
-        scene = dataclasses.replace(tiny_scene(), objects=objects)
+    names = [("light/../x", "light\\..\\x"), ("A", "a"), (".", ".."), ("", "\0")]
+    for folder, (shell, emitter) in with_folders(tmp_path, [*names, ("ü" * 200, "ü" * 100)]):
+        light = SceneObject(name=emitter, kind="emitter")
+        scene = tiny_scene(objects=(SceneObject(name=shell, kind="shell"), light))
         assert_usable(written(scene, folder), scene, folder)
 
 
@@ -256,23 +239,14 @@ ATTRIBUTED = (
 )
 
 
-@pytest.mark.parametrize(
-    ("form", "lost"),
-    [
-        ("json", "objects.uid, objects.licence, objects.attribution, provenance"),
-        (
-            "h5",
-            "object_index, objects.name, objects.kind, objects.uid, objects.licence, "
-            "objects.attribution, provenance",
-        ),
-    ],
-)
-def test_what_the_published_forms_lose_is_named(tmp_path: Path, form: str, lost: str) -> None:
-    scene = dataclasses.replace(tiny_scene(), objects=ATTRIBUTED)
-    assert write_scene(tmp_path / f"a.{form}", scene) == (lost,)
-    scene.materials[LIGHT, 0] = 0.5
-    said = "albedos of 1 emitting materials" in write_scene(tmp_path / f"b.{form}", scene)
-    assert said == (form == "h5")
+def test_what_the_published_forms_lose_is_named(tmp_path: Path) -> None:
+    rights = "objects.uid, objects.licence, objects.attribution, provenance"
+    for form, more in (("json", ""), ("h5", "object_index, objects.name, objects.kind, ")):
+        scene = dataclasses.replace(tiny_scene(), objects=ATTRIBUTED)
+        assert write_scene(tmp_path / f"a.{form}", scene) == (more + rights,)
+        scene.materials[LIGHT, 0] = 0.5
+        said = "albedos of 1 emitting materials" in write_scene(tmp_path / f"b.{form}", scene)
+        assert said == (form == "h5")
 
 
 def test_textures_and_a_sky_are_said_to_be_lost_where_they_are(tmp_path: Path) -> None:

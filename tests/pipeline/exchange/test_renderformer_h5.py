@@ -5,6 +5,7 @@ import resource
 import shutil
 import subprocess
 import sys
+import zlib
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -308,11 +309,8 @@ def test_its_environment_has_our_axes(tmp_path: Path, processed: bool) -> None:
 
 
 def test_a_turned_environment_is_said_and_another_shape_refused(tmp_path: Path) -> None:
-    more: dict[str, Any] = {
-        "env_map": six_poles().radiance_rgb,
-        "env_map_rotation": np.array([0, 0, 90], "f4"),
-    }
-    write_v2(tmp_path / "a.h5", **more)
+    turn = np.array([0, 0, 90], "f4")
+    write_v2(tmp_path / "a.h5", env_map=six_poles().radiance_rgb, env_map_rotation=turn)
     assert any("rotation of the" in text for text in read_renderformer_h5(tmp_path / "a.h5").notes)
     write_v2(tmp_path / "a.h5", env_map=np.ones((4, 8), np.float32))
     with pytest.raises(TrilightError, match=r"env_map: has shape \[4, 8\]; expected"):
@@ -375,8 +373,6 @@ def _not_finite(wrong: float) -> Callable[[Any], None]:
 
 
 def _bomb(file: Any) -> None:
-    import zlib
-
     _raw_chunk(zlib.compress(bytes(200 << 20)))(file)
 
 

@@ -16,11 +16,7 @@ from pipeline.generation import render_workers
 from pipeline.generation.dataset_writer import begin_or_resume_dataset
 from pipeline.generation.generate_options import GenerateOptions
 from pipeline.generation.generation_run import resolve_inputs
-from pipeline.generation.scene_origins import (
-    accept_scene_files,
-    build_once,
-    settings_for_files,
-)
+from pipeline.generation.scene_origins import accept_scene_files, build_once, settings_for_files
 from pipeline.isolation import ChildPool
 from pipeline.presets.registry import preset_settings
 from pipeline.presets.settings import DatasetSettings
@@ -73,20 +69,16 @@ def _build(folder: Path, name: str = "a.json") -> Scene:
     return build_json(folder, name, licence="MIT", num_views=1, scene_index=3, seed=9)
 
 
-def _digests(folder: Path, name: str) -> dict[str, str]:
-    assets = preset_settings("smoke").assets
-    return dict(build_once(folder.resolve(), name, assets, 1, "scale")[0])
-
-
 def _settings(folder: Path, views: int | None = None) -> DatasetSettings:
     return settings_for_files(preset_settings("smoke"), find_scene_files(str(folder)), views)
 
 
 def _files(folder: Path, *names: str, **unusable: str) -> SceneFiles:
-    sha256 = {uid: digest for name in names for uid, digest in _digests(folder, name).items()}
-    return SceneFiles(
-        root=folder.resolve(), names=names, sha256=sha256, unusable=unusable, licence="MIT"
-    )
+    root, assets = folder.resolve(), preset_settings("smoke").assets
+    sha256: dict[str, str] = {}
+    for name in names:
+        sha256 |= build_once(root, name, assets, 1, "scale")[0]
+    return SceneFiles(root=root, names=names, sha256=sha256, unusable=unusable, licence="MIT")
 
 
 def _scene(files: SceneFiles, scene_index: int, settings: DatasetSettings) -> Scene:
@@ -102,10 +94,9 @@ def _accept(folder: Path, out: Path, licence: str | None = None) -> object:
 
 def test_a_scene_says_where_it_comes_from(folder: Path) -> None:
     scene = _build(folder)
-    assert [(entry.name, entry.kind, entry.uid) for entry in scene.objects] == [
-        ("green", "object", "meshes/green.obj"),
-        ("light_0", "emitter", ""),
-    ]
+    green, light = scene.objects
+    assert (green.name, green.kind, green.uid) == ("green", "object", "meshes/green.obj")
+    assert (light.name, light.kind, light.uid) == ("light_0", "emitter", "")
     assert scene.provenance["template"] == "renderformer-json"
     assert (scene.provenance["scene_index"], scene.provenance["seed"]) == (3, 9)
     assert scene.provenance["scene_file"]["name"] == "a.json"
@@ -185,12 +176,8 @@ def test_files_are_frozen_by_digest(folder: Path, tmp_path: Path) -> None:
     out = tmp_path / "set"
     _accept(folder, out)
     locked = read_objects_lock(DatasetFolder(out).objects_lock)
-    assert [entry.uid for entry in locked] == [
-        "a.json",
-        "b.json",
-        "meshes/green.obj",
-        "meshes/tri.obj",
-    ]
+    files = ["a.json", "b.json", "meshes/green.obj", "meshes/tri.obj"]
+    assert [entry.uid for entry in locked] == files
     assert {entry.split for entry in locked} == {"test"}
     assert read_manifest(DatasetFolder(out).manifest).num_scenes == 2
     _accept(folder, out)  # the same again

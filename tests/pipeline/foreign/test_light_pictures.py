@@ -168,16 +168,10 @@ def test_one_picture_in_two_color_spaces_is_one_picture(attributes: Mapping[str,
 
 
 def test_what_is_not_read_is_named_and_an_environment_fills_its_data() -> None:
-    data = of_library(
-        {"R": noise(2, 4), "G": noise(2, 4), "B": noise(2, 4), "Z": noise(2, 4)},
-        whiteLuminance=100.0,
-        pixelAspectRatio=2.0,
-        owner="Ada",
-    )
-    assert read(data).unread == (
-        "channels 'Z'",
-        "header attributes 'pixelAspectRatio', 'whiteLuminance'",
-    )
+    channels = {name: noise(2, 4) for name in "RGBZ"}
+    data = of_library(channels, whiteLuminance=100.0, pixelAspectRatio=2.0, owner="Ada")
+    header = "header attributes 'pixelAspectRatio', 'whiteLuminance'"
+    assert read(data).unread == ("channels 'Z'", header)
     planes = {name: (noise(2, 4), 1) for name in "RGB"}
     sky = _attribute("envmap", "envmap", b"\0")
     assert read(raw_exr(planes, (1, 1, 4, 2), (0, 0, 9, 9), sky)).values.shape == (2, 4, 3)

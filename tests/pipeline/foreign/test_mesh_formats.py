@@ -37,12 +37,6 @@ from storage.records.material import ROUGHNESS
 from tests.for_each import case, for_each
 from tests.pipeline.assets.meshes_by_hand import write_glb
 from tests.pipeline.assets.source_materials import textured_kit as kit
-from tests.pipeline.assets.source_materials.textured_kit import (
-    SHADER,
-    TEXTURE,
-    set_inputs,
-    textured_usd,
-)
 from tests.pipeline.exchange.exchange_kit import build_json
 from tests.pipeline.exchange.test_renderformer_json import MATERIAL, TRANSFORM, changed
 from tests.pipeline.foreign.dialects import WRITERS, Polygons, Rng, draw_polygons
@@ -265,9 +259,8 @@ def test_nothing_is_read_outside_of_the_folder_that_was_given(tmp_path: Path) ->
         (tmp_path / "x.png").write_bytes(PICTURE)
         (path.parent / "link").unlink(missing_ok=True)
         (path.parent / "link").symlink_to(tmp_path)
-        (reason,) = read_source(
-            path, ReadLimits(with_materials=True), root
-        ).materials.refused.values()
+        read = read_source(path, ReadLimits(with_materials=True), root)
+        (reason,) = read.materials.refused.values()
         assert reason.reason == "texture_outside"
 
 
@@ -428,6 +421,12 @@ def tinted(stage: Usd.Stage) -> None:
     mesh.CreateDisplayColorPrimvar("uniform").Set([(0.9, 0.1, 0.3), (0.2, 0.4, 0.8)])
 
 
+SPECULAR = {"specularFactor": 0.5, "specularColorFactor": [1, 0.5, 0]}
+GLOSSY = {
+    "diffuseTexture": {"index": 0},
+    "glossinessFactor": 0.5,
+    "specularFactor": [0.2, 0.3, 0.1],
+}
 SCALED = {"scale": Gf.Vec4f(1, 0.5, 0.75, 1), "bias": Gf.Vec4f(0, 0.25, -0.125, 0)}
 
 
@@ -468,23 +467,8 @@ def test_usd(
         {"pbrMetallicRoughness": {"metallicRoughnessTexture": {"index": 0}}},
         {"extensions": {"KHR_materials_unlit": {}}},
         {"extensions": {"KHR_materials_ior": {"ior": 2.0}}},
-        {
-            "extensions": {
-                "KHR_materials_specular": {
-                    "specularFactor": 0.5,
-                    "specularColorFactor": [1, 0.5, 0],
-                }
-            }
-        },
-        {
-            "extensions": {
-                "KHR_materials_pbrSpecularGlossiness": {
-                    "diffuseTexture": {"index": 0},
-                    "glossinessFactor": 0.5,
-                    "specularFactor": [0.2, 0.3, 0.1],
-                }
-            }
-        },
+        {"extensions": {"KHR_materials_specular": SPECULAR}},
+        {"extensions": {"KHR_materials_pbrSpecularGlossiness": GLOSSY}},
     ],
 )
 @for_each("sampler", [{}, {"wrapS": 33071}, {"wrapS": 33648, "wrapT": 33071}])
@@ -534,10 +518,10 @@ def obj(folder: Path, where: str, name: str, value: Any) -> str:
 
 def usd(folder: Path, where: str, name: str, value: Any) -> str:
     def change(stage: Any) -> None:
-        set_inputs(stage, where, {name: tuple(value) if isinstance(value, list) else value})
+        kit.set_inputs(stage, where, {name: tuple(value) if isinstance(value, list) else value})
 
     path, connect = folder / "u" / "a.usda", {"emissiveColor": "rgb"}
-    return look_at_parts(textured_usd(path, SMALL_PICTURE, change, connect=connect))
+    return look_at_parts(kit.textured_usd(path, SMALL_PICTURE, change, connect=connect))
 
 
 def scene(folder: Path, where: str, name: str, value: Any) -> str:
@@ -561,8 +545,12 @@ FIELDS = [
     *((gltf, "uv", "rotation", 1), (gltf, "uv", "scale", 2), (gltf, "uv", "offset", 2)),
     *((obj, "", name, 1) for name in ("Kd", "Ks", "Ns", "Ke", "Pm", "Pr", "illum")),
     *((obj, "option", name, 1) for name in ("-s", "-o")),
-    *((usd, SHADER, name, 1) for name in ("roughness", "metallic", "ior")),
-    *((usd, SHADER, "diffuseColor", 3), (usd, TEXTURE, "scale", 4), (usd, TEXTURE, "bias", 4)),
+    *((usd, kit.SHADER, name, 1) for name in ("roughness", "metallic", "ior")),
+    *(
+        (usd, kit.SHADER, "diffuseColor", 3),
+        (usd, kit.TEXTURE, "scale", 4),
+        (usd, kit.TEXTURE, "bias", 4),
+    ),
     *((scene, "material", "roughness", 1), (scene, "material", "emissive", 3)),
     *((scene, "transform", "scale", 3), (radiance, "", "EXPOSURE", 1)),
 ]

@@ -107,10 +107,8 @@ def test_other_objects_and_other_settings_are_refused(bucket: Any, machines: Mac
             second.lock_objects([dataclasses.replace(LOCKED, uid="b")])
         second.lock_objects([LOCKED])
     changed = {"renders.resolution": 32}
-    with (
-        pytest.raises(TrilightError, match=rf"{OUT}: this dataset was begun with another setting"),
-        machines.maker("c", **changed),
-    ):
+    refusal = rf"{OUT}: this dataset was begun with another setting"
+    with pytest.raises(TrilightError, match=refusal), machines.maker("c", **changed):
         pass
 
 
@@ -204,10 +202,8 @@ def test_access_that_is_lost_in_the_middle_loses_nothing(
 
 def test_what_is_lacking_is_said_at_once(bucket: Any, machines: Machines, moto: int) -> None:
     bucket.rm("shards", recursive=True)
-    with (
-        pytest.raises(TrilightError, match=rf"out '{OUT}': cannot be written .*404.*that exists"),
-        machines.maker("a"),
-    ):
+    absent = rf"out '{OUT}': cannot be written .*404.*that exists"
+    with pytest.raises(TrilightError, match=absent), machines.maker("a"):
         pass
     bucket.mkdir("shards")
     for name, message in (("x.tar", "there are shards but no manifest"), ("README.md", "replace")):
@@ -218,8 +214,8 @@ def test_what_is_lacking_is_said_at_once(bucket: Any, machines: Machines, moto: 
     assert names(bucket) == set()
 
 
-def _failures(bucket: Any, name: str) -> list[Failure]:
-    return decode_failures(bucket.cat_file(f"shards/set/{name}"))
+def _failures(bucket: Any) -> list[Failure]:
+    return decode_failures(bucket.cat_file("shards/set/failures.jsonl"))
 
 
 def test_who_freezes_late_takes_nothing_back(bucket: Any, machines: Machines) -> None:
@@ -256,7 +252,7 @@ def test_the_first_writer_of_a_shard_wins_with_its_rejections(
         make_tiny_shard(second, 1)
         second.finish()
         assert listed in second.manifest.shards
-    assert {row.reason for row in _failures(bucket, "failures.jsonl")} == {"no_camera"}
+    assert {row.reason for row in _failures(bucket)} == {"no_camera"}
     assert verify_dataset(OUT).problems == []
 
 
@@ -295,7 +291,7 @@ def test_a_shard_that_another_machine_has_sent_is_listed(bucket: Any, machines: 
         make_tiny_shard(writer, 1)
         listed = writer.finish()
         assert listed is not None and listed.shards[0] == entry
-    assert len(_failures(bucket, "failures.jsonl")) == 8
+    assert len(_failures(bucket)) == 8
 
 
 @contextlib.contextmanager

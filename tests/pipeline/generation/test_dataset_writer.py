@@ -28,7 +28,7 @@ from storage.dataset.verify import verify_dataset
 from storage.errors import TrilightError
 from storage.records.objects import Failure
 from storage.records.sample import Sample, sample_key
-from tests.for_each import for_each
+from tests.for_each import for_each, with_folders
 from tests.pipeline.documents.dataset_by_hand import locked
 from tests.scenes_by_hand import stage_scene, tiny_sample, tiny_scene
 
@@ -104,9 +104,11 @@ def test_other_settings_and_another_environment_are_refused_by_name(tmp_path: Pa
     begin_tiny(tmp_path, accept_environment=True, mitsuba_variant="scalar_rgb")
 
 
-@for_each(
-    ("build", "begun", "device", "named", "chosen"),
-    [
+def test_a_dataset_stays_on_the_device_that_it_began_on(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """This machine has a GPU that renders well, and smoke and frozen presets have digests."""
+    rows: list[tuple[str, str, Device | None, str, Device]] = [
         ("smoke", "", None, "", "cpu"),
         ("benchmark-v1", "", None, "", "cpu"),
         ("pretrain-256", "", None, "", "gpu"),
@@ -117,30 +119,19 @@ def test_other_settings_and_another_environment_are_refused_by_name(tmp_path: Pa
         ("pretrain-256", "llvm_ad_rgb", "auto", "", "cpu"),
         ("pretrain-256", "llvm_ad_rgb", "gpu", "", "gpu"),
         ("pretrain-256", "llvm_ad_rgb", None, "cuda_ad_rgb", "gpu"),
-    ],
-)
-def test_a_dataset_stays_on_the_device_that_it_began_on(
-    build: str,
-    begun: str,
-    device: Device | None,
-    named: str,
-    chosen: Device,
-    tmp_path: Path,
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:
-    """This machine has a GPU that renders well, and smoke and frozen presets have digests."""
-    folder = DatasetFolder(tmp_path)
-    if begun:
-        begin_tiny(tmp_path, mitsuba_variant=begun)
-    monkeypatch.setenv("TRILIGHT_VARIANT", named)
-    monkeypatch.setenv("TRILIGHT_CACHE", str(tmp_path / "cache"))
+    ]
+    on_cpu = Variant(name="llvm_ad_rgb", libllvm="", note="")
     monkeypatch.setenv("CUDA_VISIBLE_DEVICES", "0")
     monkeypatch.setattr("pipeline.renders.mitsuba_variant._probe", lambda variant: _ProbeResult())
-    on_cpu = Variant(name="llvm_ad_rgb", libllvm="", note="")
     monkeypatch.setattr("pipeline.renders.mitsuba_variant._on_processor", lambda: on_cpu)
-    order = GenerateOptions(build=build, device=device)
-    variant = choose_dataset_variant(order, folder)
-    assert variant.device == device_of(environment(variant)) == chosen
+    for folder, (build, begun, device, named, chosen) in with_folders(tmp_path, rows):
+        monkeypatch.setenv("TRILIGHT_VARIANT", named)
+        monkeypatch.setenv("TRILIGHT_CACHE", str(folder / "cache"))
+        if begun:
+            begin_tiny(folder, mitsuba_variant=begun)
+        order = GenerateOptions(build=build, device=device)
+        variant = choose_dataset_variant(order, DatasetFolder(folder))
+        assert variant.device == device_of(environment(variant)) == chosen, (begun, order)
 
 
 @for_each(("before", "now"), [("llvm_ad_rgb", "cuda_ad_rgb"), ("cuda_ad_rgb", "llvm_ad_rgb")])

@@ -12,7 +12,7 @@ from prefect.exceptions import ParameterTypeError
 from infra.repair import repair
 from pipeline.exchange.reader import LIMITS
 from pipeline.executors.threads import ThreadRunner
-from pipeline.generation.dataset_writer import begin_or_resume_dataset
+from pipeline.generation.dataset_writer import DatasetWriter, begin_or_resume_dataset
 from pipeline.generation.derive_dataset import _extensions
 from pipeline.generation.freeze_objects import ObjectLock
 from pipeline.generation.generate_options import GenerateOptions
@@ -31,7 +31,7 @@ from storage.errors import TrilightError, removal_message
 from storage.extensions import load_extension, mistake_in_extension
 from tests.command_line import trilight
 from tests.extensions_kit import EXAMPLES, loaded, parts_of, room_for_extensions, written
-from tests.for_each import for_each
+from tests.for_each import case, for_each
 from tests.pipeline.documents.dataset_by_hand import edit_manifest
 from tests.pipeline.generation.test_dataset_writer import ENVIRONMENT, begin_tiny, make_tiny_shard
 from tests.pipeline.generation.tiny_scenes_kit import (
@@ -46,9 +46,10 @@ TRAP = "from pathlib import Path\nPath(__file__).with_suffix('.ran').touch()\n"
 """Leaves a mark when it is imported."""
 
 
-def _begin(root: Path) -> None:
-    build = preset_settings("smoke")
-    begin_or_resume_dataset(PublishedShards(DatasetFolder(root)), build, ENVIRONMENT, 4)
+def _begin(root: Path, scenes: int = 4, seed: int | None = None) -> DatasetWriter:
+    build = preset_settings("smoke", seed=seed)
+    shards = PublishedShards(DatasetFolder(root))
+    return begin_or_resume_dataset(shards, build, ENVIRONMENT, scenes)
 
 
 def test_the_manifest_records_what_had_part_in_a_dataset(tmp_path: Path) -> None:
@@ -60,10 +61,8 @@ def test_the_manifest_records_what_had_part_in_a_dataset(tmp_path: Path) -> None
     with pytest.raises(TrilightError, match=r"begun with the extension template\.py, which is not"):
         _begin(tmp_path)
     other = written(tmp_path, TEMPLATE.read_text() + "\n# changed\n", "template.py")
-    with (
-        loaded(other),
-        pytest.raises(TrilightError, match=r"another extension template\.py: its sha256 was"),
-    ):
+    changed = r"another extension template\.py: its sha256 was"
+    with loaded(other), pytest.raises(TrilightError, match=changed):
         _begin(tmp_path)
     with loaded(TEMPLATE):
         _begin(tmp_path)
@@ -73,10 +72,8 @@ def test_a_manifest_without_extensions_is_what_it_was(tmp_path: Path) -> None:
     with loaded(EXAMPLES / "executor.py"):  # changes how a dataset is made, and nothing of it
         _begin(tmp_path)
     assert "extensions" not in json.loads((tmp_path / "manifest.json").read_text())
-    with (
-        loaded(TEMPLATE),
-        pytest.raises(TrilightError, match=r"begun without the extension template\.py; leave"),
-    ):
+    added = r"begun without the extension template\.py; leave"
+    with loaded(TEMPLATE), pytest.raises(TrilightError, match=added):
         _begin(tmp_path)
 
 
@@ -126,26 +123,19 @@ def test_a_bug_in_an_extension_is_its_authors_and_stops_at_once(tmp_path: Path) 
     assert mistake_in_extension(other.value) is None
 
 
-@for_each(
-    ("changed", "said"),
-    [
-        (
-            'parts=("floor", "wall9")',
-            "('floor', 'wall9'); expected none, or floor first, then any of floor",
-        ),
-        ('parts=("wall0", "floor")', "('wall0', 'floor'); expected none, or floor first"),
-        ('parts=("floor", "wall0", "wall0")', "'wall0'); expected none, or floor first"),
+def test_a_template_is_checked_when_it_is_made(tmp_path: Path) -> None:
+    first = "expected none, or floor first"
+    for changed, said in (
+        ('parts=("floor", "wall9")', f"('floor', 'wall9'); {first}, then any of floor"),
+        ('parts=("wall0", "floor")', f"('wall0', 'floor'); {first}"),
+        ('parts=("floor", "wall0", "wall0")', f"'wall0'); {first}"),
         ('parts=("floor",), lights=sector(99)', "elevation_deg is (3, 99); expected two from -90"),
         ('parts=("floor",), lights=sector(2)', "(3, 2); expected two from -90 to 90, the lower"),
-    ],
-)
-def test_a_template_is_checked_when_it_is_made(tmp_path: Path, changed: str, said: str) -> None:
-    text = f"Template(**dict(name='t', cameras=sector(), lights=sector()) | dict({changed}))"
-    with (
-        room_for_extensions(),
-        pytest.raises(TrilightError, match=rf"^extension own\.py, line \d+: .*{re.escape(said)}"),
     ):
-        load_extension(written(tmp_path, f"{BUG}\n{text}\n"))
+        text = f"Template(**dict(name='t', cameras=sector(), lights=sector()) | dict({changed}))"
+        where = rf"^extension own\.py, line \d+: .*{re.escape(said)}"
+        with case(changed), room_for_extensions(), pytest.raises(TrilightError, match=where):
+            load_extension(written(tmp_path, f"{BUG}\n{text}\n"))
 
 
 @for_each("extended", [{}, {"trap.py": "0" * 64}])
@@ -189,36 +179,26 @@ def test_families_are_chosen_by_name() -> None:
         heavy = {"scenes.families": ["crowd"], "scenes.families.weight": 5.0}
         assert preset_settings("smoke", changes=heavy).scenes.families[0].weight == 5.0
     for wrong in ("crowd", ["plane-single", "crowd"], 3):
-        with pytest.raises(
-            TrilightError, match=r"setting 'scenes\.families' is .* of plane-single"
-        ):
+        said = r"setting 'scenes\.families' is .* of plane-single"
+        with pytest.raises(TrilightError, match=said):
             preset_settings("smoke", changes={"scenes.families": wrong})
     with pytest.raises(TrilightError, match=r"families.* expected at least one"):
         preset_settings("smoke", changes={"scenes.families": []})
 
 
-@for_each(
-    ("old", "new", "said"),
-    [
+def test_a_wrong_family_names_file_line_and_family(tmp_path: Path) -> None:
+    text = TEMPLATE.read_text()
+    place = r"^extension own\.py, line \d\d, scenes\.families 'corridor': "
+    for old, new, said in (
         ("object_scale=", "object_size=", "object_size does not exist; did you mean object_scale?"),
         ("(1, 2)", "(4, 3)", "num_objects is (4, 3); expected two whole numbers"),
-        (
-            'template="corridor"',
-            'template="coridor"',
-            "'coridor' is unknown; did you mean corridor",
-        ),
+        ('template="corridor', 'template="coridor', "'coridor' is unknown; did you mean corridor"),
         ("square_share=", "square=", "square does not exist; did you mean square_share?"),
-    ],
-)
-def test_a_wrong_family_names_file_line_and_family(
-    tmp_path: Path, old: str, new: str, said: str
-) -> None:
-    text = TEMPLATE.read_text()
-    assert old in text
-    with loaded(written(tmp_path, text.replace(old, new))), pytest.raises(TrilightError) as caught:
-        preset_settings("smoke", changes={"scenes.families": "corridor"})
-    place = r"^extension own\.py, line \d\d, scenes\.families 'corridor': "
-    assert re.match(f"{place}.*{re.escape(said)}", str(caught.value))
+    ):
+        assert old in text
+        wrong = written(tmp_path, text.replace(old, new))
+        with loaded(wrong), pytest.raises(TrilightError, match=f"{place}.*{re.escape(said)}"):
+            preset_settings("smoke", changes={"scenes.families": "corridor"})
 
 
 def test_an_extension_that_is_left_out_is_asked_for(tmp_path: Path) -> None:
@@ -267,9 +247,8 @@ DATASET_PRESETS.register("late", DatasetPreset(settings=wrong, num_scenes=1))
             preset_settings(resolve_dataset_preset(f"{path}:posing"))
         with pytest.raises(TrilightError, match=r"own\.py: it returned a NoneType; expected Data"):
             resolve_dataset_preset(f"{path}:nothing")
-        with pytest.raises(
-            TrilightError, match=r"^extension own\.py, line 17, dataset preset 'late'"
-        ):
+        late = r"^extension own\.py, line 17, dataset preset 'late'"
+        with pytest.raises(TrilightError, match=late):
             preset_settings("late")
     assert name not in DATASET_PRESETS
 
@@ -300,7 +279,7 @@ def test_what_was_only_begun_is_begun_anew_and_what_has_objects_or_scenes_is_not
     without_rendering(monkeypatch)
     folder = DatasetFolder(tmp_path / "set")
     with folder.hold_shared_lock():
-        begin_or_resume_dataset(PublishedShards(folder), preset_settings("smoke", seed=5), {}, 24)
+        _begin(folder.root, 24, seed=5)
     order = tiny_order(out=str(folder.root), scenes=4, seed=7)
     run = prepare_dataset(order)  # its objects are frozen, no more
     assert run.publication.manifest.settings["seed"] == 7
@@ -336,7 +315,7 @@ def test_the_command_is_there_while_objects_are_prepared(
 def test_nobody_forgets_while_another_is_at_work(tmp_path: Path) -> None:
     folder = DatasetFolder(tmp_path / "set")
     with PublishedShards(folder).hold_lock():
-        begin_or_resume_dataset(PublishedShards(folder), preset_settings("smoke", seed=5), {}, 4)
+        _begin(folder.root, seed=5)
         with PublishedShards(folder).hold_lock():
             assert read_manifest(folder.manifest).settings["seed"] == 5
 
@@ -344,11 +323,10 @@ def test_nobody_forgets_while_another_is_at_work(tmp_path: Path) -> None:
 def test_who_was_replaced_all_the_same_stops(tmp_path: Path) -> None:
     """Locks do not reach every machine: a maker whose manifest has become another's says so."""
     folder = DatasetFolder(tmp_path / "set")
-    shards = PublishedShards(folder)
     with folder.hold_shared_lock():
-        mine = begin_or_resume_dataset(shards, preset_settings("smoke", seed=5), {}, 4)
+        mine = _begin(folder.root, seed=5)
         folder.manifest.unlink()
-        begin_or_resume_dataset(shards, preset_settings("smoke", seed=7), {}, 4)
+        _begin(folder.root, seed=7)
         with pytest.raises(TrilightError, match="another dataset has been begun here"):
             mine.lock_objects([])
 

@@ -250,11 +250,9 @@ def accepted(settings: DatasetSettings, tmp_path_factory: pytest.TempPathFactory
     with pytest.MonkeyPatch.context() as patch:
         patch.setenv("TRILIGHT_CACHE", str(root / "cache"))
         patch.setattr(freeze_objects, "IsolatedChild", ChildHere)
-        writer: Any = None
         folders = {TEXTURE: str(root / "textures"), SKY: str(root / "skies")}
-        return ObjectLock(
-            source="", licence=None, settings=settings, writer=writer, map_folders=folders
-        ).accept_maps()
+        stated: dict[str, Any] = {"source": "", "licence": None, "writer": None}
+        return ObjectLock(settings=settings, map_folders=folders, **stated).accept_maps()
 
 
 def test_rows_have_splits_by_content_and_copies_stay_together(accepted: AcceptedMaps) -> None:
@@ -281,12 +279,8 @@ def test_no_texture_or_map_of_test_is_in_train(
         uids[split], shown[split] = set(), set()
         for index in range(5):
             try:
-                scene = compose_scene(
-                    settings.scenes,
-                    small_pool(),
-                    SceneKey(0, index),
-                    user_maps=own,
-                )
+                key = SceneKey(0, index)
+                scene = compose_scene(settings.scenes, small_pool(), key, user_maps=own)
             except Rejected:
                 continue
             scene.check()

@@ -1,7 +1,6 @@
 """Work is ordered and cut; a dataset that is grown by any steps is the one made at once."""
 
 import contextlib
-import dataclasses
 import itertools
 import json
 import os
@@ -146,10 +145,8 @@ def test_growth_that_is_killed_anywhere_is_finished_by_the_next_command(tmp_path
             seen = open_dataset(str(root))
             read = [sample for shard in seen.manifest.shards for sample in seen.read_shard(shard)]
             assert len(read) >= small.num_samples, "what was there can be read"
-            faults = [
-                text for text in verify_dataset(root).problems if "not in the man" not in text
-            ]
-            assert faults == []
+            faults = verify_dataset(root).problems
+            assert [text for text in faults if "not in the man" not in text] == []
             assert make(root, 11) == whole
             assert files(root) == files(tmp_path / "whole")
         shutil.rmtree(root)
@@ -228,9 +225,8 @@ def test_who_packs_a_growing_shard_second_without_locks_has_the_first_ones_resul
     monkeypatch.setattr(pack, "write_shard", late)
     assert make(tmp_path / "set", 4) == whole
     folder = DatasetFolder(tmp_path / "set")
-    with pytest.raises(
-        TrilightError, match=r"train-000001.tar: a file vanished .* run the same command"
-    ):
+    vanished = r"train-000001.tar: a file vanished .* run the same command"
+    with pytest.raises(TrilightError, match=vanished):
         pack.pack_shard(folder, "train-000001.tar", range(4, 8))
 
 
@@ -353,20 +349,18 @@ def test_all_rounds_of_a_run_are_at_most_a_thousand_tasks() -> None:
     assert sum(rounds) == MAX_TASKS
 
 
-@for_each(
-    ("changes", "message"),
-    [
+def test_wrong_orders_are_named() -> None:
+    wrong: list[tuple[dict[str, Any], str]] = [
         ({"build": "nonsense"}, "preset 'nonsense'"),
         ({"scenes": 0}, "scenes is 0"),
         ({"failure_budget": 1.5}, "failure_budget is 1.5"),
         ({"shards": "4:4"}, "shards is '4:4'"),
         ({"views": 2}, "--views is 2"),
         ({"scenes_from": "a", "scenes": 3}, "given with --scenes; expected it without"),
-    ],
-)
-def test_wrong_orders_are_named(changes: dict[str, object], message: str) -> None:
-    with pytest.raises(TrilightError, match=message):
-        dataclasses.replace(GenerateOptions(), **changes)  # type: ignore[arg-type]
+    ]
+    for changes, message in wrong:
+        with case(changes), pytest.raises(TrilightError, match=message):
+            GenerateOptions(**changes)
     assert GenerateOptions(shards="4:7").shard_range() == range(4, 7)
 
 
@@ -455,22 +449,13 @@ def test_cores_are_those_of_the_affinity_unless_said(monkeypatch: pytest.MonkeyP
         available_cores()
 
 
-@for_each(
-    ("value", "cards"),
-    [("0,2", ("0", "2")), ("GPU-1a", ("GPU-1a",)), ("", ()), ("-1", ())],
-)
-def test_cards_are_those_that_are_visible(
-    monkeypatch: pytest.MonkeyPatch, value: str, cards: tuple[str, ...]
-) -> None:
-    monkeypatch.setenv("CUDA_VISIBLE_DEVICES", value)
-    assert visible_gpus() == cards
+def test_cards_are_those_that_are_visible(monkeypatch: pytest.MonkeyPatch) -> None:
+    for value, cards in (("0,2", ("0", "2")), ("GPU-1a", ("GPU-1a",)), ("", ()), ("-1", ())):
+        monkeypatch.setenv("CUDA_VISIBLE_DEVICES", value)
+        assert visible_gpus() == cards, value
 
 
-@for_each(
-    ("resolution", "memory_gib", "children"),
-    [(256, 80, 4), (512, 8, 4), (512, 4, 2), (2048, 24, 2), (2048, 141, 4), (256, 0, 1)],
-)
-def test_a_card_has_as_many_children_as_keep_it_busy_and_fit(
-    resolution: int, memory_gib: int, children: int
-) -> None:
-    assert children_of_gpu(resolution, memory_gib << 30) == children
+def test_a_card_has_as_many_children_as_keep_it_busy_and_fit() -> None:
+    rows = [(256, 80, 4), (512, 8, 4), (512, 4, 2), (2048, 24, 2), (2048, 141, 4), (256, 0, 1)]
+    for resolution, memory_gib, children in rows:
+        assert children_of_gpu(resolution, memory_gib << 30) == children, (resolution, memory_gib)

@@ -304,13 +304,12 @@ def test_what_stores_some_says_so_in_the_order_of_the_table() -> None:
 def test_a_rendered_sample_holds_what_is_asked() -> None:
     activate(choose_variant())
     scene = tiny_scene(provenance={"camera_attempts": [0, 0]})
-    sample = render_sample(
-        "000000007", RenderInput(scene=scene), build(**ASKED), [], ViewProgress(None, 7)
+    sample, plain = (
+        render_sample("000000007", RenderInput(scene=scene), settings, [], ViewProgress(None, 7))
+        for settings in (build(**ASKED), build())
     )
     expected = tuple(passes_exr(scene, NAMES, view=view, resolution=16) for view in range(2))
-    assert sample.passes_exr == expected
-    plain = render_sample("000000007", RenderInput(scene=scene), build(), [], ViewProgress(None, 7))
-    assert plain.passes_exr is None
+    assert sample.passes_exr == expected and plain.passes_exr is None
     np.testing.assert_array_equal(plain.radiance_rgb, sample.radiance_rgb)
 
 

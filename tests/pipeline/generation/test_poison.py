@@ -74,10 +74,9 @@ def test_a_mesh_that_crashes_its_child_is_one_failure(
         poisoned.unlink()
     assert (outcome.num_objects_found, outcome.num_objects_used) == (9, 8)
     assert outcome.digest == expected(workshop)
-    rejected = [
-        row for row in open_dataset(str(tmp_path / "set")).failures() if row.stage == "assets"
-    ]
-    assert [(row.item, row.reason) for row in rejected] == [("poison", "crashed_signal_11")]
+    failures = open_dataset(str(tmp_path / "set")).failures()
+    rejected = [(row.item, row.reason) for row in failures if row.stage == "assets"]
+    assert rejected == [("poison", "crashed_signal_11")]
 
 
 @pytest.fixture
@@ -108,14 +107,12 @@ def test_an_object_whose_children_are_all_killed_is_tried_again_by_the_next_run(
     shutil.rmtree(cold / "cache")
     begun.publication.folder.staged_index.unlink()
     deaths.write_text("3")
-    with pytest.raises(
-        EnvironmentFailure, match="'knot0', which .* begun with.*killed.*run the same"
-    ):
+    killed = "'knot0', which .* begun with.*killed.*run the same"
+    with pytest.raises(EnvironmentFailure, match=killed):
         prepare_dataset(order(workshop, cold / "with", **small))
     assert open_dataset(str(cold / "with")).failures() == []
-    assert (
-        prepare_dataset(order(workshop, cold / "with", **small)).job.accepted == begun.job.accepted
-    )
+    again = prepare_dataset(order(workshop, cold / "with", **small))
+    assert again.job.accepted == begun.job.accepted
 
 
 def test_meshes_that_are_away_are_made_again_where_a_scene_draws_them(
@@ -127,11 +124,8 @@ def test_meshes_that_are_away_are_made_again_where_a_scene_draws_them(
     monkeypatch.setattr("pipeline.assets.stage.attempt_in_child", poison.prepare_or_die)
     monkeypatch.setenv("TRILIGHT_CONFINE", "off")  # they count their deaths in a file
     (workshop / poison.DEATHS).write_text("1000")
-    drawn = {
-        row.uid
-        for sample in open_dataset(str(workshop / "plain")).samples()
-        for row in sample.scene.objects
-    }
+    samples = open_dataset(str(workshop / "plain")).samples()
+    drawn = {row.uid for sample in samples for row in sample.scene.objects}
     assert "knot0" in drawn
     assert prepare_dataset(order(workshop, tmp_path / "set")).job.accepted == begun.job.accepted
     with pytest.raises(EnvironmentFailure, match="'knot0', which .*killed.*run the same"):

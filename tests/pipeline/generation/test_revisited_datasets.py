@@ -31,7 +31,7 @@ from storage.dataset.shard import open_shard
 from storage.dataset.verify import verify_dataset
 from storage.errors import TrilightError
 from storage.records.scene_facts import lights
-from tests.for_each import for_each
+from tests.for_each import case, for_each
 from tests.infra.child_here import ChildHere
 from tests.pipeline.generation.tiny_scenes_kit import Undocumented
 from tests.scenes_by_hand import tiny_scene
@@ -119,13 +119,11 @@ def test_another_view_is_that_of_a_dataset_with_more_views(
             assert found[name] == expected[name], name
     before = {name: data for name, data in members(source).items() if name.endswith(".exr")}
     assert before and before == {name: found[name] for name in before}
-    assert {name for name in found if ".0." in name} - before.keys() == {
-        name.replace(".0.exr", ".0.passes.exr") for name in before
-    }
+    added = {name for name in found if ".0." in name} - before.keys()
+    assert added == {name.replace(".0.exr", ".0.passes.exr") for name in before}
     assert more.objects_lock() == source.objects_lock()
-    assert [(entry.name, entry.split) for entry in more.manifest.shards] == [
-        (entry.name, entry.split) for entry in source.manifest.shards
-    ]
+    names = [[(row.name, row.split) for row in each.manifest.shards] for each in (more, source)]
+    assert names[0] == names[1]
 
 
 def test_a_kept_picture_is_copied_and_not_rendered(
@@ -140,15 +138,8 @@ def test_a_kept_picture_is_copied_and_not_rendered(
 
 
 def test_lights_materials_and_resolution_change_on_request(source: Dataset, tmp_path: Path) -> None:
-    new = revisited(
-        source.folder.root,
-        tmp_path / "new",
-        cameras="plane:2",
-        lights="2",
-        materials="new",
-        resolution=24,
-        seed=5,
-    )
+    asked = {"cameras": "plane:2", "lights": "2", "materials": "new", "resolution": 24, "seed": 5}
+    new = revisited(source.folder.root, tmp_path / "new", **asked)
     assert new.manifest.num_views == 2
     for then, now in zip(source.samples(), new.samples(), strict=True):
         assert now.radiance_rgb.shape == (2, 24, 24, 3)
@@ -232,18 +223,15 @@ def test_another_source_is_refused(source: Dataset, tmp_path: Path) -> None:
     assert not (tmp_path / "set" / "manifest.json").exists()
 
 
-@for_each(
-    ("asked", "message"),
-    [({"cameras": "new:2"}, "draws no cameras"), ({"lights": "new"}, "draws no lights")],
-)
-def test_scenes_of_files_have_no_layout_to_draw_from(
-    source: Dataset, tmp_path: Path, asked: dict[str, Any], message: str
-) -> None:
+def test_scenes_of_files_have_no_layout_to_draw_from(source: Dataset, tmp_path: Path) -> None:
     of_files = {"splits.listed_scenes": 4}
-    order = order_of(source.folder.root, tmp_path / "set", changes=of_files, **asked)
-    with pytest.raises(TrilightError, match=f"its scenes are of files, .* {message}; expected"):
-        make_dataset(order, Undocumented())
-    assert not (tmp_path / "set" / "manifest.json").exists()
+    for name, value in (("cameras", "new:2"), ("lights", "new")):
+        asked = {"changes": of_files, name: value}
+        order = order_of(source.folder.root, tmp_path / "set", **asked)
+        refusal = f"its scenes are of files, .* draws no {name}; expected"
+        with pytest.raises(TrilightError, match=refusal):
+            make_dataset(order, Undocumented())
+        assert not (tmp_path / "set" / "manifest.json").exists()
 
 
 def test_a_damaged_source_is_named(source: Dataset, tmp_path: Path) -> None:
@@ -258,19 +246,14 @@ def test_a_damaged_source_is_named(source: Dataset, tmp_path: Path) -> None:
     assert not (tmp_path / "set" / shard.name).exists()
 
 
-@for_each(
-    ("asked", "message"),
-    [
+def test_words_that_mean_nothing_are_one_line(source: Dataset, tmp_path: Path) -> None:
+    for asked, message in (
         ({"cameras": "bogus"}, "--cameras is 'bogus'; expected keep; a number"),
         ({"cameras": "0"}, "cameras: 0 for each scene; expected 1 to 1000"),
         ({"lights": "none"}, "--lights is 'none'; expected keep, new, or a number"),
         ({"lights": "65"}, "num_lights is 65; expected a whole number from 1 to 64"),
         ({"materials": "old"}, "materials is 'old'; expected keep or new"),
-    ],
-)
-def test_words_that_mean_nothing_are_one_line(
-    source: Dataset, tmp_path: Path, asked: dict[str, Any], message: str
-) -> None:
-    with pytest.raises(TrilightError, match=message):
-        order_of(source.folder.root, tmp_path / "set", **asked)
-    assert not (tmp_path / "set").exists()
+    ):
+        with case(asked), pytest.raises(TrilightError, match=message):
+            order_of(source.folder.root, tmp_path / "set", **asked)
+        assert not (tmp_path / "set").exists(), asked

@@ -50,10 +50,8 @@ def test_what_is_named_changes_and_nothing_else(name: str) -> None:
         noise_targets={"noise_floor_db": 33.0},
         changes={"scenes.num_views": 3},
     )
-    found = {
-        path: value
-        for path, _, value in differences(settings_record(before), settings_record(after))
-    }
+    records = (settings_record(before), settings_record(after))
+    found = {path: value for path, _, value in differences(*records)}
     expected: dict[str, Any] = {"seed": 7, "renders.resolution": 64}
     expected |= {"renders.noise_floor_db": 33.0, "scenes.num_views": 3}
     if before.renders.noise_floor_objects_db is not None:

@@ -20,27 +20,8 @@ from storage.records.asset import Asset, decode_asset, encode_asset
 from storage.records.lookup import mapped_normals, texture_values, u_directions
 from storage.settings.described import settings_record
 from tests.for_each import for_each
-from tests.pipeline.assets.meshes_by_hand import (
-    OUTSIDE,
-    geometry,
-    prepare,
-    reason_of,
-    secret_beside,
-    write_glb,
-    write_ply,
-)
+from tests.pipeline.assets import meshes_by_hand as meshes
 from tests.pipeline.assets.source_materials import textured_kit as kit
-from tests.pipeline.assets.source_materials.textured_kit import (
-    KEEP,
-    OWN,
-    TEXTURE,
-    UV_UP,
-    picture_bytes,
-    set_inputs,
-    textured_obj,
-    textured_tree,
-    textured_usd,
-)
 from tests.pipeline.foreign.gltf.gltf_writer import GltfWriter
 
 TOLERANCE = 0.02
@@ -75,7 +56,7 @@ def test_bad_pictures_are_lost_with_a_reason(tmp_path: Path, name: str) -> None:
     reason, data = UNREADABLE[name]
     path = kit.textured_glb(tmp_path / "a.glb", data)
     assert kit.lost(path) == reason
-    assert reason_of(path, kit.REFUSE) == reason
+    assert meshes.reason_of(path, kit.REFUSE) == reason
 
 
 def test_many_pictures_count_together(tmp_path: Path) -> None:
@@ -84,9 +65,9 @@ def test_many_pictures_count_together(tmp_path: Path) -> None:
     metal["metallicRoughnessTexture"] = {"index": 1}
     tree["textures"].append({"source": 1})
     tree["images"].append(dict(tree["images"][0]))
-    path = write_glb(tmp_path / "a.glb", tree, buffer)
+    path = meshes.write_glb(tmp_path / "a.glb", tree, buffer)
     enough = OwnMaterialSettings(keep=True, texels=16, max_pixels=2 * 64 * 64, max_colour_error=1.0)
-    materials = prepare(path, AssetSettings(own_materials=enough)).materials
+    materials = meshes.prepare(path, AssetSettings(own_materials=enough)).materials
     assert materials is not None and materials.reason == ""
     less = dataclasses.replace(enough, max_pixels=2 * 64 * 64 - 1)
     assert kit.lost(path, AssetSettings(own_materials=less)) == "texture_too_large"
@@ -104,8 +85,8 @@ def test_a_halved_picture_is_its_mean_in_linear_light() -> None:
 
 
 def test_pictures_of_a_gltf_or_an_mtl_do_not_lead_out(tmp_path: Path) -> None:
-    folder = secret_beside(tmp_path, PICTURE)
-    for uri in OUTSIDE:
+    folder = meshes.secret_beside(tmp_path, PICTURE)
+    for uri in meshes.OUTSIDE:
         assert kit.lost(kit.textured_gltf(folder / "a.gltf", uri)) == "texture_outside", uri
     for name in ("../secret.png", "..\\secret.png", "/etc/hostname"):
         path = kit.textured_obj(folder / "a.obj", b"", mtl=f"map_Kd {name}\n")
@@ -131,7 +112,7 @@ def test_pictures_mtl_files_and_coordinates_that_are_missing_or_make_no_sense(
     path = kit.textured_glb(tmp_path / "b.glb", PICTURE, broken)
     assert kit.lost(path) == "texture_coordinates_not_finite"
     # A comment of a PLY that names a picture is no material, and no picture is opened.
-    path = write_ply(tmp_path / "a.ply", kit.SQUARE)
+    path = meshes.write_ply(tmp_path / "a.ply", kit.SQUARE)
     comment = "comment TextureFile a.png\nelement vertex"
     path.write_text(path.read_text().replace("element vertex", comment))
     assert kit.lost(path) == "no_materials"
@@ -148,7 +129,8 @@ def test_materials_that_are_malformed(tmp_path: Path) -> None:
     for change in changes:
         tree, buffer = kit.textured_tree(PICTURE)
         change(tree)
-        assert kit.lost(write_glb(tmp_path / "a.glb", tree, buffer)) == "materials_unreadable"
+        path = meshes.write_glb(tmp_path / "a.glb", tree, buffer)
+        assert kit.lost(path) == "materials_unreadable"
 
 
 def test_folded_coordinates_and_one_texel_are_constants(tmp_path: Path) -> None:
@@ -160,7 +142,7 @@ def test_folded_coordinates_and_one_texel_are_constants(tmp_path: Path) -> None:
         (kit.picture_bytes(texel), kit.UV_UP, linear_from_srgb8()[texel[0, 0]]),
     ):
         path = kit.textured_glb(tmp_path / "a.glb", picture, uv)
-        skin = prepare(path, kit.KEEP).levels[0].skin
+        skin = meshes.prepare(path, kit.KEEP).levels[0].skin
         assert skin is not None and [t.texels.shape[:2] for t in skin.textures] == [(1, 1)] * 3
         wanted = np.asarray(linear) * (1 - kit.F)
         assert np.allclose(skin.textures[0].texels[0, 0], wanted, atol=1e-6)
@@ -182,7 +164,7 @@ FORMS: dict[str, bytes] = {
 
 @for_each("form", FORMS)
 def test_forms_of_pictures(tmp_path: Path, form: str) -> None:
-    asset = prepare(kit.textured_glb(tmp_path / "a.glb", FORMS[form]), kit.KEEP)
+    asset = meshes.prepare(kit.textured_glb(tmp_path / "a.glb", FORMS[form]), kit.KEEP)
     places = {(-0.25, 0.25): 40, (0.25, 0.25): 200, (-0.25, -0.25): 120, (0.25, -0.25): 250}
     for place, code in places.items():
         wanted = linear_from_srgb8()[code] * (1 - kit.F)
@@ -192,7 +174,7 @@ def test_forms_of_pictures(tmp_path: Path, form: str) -> None:
 def test_a_data_uri_holds_a_picture(tmp_path: Path) -> None:
     text = "data:image/png;base64," + base64.b64encode(PICTURE).decode()
     path = kit.textured_gltf(tmp_path / "a.gltf", text)
-    kit.assert_corners(prepare(path, kit.KEEP))
+    kit.assert_corners(meshes.prepare(path, kit.KEEP))
     tree = json.loads(path.read_text())
     tree["images"][0]["uri"] = "data:image/png;base64,!"
     path.write_text(json.dumps(tree))
@@ -207,12 +189,12 @@ def test_maps_of_an_mtl_are_linear_in_their_first_channel(tmp_path: Path) -> Non
     path = tmp_path / "o" / "a.obj"
     for stated, times in (("", 1.0), ("Pr 0.5\n", 0.5)):
         mtl = f"Kd 0.5 0.5 0.5\n{stated}map_Pr its picture.png\n"
-        asset = prepare(kit.textured_obj(path, NUMBERS, mtl), kit.KEEP)
+        asset = meshes.prepare(kit.textured_obj(path, NUMBERS, mtl), kit.KEEP)
         assert abs(kit.seen_at(asset, -0.25, 0, 2)[0] - times * 51 / 255) < kit.STORED
         assert abs(kit.seen_at(asset, 0.25, 0, 2)[0] - times * 204 / 255) < kit.STORED
         assert np.allclose(kit.seen_at(asset, 0.25, 0, 1), kit.F, atol=kit.STORED)
     mtl = "Kd 0.8 0.8 0.8\nPr 0.3\nmap_Pm its picture.png\n"
-    asset = prepare(kit.textured_obj(path, NUMBERS, mtl), kit.KEEP)
+    asset = meshes.prepare(kit.textured_obj(path, NUMBERS, mtl), kit.KEEP)
     for place, metal in ((-0.25, 0.2), (0.25, 0.8)):
         f0 = 0.04 * (1 - metal) + 0.8 * metal
         specular = f0 + (1 - f0) / 21
@@ -227,7 +209,7 @@ COLOURS = np.array([[255, 0, 0], [0, 188, 0], [0, 0, 255], [255, 255, 255]])
 
 def _coloured_ply(path: Path, of: str, kind: str = "uchar") -> Path:
     """Colours of the vertices of the square, or of its two faces."""
-    lines = write_ply(path, kit.SQUARE).read_text().splitlines()
+    lines = meshes.write_ply(path, kit.SQUARE).read_text().splitlines()
     fields = [f"property {kind} {name}" for name in ("red", "green", "blue")]
     at = lines.index("element face 2" if of == "vertex" else "end_header")
     start = lines.index("end_header") + 1
@@ -243,17 +225,18 @@ def test_colours_of_vertices_are_interpolated_in_linear_light_and_faces_have_the
 ) -> None:
     linear = linear_from_srgb8()[COLOURS] * (1 - kit.F)
     for kind in ("uchar", "float"):
-        asset = prepare(_coloured_ply(tmp_path / "a.ply", "vertex", kind), kit.KEEP)
+        asset = meshes.prepare(_coloured_ply(tmp_path / "a.ply", "vertex", kind), kit.KEEP)
         middle = 0.5 * (linear[0] + linear[1]) * 0.9 + 0.1 * linear[2]  # near the lower edge
         seen = kit.seen_at(asset, 0.05, -0.4)  # weights 0.45, 0.45 and 0.1
         assert np.abs(seen - middle).max() < 3 * kit.STORED
-        assert geometry(asset) == geometry(prepare(write_ply(tmp_path / "b.ply", kit.SQUARE)))
-    asset = prepare(_coloured_ply(tmp_path / "a.ply", "face"), kit.KEEP)
+        plain = meshes.prepare(meshes.write_ply(tmp_path / "b.ply", kit.SQUARE))
+        assert meshes.geometry(asset) == meshes.geometry(plain)
+    asset = meshes.prepare(_coloured_ply(tmp_path / "a.ply", "face"), kit.KEEP)
     assert np.abs(kit.seen_at(asset, 0.25, -0.25) - linear[0]).max() < kit.STORED
     assert np.abs(kit.seen_at(asset, -0.25, 0.25) - linear[1]).max() < kit.STORED
 
 
-MAPS = dataclasses.replace(KEEP, own_materials=dataclasses.replace(OWN, normal_maps=True))
+MAPS = dataclasses.replace(kit.KEEP, own_materials=dataclasses.replace(kit.OWN, normal_maps=True))
 PLACES = np.array([(-0.25, 0.25), (0.25, 0.25), (-0.25, -0.25), (0.25, -0.25)])
 """Right and up on the square, in the order of the picture."""
 SLOPES = np.array([(0.5, 0.1), (-0.4, 0.3), (0.0, -0.6), (0.0, 0.0)])
@@ -272,11 +255,13 @@ def _picture(values: ArrayLike | None = None) -> bytes:
     """Return quarters of 8 x 8 texels with the normals of SLOPES, or other codes [4, 3]."""
     codes = np.round((_normals(SLOPES) + 1) / 2 * 255) if values is None else np.asarray(values)
     quarters = codes.reshape(2, 2, 3).astype(np.uint8)
-    return picture_bytes(np.repeat(np.repeat(quarters, 8, axis=0), 8, axis=1))
+    return kit.picture_bytes(np.repeat(np.repeat(quarters, 8, axis=0), 8, axis=1))
 
 
-def _glb(path: Path, uv: ArrayLike = UV_UP, tangent: ArrayLike | None = None, **info: Any) -> Path:
-    tree, buffer = textured_tree(_picture(), uv)
+def _glb(
+    path: Path, uv: ArrayLike = kit.UV_UP, tangent: ArrayLike | None = None, **info: Any
+) -> Path:
+    tree, buffer = kit.textured_tree(_picture(), uv)
     material = tree["materials"][0]
     material["normalTexture"] = {"index": 0, **info}
     material["pbrMetallicRoughness"] = {"baseColorFactor": [0.5, 0.5, 0.5, 1]}
@@ -286,16 +271,16 @@ def _glb(path: Path, uv: ArrayLike = UV_UP, tangent: ArrayLike | None = None, **
         attributes["TANGENT"] = file.accessor(np.tile(np.asarray(tangent), (4, 1)), "f4")
         buffer = bytes(file.data)
         tree["buffers"][0]["byteLength"] = len(buffer)
-    return write_glb(path, tree, buffer)
+    return meshes.write_glb(path, tree, buffer)
 
 
 def _usd(path: Path, scale: float | None = 2.0) -> Path:
     def change(stage: Usd.Stage) -> None:
         if scale is not None:
             vectors = {"scale": Gf.Vec4f(scale, scale, scale, 1), "bias": Gf.Vec4f(-1, -1, -1, 0)}
-            set_inputs(stage, TEXTURE, vectors)
+            kit.set_inputs(stage, kit.TEXTURE, vectors)
 
-    return textured_usd(path, _picture(), change, connect={"normal": "rgb"})
+    return kit.textured_usd(path, _picture(), change, connect={"normal": "rgb"})
 
 
 def _shown(asset: Asset, places: NDArray = PLACES) -> NDArray[np.float64]:
@@ -328,10 +313,10 @@ FORMATS: dict[str, Callable[[Path], Path]] = {
     "glb": lambda folder: _glb(folder / "a.glb"),
     "usd": lambda folder: _usd(folder / "a.usda"),
     "usd without scale": lambda folder: _usd(folder / "a.usda", None),
-    "mtl norm": lambda folder: textured_obj(
+    "mtl norm": lambda folder: kit.textured_obj(
         folder / "o/a.obj", _picture(), "Kd .5 .5 .5\nnorm its picture.png\n"
     ),
-    "mtl map_Kn": lambda folder: textured_obj(
+    "mtl map_Kn": lambda folder: kit.textured_obj(
         folder / "o/a.obj", _picture(), "Kd .5 .5 .5\nmap_Kn -bm 1.0 its picture.png\n"
     ),
 }
@@ -340,14 +325,14 @@ FORMATS: dict[str, Callable[[Path], Path]] = {
 @for_each("form", FORMATS)
 def test_a_level_gives_the_map_of_its_source_back(tmp_path: Path, form: str) -> None:
     path = FORMATS[form](tmp_path)
-    asset = prepare(path, MAPS)
+    asset = meshes.prepare(path, MAPS)
     assert np.abs(_shown(asset) - _wanted()).max() < STEP
     assert asset.materials is not None and "normal map" not in asset.materials.lost
     (again,) = decode_asset(encode_asset(asset)).levels[:1]
     skin = asset.levels[0].skin
     assert skin is not None and again.skin is not None
     assert again.skin.packed == skin.packed and skin.normal is not None
-    plain = prepare(path, KEEP)
+    plain = meshes.prepare(path, kit.KEEP)
     assert plain.materials is not None and plain.levels[0].skin is not None
     assert plain.levels[0].skin.normal is None
     if form != "mtl map_Kn":  # which was a statement that nothing knew
@@ -358,46 +343,46 @@ def test_frames_follow_coordinates_that_are_mirrored_or_turned_and_stated_tangen
     tmp_path: Path,
 ) -> None:
     """The picture lies mirrored or turned by a right angle: so do its places and directions."""
-    mirrored = UV_UP * [-1, 1] + [1, 0]
-    asset = prepare(_glb(tmp_path / "a.glb", mirrored), MAPS)
+    mirrored = kit.UV_UP * [-1, 1] + [1, 0]
+    asset = meshes.prepare(_glb(tmp_path / "a.glb", mirrored), MAPS)
     assert np.abs(_shown(asset, PLACES * [-1, 1]) - _wanted(-RIGHT)).max() < STEP
-    turned = UV_UP[[3, 0, 1, 2]]  # u grows upwards, v to the left
-    asset = prepare(_glb(tmp_path / "b.glb", turned), MAPS)
+    turned = kit.UV_UP[[3, 0, 1, 2]]  # u grows upwards, v to the left
+    asset = meshes.prepare(_glb(tmp_path / "b.glb", turned), MAPS)
     places = PLACES[:, ::-1] * [-1, 1]
     assert np.abs(_shown(asset, places) - _wanted(UP, -RIGHT)).max() < STEP
     for sign in (1, -1):  # upwards in glTF is +Y
-        asset = prepare(_glb(tmp_path / "c.glb", tangent=[0, 1, 0, sign]), MAPS)
+        asset = meshes.prepare(_glb(tmp_path / "c.glb", tangent=[0, 1, 0, sign]), MAPS)
         assert np.abs(_shown(asset) - _wanted(UP, -sign * RIGHT)).max() < STEP
-    asset = prepare(_glb(tmp_path / "d.glb", tangent=[np.nan, 0, 0, 1]), MAPS)
+    asset = meshes.prepare(_glb(tmp_path / "d.glb", tangent=[np.nan, 0, 0, 1]), MAPS)
     assert np.abs(_shown(asset) - _wanted()).max() < STEP  # that is none: the coordinates count
-    asset = prepare(_glb(tmp_path / "e.glb", scale=0.5), MAPS)
+    asset = meshes.prepare(_glb(tmp_path / "e.glb", scale=0.5), MAPS)
     assert np.abs(_shown(asset) - _wanted(slopes=_strong(0.5))).max() < STEP
 
 
 def test_maps_that_no_one_should_make_are_flat_bent_upright_or_refused(tmp_path: Path) -> None:
     def made(picture: bytes, name: str) -> Path:
         mtl = f"Kd .5 .5 .5\nnorm its picture.png\nbump -bm 2 its picture.png # {name}\n"
-        return textured_obj(tmp_path / name / "a.obj", picture, mtl)
+        return kit.textured_obj(tmp_path / name / "a.obj", picture, mtl)
 
     # No length at all, behind the surface, 16 bits of gray (a slope of 45 degrees), and 127s.
     odd = _picture([[128, 128, 128], [255, 128, 0], [128, 128, 255], [127, 127, 255]])
-    asset = prepare(made(odd, "odd"), MAPS)
+    asset = meshes.prepare(made(odd, "odd"), MAPS)
     (level,) = asset.levels[:1]
     assert level.skin is not None and np.isfinite(level.skin.uv).all()
     upright = np.array([[0, 0], [1, 0], [0, 0], [0, 0]]) * np.sqrt(1 - 0.01**2)
     assert np.abs(_shown(asset) - _wanted(slopes=upright)).max() < 2 * STEP
     assert asset.materials is not None and asset.materials.lost == ("height map",)
-    flat = prepare(made(_picture([[128, 127, 255]] * 4), "flat"), MAPS).levels[0].skin
+    flat = meshes.prepare(made(_picture([[128, 127, 255]] * 4), "flat"), MAPS).levels[0].skin
     assert flat is not None and flat.normal is None
-    deep = picture_bytes(np.full((4, 4), 65535, np.uint16))  # (1, 1, 1)
-    gray = prepare(made(deep, "deep"), MAPS)
+    deep = kit.picture_bytes(np.full((4, 4), 65535, np.uint16))  # (1, 1, 1)
+    gray = meshes.prepare(made(deep, "deep"), MAPS)
     assert np.abs(_shown(gray) - _wanted(slopes=np.full((4, 2), 3**-0.5))).max() < 2 * STEP
-    cut = prepare(made(_picture()[:60], "cut"), MAPS)
+    cut = meshes.prepare(made(_picture()[:60], "cut"), MAPS)
     assert cut.materials is not None and cut.materials.reason == "texture_unreadable"
-    no_uv = prepare(_glb(tmp_path / "b.glb", np.zeros((4, 2))), MAPS).levels[0].skin
+    no_uv = meshes.prepare(_glb(tmp_path / "b.glb", np.zeros((4, 2))), MAPS).levels[0].skin
     assert no_uv is not None and no_uv.normal is None  # no direction in which u grows
 
 
 def test_todays_value_is_no_part_of_a_record() -> None:
-    assert "normal_maps" not in settings_record(KEEP)["own_materials"]
+    assert "normal_maps" not in settings_record(kit.KEEP)["own_materials"]
     assert settings_record(MAPS)["own_materials"]["normal_maps"] is True

@@ -24,45 +24,27 @@ from storage.records.asset import Level
 from storage.records.lookup import environment_values, texture_values
 from storage.records.material import DIFFUSE, EMISSION, ROUGHNESS, SPECULAR
 from storage.records.scene import Scene
+from tests import textured_by_hand as textured
 from tests.for_each import for_each
 from tests.pipeline.assets.meshes_by_hand import geometry, prepare, write_glb
-from tests.pipeline.assets.source_materials.textured_kit import (
-    CORNERS,
-    KEEP,
-    QUARTERS,
-    SQUARE,
-    UV_UP,
-    F,
-    picture_bytes,
-    seen_at,
-    textured_glb,
-    textured_tree,
-)
+from tests.pipeline.assets.source_materials import textured_kit as kit
 from tests.pipeline.exchange.exchange_kit import row_at
 from tests.scenes_by_hand import FLOOR, tiny_scene
-from tests.textured_by_hand import (
-    bumpy_scene,
-    colour_texture,
-    corner_uv,
-    number_texture,
-    sky,
-    textured_scene,
-)
 
 RED, GREEN, BLUE, GREY = (255, 0, 0), (0, 255, 0), (0, 0, 255), (128, 128, 128)
 PICTURE = np.array([[RED, GREEN], [BLUE, GREY]], np.uint8)
 """The top row first: red is the upper left corner, at (-1, 1)."""
 
-FLOOR_MESH = dataclasses.replace(SQUARE, positions=2 * SQUARE.positions[:, [0, 2, 1]])
+FLOOR_MESH = dataclasses.replace(kit.SQUARE, positions=2 * kit.SQUARE.positions[:, [0, 2, 1]])
 """Its corners are (-1, -1), (1, -1), (1, 1), (-1, 1)."""
 
 
 def quad(
-    *pictures: bytes | str, uv: Any = UV_UP, material: Any = None, **changes: Any
+    *pictures: bytes | str, uv: Any = kit.UV_UP, material: Any = None, **changes: Any
 ) -> tuple[dict[str, Any], bytes]:
     """Return tree and buffer of a textured floor, whose first picture is `PICTURE` by default."""
-    first, *more = pictures or (picture_bytes(PICTURE),)
-    tree, buffer = textured_tree(first, uv, FLOOR_MESH)
+    first, *more = pictures or (kit.picture_bytes(PICTURE),)
+    tree, buffer = kit.textured_tree(first, uv, FLOOR_MESH)
     tree["asset"]["copyright"] = "A. Maker"
     tree["nodes"][0]["name"] = "floor"
     tree["materials"][0]["pbrMetallicRoughness"]["roughnessFactor"] = 0.5
@@ -83,7 +65,7 @@ def read(folder: Path, *pictures: bytes | str, **changes: Any) -> LoadedScene:
 
 
 def diffuse_of(srgb: tuple[int, int, int]) -> np.ndarray:
-    return np.asarray(linear_from_srgb8()[list(srgb)] * (1 - F))
+    return np.asarray(linear_from_srgb8()[list(srgb)] * (1 - kit.F))
 
 
 CODED = 0.005
@@ -94,7 +76,7 @@ def test_textures_stand_upright_and_rights_are_kept(tmp_path: Path) -> None:
     """Objects and scenes are the same: tests/pipeline/foreign/test_mesh_formats.py."""
     scene = read(tmp_path).scene
     assert row_at(scene, -0.5, 0.5)[:3] == pytest.approx(diffuse_of(RED), abs=CODED)
-    assert row_at(scene, -0.5, 0.5)[3:7] == pytest.approx([F, F, F, 0.5], abs=1e-6)
+    assert row_at(scene, -0.5, 0.5)[3:7] == pytest.approx([kit.F, kit.F, kit.F, 0.5], abs=1e-6)
     assert scene.vertex_normals == pytest.approx(np.tile([0, 0, 1], (4, 1)), abs=1e-6)
     assert scene.objects[0].attribution == "A. Maker"
     loaded = load_source(scene_source(str(tmp_path / "a.glb")))
@@ -109,14 +91,9 @@ def test_cameras_lights_and_emission(tmp_path: Path) -> None:
         cameras=[lens],
         extensions={"KHR_lights_punctual": {"lights": [{"type": "point", "intensity": 3.0}]}},
     )  # fmt: skip
-    tree["nodes"] += [
-        {"camera": 0, "translation": [0, 2, 5]},
-        {
-            "name": "lamp",
-            "translation": [0, 3, 0],
-            "extensions": {"KHR_lights_punctual": {"light": 0}},
-        },
-    ]
+    light = {"KHR_lights_punctual": {"light": 0}}
+    lamp = {"name": "lamp", "translation": [0, 3, 0], "extensions": light}
+    tree["nodes"] += [{"camera": 0, "translation": [0, 2, 5]}, lamp]
     tree["scenes"][0]["nodes"] = [0, 1, 2]
     found = saved(tmp_path, tree, buffer)
     scene = found.scene
@@ -162,14 +139,8 @@ def test_what_is_lost_is_said_once(tmp_path: Path) -> None:
         "extensions": {"KHR_materials_clearcoat": {"clearcoatFactor": 1}},
     }
     found = read(tmp_path, material=material, animations=[{}])
-    for words in (
-        "normal map",
-        "occlusion",
-        "transparency",
-        "emission",
-        "clearcoat",
-        "animations",
-    ):
+    lost = ("normal map", "occlusion", "transparency", "emission", "clearcoat", "animations")
+    for words in lost:
         assert sum(words in text for text in found.notes) == 1, words
     files = convert_scene(
         scene_source(str(tmp_path / "a.glb")), tmp_path / "a.usda", budget=None,
@@ -184,7 +155,7 @@ def test_what_is_lost_is_said_once(tmp_path: Path) -> None:
 def test_a_missing_picture_leaves_the_factor(tmp_path: Path) -> None:
     found = read(tmp_path, "gone.png")
     assert any("left out: 'gone.png'" in text for text in found.notes)
-    assert row_at(found.scene, 0.5, 0.5)[:3] == pytest.approx([1 - F] * 3, abs=1e-6)
+    assert row_at(found.scene, 0.5, 0.5)[:3] == pytest.approx([1 - kit.F] * 3, abs=1e-6)
 
 
 @for_each("uri", ["../a.png", "http://example.com/a.png", "/etc/hostname"])
@@ -206,15 +177,15 @@ def test_a_mesh_without_coordinates_takes_the_mean_and_one_texel_is_a_constant(
     found = read(tmp_path, uv=None)
     assert any("without texture coordinates" in text for text in found.notes)
     assert not found.scene.textures
-    mean = linear_from_srgb8()[PICTURE].mean(axis=(0, 1)) * (1 - F)
+    mean = linear_from_srgb8()[PICTURE].mean(axis=(0, 1)) * (1 - kit.F)
     assert found.scene.materials[0, :3] == pytest.approx(mean, abs=1e-5)
-    one = read(tmp_path, picture_bytes(PICTURE[:1, 1:])).scene
+    one = read(tmp_path, kit.picture_bytes(PICTURE[:1, 1:])).scene
     assert not one.textures
     assert one.materials[0, :3] == pytest.approx(diffuse_of(GREEN), abs=1e-6)
 
 
 def test_coordinates_that_are_not_finite_are_refused(tmp_path: Path) -> None:
-    broken = UV_UP.copy()
+    broken = kit.UV_UP.copy()
     broken[0, 0] = np.nan
     with pytest.raises(TrilightError, match="TEXCOORD_0 is not finite"):
         read(tmp_path, uv=broken)
@@ -253,7 +224,7 @@ def _looked_up(scene: Scene, column: int) -> NDArray[np.float64]:
 
 
 def test_textures_come_back_to_their_eight_bits(tmp_path: Path) -> None:
-    scene = textured_scene(4)
+    scene = textured.textured_scene(4)
     found = there_and_back(tmp_path, scene)
     for column, most in ((0, 0.01), (2, 0.003)):
         wanted, got = (_looked_up(each, column) for each in (scene, found))
@@ -262,12 +233,13 @@ def test_textures_come_back_to_their_eight_bits(tmp_path: Path) -> None:
 
 
 def test_two_textured_albedos_of_different_widths_are_one_grid(tmp_path: Path) -> None:
-    glossy = dataclasses.replace(colour_texture(1), texels=colour_texture(1).texels[::2] // 4)
-    rough = number_texture()
-    wide = dataclasses.replace(colour_texture(2), texels=colour_texture(2).texels // 2)
+    one, two = textured.colour_texture(1), textured.colour_texture(2)
+    glossy = dataclasses.replace(one, texels=one.texels[::2] // 4)
+    rough = textured.number_texture()
+    wide = dataclasses.replace(two, texels=two.texels // 2)
     index = np.full((2, 3), -1, np.int32)
     index[FLOOR] = [0, 1, 2]
-    scene = textured_scene(0, wide, glossy, rough, material_textures=index)
+    scene = textured.textured_scene(0, wide, glossy, rough, material_textures=index)
     found = there_and_back(tmp_path, scene)
     row = found.material_index[0]
     kept = scene.materials[FLOOR]
@@ -276,14 +248,15 @@ def test_two_textured_albedos_of_different_widths_are_one_grid(tmp_path: Path) -
 
 
 def test_what_a_glb_loses_is_said(tmp_path: Path) -> None:
-    lost = " ".join(write_scene(tmp_path / "a.glb", textured_scene(environment=sky())))
+    scene = textured.textured_scene(environment=textured.sky())
+    lost = " ".join(write_scene(tmp_path / "a.glb", scene))
     for word in ("environment", "8 bits", "floors and walls", "provenance"):
         assert word in lost
 
 
 def test_a_stranger_reads_it(tmp_path: Path) -> None:
     """trimesh, which knows nothing of ours, sees the triangles with +Y up, and the normal map."""
-    scene = bumpy_scene()
+    scene = textured.bumpy_scene()
     assert "normal" not in " ".join(write_scene(tmp_path / "a.glb", scene))
     loaded = trimesh.load_scene(tmp_path / "a.glb")
     seen: Any = loaded.to_geometry()
@@ -295,7 +268,7 @@ def test_a_stranger_reads_it(tmp_path: Path) -> None:
 
 
 def test_the_file_keeps_the_laws_of_its_format() -> None:
-    data = encode_scene_glb(textured_scene())
+    data = encode_scene_glb(textured.textured_scene())
     magic, version, length, head = struct.unpack("<4sIII", data[:16])
     assert (magic, version, length) == (b"glTF", 2, len(data))
     tree = json.loads(data[20 : 20 + head])
@@ -311,7 +284,7 @@ def test_the_file_keeps_the_laws_of_its_format() -> None:
     for material in tree["materials"]:
         assert max(material.get("emissiveFactor", [0])) <= 1
         assert max(material["pbrMetallicRoughness"].get("baseColorFactor", [0])) <= 1
-    assert corner_uv(textured_scene()).shape[1] == 2
+    assert textured.corner_uv(textured.textured_scene()).shape[1] == 2
 
 
 STEPS = 0.03
@@ -319,31 +292,31 @@ STEPS = 0.03
 
 
 def glb_of(path: Path, level: Level) -> Path:
-    assert level.skin is not None
-    path.write_bytes(
-        encode_mesh_glb(level.positions, level.faces, level.skin.uv, level.skin.textures)
-    )
+    skin = level.skin
+    assert skin is not None
+    path.write_bytes(encode_mesh_glb(level.positions, level.faces, skin.uv, skin.textures))
     return path
 
 
 def test_colours_and_triangles_come_back(tmp_path: Path) -> None:
-    asset = prepare(textured_glb(tmp_path / "a.glb", picture_bytes(CORNERS)), KEEP)
-    again = prepare(glb_of(tmp_path / "b.glb", asset.levels[0]), KEEP)
+    asset = prepare(kit.textured_glb(tmp_path / "a.glb", kit.picture_bytes(kit.CORNERS)), kit.KEEP)
+    again = prepare(glb_of(tmp_path / "b.glb", asset.levels[0]), kit.KEEP)
     assert geometry(again) == geometry(asset)
-    for place in QUARTERS:
+    for place in kit.QUARTERS:
         for column in range(3):
-            before, after = seen_at(asset, *place, column), seen_at(again, *place, column)
+            before, after = kit.seen_at(asset, *place, column), kit.seen_at(again, *place, column)
             assert np.abs(before - after).max() < STEPS, (place, column)
 
 
 def test_metal_comes_back_as_the_same_light(tmp_path: Path) -> None:
     """Not as a metal: what both lobes reflect is what we keep."""
-    tree, buffer = textured_tree(picture_bytes(np.array([[[9, 51, 0], [9, 204, 255]]], np.uint8)))
+    picture = kit.picture_bytes(np.array([[[9, 51, 0], [9, 204, 255]]], np.uint8))
+    tree, buffer = kit.textured_tree(picture)
     metal = tree["materials"][0]["pbrMetallicRoughness"]
     metal |= {"metallicRoughnessTexture": metal.pop("baseColorTexture"), "metallicFactor": 1}
     metal["baseColorFactor"] = [0.9, 0.4, 0.2, 1]
-    asset = prepare(write_glb(tmp_path / "a.glb", tree, buffer), KEEP)
-    again = prepare(glb_of(tmp_path / "b.glb", asset.levels[0]), KEEP)
+    asset = prepare(write_glb(tmp_path / "a.glb", tree, buffer), kit.KEEP)
+    again = prepare(glb_of(tmp_path / "b.glb", asset.levels[0]), kit.KEEP)
     for right, column in itertools.product((-0.25, 0.25), range(3)):
-        before, after = seen_at(asset, right, 0, column), seen_at(again, right, 0, column)
+        before, after = kit.seen_at(asset, right, 0, column), kit.seen_at(again, right, 0, column)
         assert np.abs(before - after).max() < STEPS, (right, column)

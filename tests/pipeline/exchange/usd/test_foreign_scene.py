@@ -124,14 +124,12 @@ def test_our_own_files_read_as_a_stranger_does_hold_the_same_light(tmp_path: Pat
     write_usd(tmp_path / "a.usda", tiny_scene())
     text = (tmp_path / "a.usda").read_text()
     (tmp_path / "b.usda").write_text(text.replace("trilight:", "other:"))
-    found, scene = read_usd(tmp_path / "b.usda"), tiny_scene()
-    assert found.scene.provenance["template"] == "usd"
-    back = found.scene
+    back, scene = read_usd(tmp_path / "b.usda").scene, tiny_scene()
+    assert back.provenance["template"] == "usd"
     assert np.array_equal(back.vertex_positions[back.faces], scene.vertex_positions[scene.faces])
     assert np.array_equal(back.vertex_normals[back.faces], scene.vertex_normals[scene.faces])
-    assert np.array_equal(
-        back.materials[back.material_index], scene.materials[scene.material_index]
-    )
+    rows, expected = (each.materials[each.material_index] for each in (back, scene))
+    assert np.array_equal(rows, expected)
     assert np.array_equal(back.c2w, scene.c2w)
     assert back.fov_deg == pytest.approx(scene.fov_deg, rel=1e-6)  # a focal length in between
 
@@ -164,9 +162,8 @@ def test_a_stage_without_light_or_camera(tmp_path: Path) -> None:
     lamps[1].CreateIntensityAttr(-1.0)
     stage.GetPrimAtPath("/L").CreateRelationship("material:binding").AddTarget("/Gone")
     stage.GetRootLayer().Export(str(tmp_path / "a.usda"))
-    with pytest.raises(
-        TrilightError, match="/None: a light without an area; /Below: negative radiance"
-    ):
+    lost = "/None: a light without an area; /Below: negative radiance"
+    with pytest.raises(TrilightError, match=lost):
         read_usd(tmp_path / "a.usda")
     UsdLux.DistantLight.Define(stage, "/Sun")
     stage.GetRootLayer().Export(str(tmp_path / "a.usda"))
@@ -174,9 +171,8 @@ def test_a_stage_without_light_or_camera(tmp_path: Path) -> None:
         read_usd(tmp_path / "a.usda")
     lamps[0].CreateRadiusAttr(1.0)
     stage.GetRootLayer().Export(str(tmp_path / "a.usda"))
-    assert any(
-        "binding of a material that is not there" in t for t in read_usd(tmp_path / "a.usda").notes
-    )
+    notes = read_usd(tmp_path / "a.usda").notes
+    assert any("binding of a material that is not there" in text for text in notes)
     found = edited(tmp_path, lambda stage: stage.RemovePrim("/W/cam"))
     assert found.scene.num_views == 1
     assert any("no camera" in text for text in found.notes)
@@ -376,9 +372,8 @@ def test_values_that_contradict_each_other_or_their_kind_are_refused_or_noted(
     prim = stage.GetPrimAtPath(prim_path)
     assert prim
     prim.RemoveProperty(name)
-    spec = Sdf.AttributeSpec(
-        stage.GetRootLayer().GetPrimAtPath(prim_path), name, Sdf.ValueTypeNames.Find(kind)
-    )
+    owner = stage.GetRootLayer().GetPrimAtPath(prim_path)
+    spec = Sdf.AttributeSpec(owner, name, Sdf.ValueTypeNames.Find(kind))
     spec.default = value
     stage.GetRootLayer().Export(str(tmp_path / "odd.usda"))
     try:

@@ -152,36 +152,27 @@ def test_constants_beside_textures_are_read_where_they_were_changed(tmp_path: Pa
     assert [t.sha256 for t in found.scene.textures] == [t.sha256 for t in textured_scene().textures]
 
 
-@for_each(
-    "changed, expected, said",
-    [
-        (((".trilight:roughness", 0.9), (PREVIEW, 0.7)), 0.9, "not of its shader Preview or its"),
-        (((PREVIEW, 0.7), (OPENPBR, 0.8)), 0.7, "not of its shader OpenPBR"),
-        (((PREVIEW, 0.7), (OPENPBR, 0.7)), 0.7, "the value of its shader Preview is used"),
-        (((".trilight:roughness", 0.9), (OPENPBR, 0.8)), 0.9, "not of its shader OpenPBR"),
-    ],
-)
-def test_of_several_changes_the_first_place_counts(
-    tmp_path: Path, changed: Any, expected: float, said: str
-) -> None:
-    found = edited(tmp_path, tiny_scene(), set_values(*changed))
-    assert rows(found.scene)[0, 6] == np.float32(expected)
-    assert any(said in text for text in found.notes)
+def test_of_several_changes_the_first_place_counts(tmp_path: Path) -> None:
+    cases = [
+        (((".trilight:roughness", 0.9), (PREVIEW, 0.7)), "not of its shader Preview or its"),
+        (((PREVIEW, 0.7), (OPENPBR, 0.8)), "not of its shader OpenPBR"),
+        (((PREVIEW, 0.7), (OPENPBR, 0.7)), "the value of its shader Preview is used"),
+        (((".trilight:roughness", 0.9), (OPENPBR, 0.8)), "not of its shader OpenPBR"),
+    ]
+    for folder, (changed, said) in with_folders(tmp_path, cases):
+        found = edited(folder, tiny_scene(), set_values(*changed))
+        assert rows(found.scene)[0, 6] == np.float32(changed[0][1]), changed
+        assert any(said in text for text in found.notes), changed
 
 
-@for_each(
-    "path, value",
-    [
-        ("/OpenPBR.inputs:base_diffuse_roughness", 0.5),
-        ("/Preview.inputs:ior", 1.5),
-        ("/Preview.inputs:useSpecularWorkflow", 0),
-    ],
-)
-def test_a_change_that_no_column_holds_is_said(tmp_path: Path, path: str, value: Any) -> None:
-    found = edited(tmp_path, tiny_scene(), set_values((path, value)))
-    assert np.array_equal(rows(found.scene), rows(tiny_scene()))
-    name = path.replace("inputs:", "")
-    assert [f"{MATERIAL}{name}: has no place here"] == [t for t in found.notes if "no place" in t]
+def test_a_change_that_no_column_holds_is_said(tmp_path: Path) -> None:
+    cases = {"/OpenPBR.inputs:base_diffuse_roughness": 0.5, "/Preview.inputs:ior": 1.5}
+    cases |= {"/Preview.inputs:useSpecularWorkflow": 0}
+    for folder, (path, value) in with_folders(tmp_path, cases.items()):
+        found = edited(folder, tiny_scene(), set_values((path, value)))
+        assert np.array_equal(rows(found.scene), rows(tiny_scene())), path
+        said = f"{MATERIAL}{path.replace('inputs:', '')}: has no place here"
+        assert [said] == [t for t in found.notes if "no place" in t]
 
 
 def test_an_added_column_is_read_as_it_was_changed(tmp_path: Path) -> None:
@@ -201,9 +192,8 @@ def test_what_blender_loses_is_still_there(tmp_path: Path, specular: bool) -> No
         scene = textured_scene(0, number_texture(), gloss, material_textures=index)
     found = edited(tmp_path, scene, as_blender_writes)
     assert len(found.notes) == 1
-    assert {t.sha256: t.source for t in found.scene.textures} == {
-        t.sha256: t.source for t in scene.textures
-    }
+    sources = [{t.sha256: t.source for t in each.textures} for each in (found.scene, scene)]
+    assert sources[0] == sources[1]
     assert np.array_equal(rows(found.scene)[2], rows(scene)[2])
     assert found.scene.objects == scene.objects
 
@@ -222,9 +212,8 @@ def drop_preview(layer: Any) -> None:
 
 def to_metal(layer: Any) -> None:
     as_blender_writes(layer)
-    metal = Sdf.AttributeSpec(
-        layer.GetPrimAtPath(f"{MATERIAL}/Preview"), "inputs:metallic", Sdf.ValueTypeNames.Float
-    )
+    preview = layer.GetPrimAtPath(f"{MATERIAL}/Preview")
+    metal = Sdf.AttributeSpec(preview, "inputs:metallic", Sdf.ValueTypeNames.Float)
     metal.default = 1.0
 
 
@@ -232,22 +221,18 @@ def spoil(layer: Any) -> None:
     layer.GetAttributeAtPath(f"{MATERIAL}.trilight:diffuseAlbedo").default = (0.5, np.nan, 7.0)
 
 
-@for_each(
-    "edit, albedos, said",
-    [
+def test_what_is_no_longer_so_is_said(tmp_path: Path) -> None:
+    cases: list[tuple[Edit, tuple[float, ...], str]] = [
         (drop_shader, (0.5, 0.4, 0.3, 0.2, 0.2, 0.2), "the values that Trilight wrote are used"),
         (to_metal, (0, 0, 0, 11 / 21, 9 / 21, 7 / 21), "became a metal"),
         (spoil, (0.5, 0.4, 0.3, 0.2, 0.2, 0.2), "diffuseAlbedo: expected 3 numbers from 0 to 1"),
         (drop_preview, (0.1, 0.4, 0.3, 0.2, 0.2, 0.2), "the value of its shader OpenPBR is used"),
-    ],
-)
-def test_what_is_no_longer_so_is_said(
-    tmp_path: Path, edit: Edit, albedos: tuple[float, ...], said: str
-) -> None:
-    found = edited(tmp_path, tiny_scene(), edit)
-    assert rows(found.scene)[0, :6] == pytest.approx(albedos, rel=1e-6)
-    assert any(said in text for text in found.notes)
-    assert np.array_equal(rows(found.scene)[2], rows(tiny_scene())[2])
+    ]
+    for folder, (edit, albedos, said) in with_folders(tmp_path, cases):
+        found = edited(folder, tiny_scene(), edit)
+        assert rows(found.scene)[0, :6] == pytest.approx(albedos, rel=1e-6), said
+        assert any(said in text for text in found.notes), said
+        assert np.array_equal(rows(found.scene)[2], rows(tiny_scene())[2]), said
 
 
 def test_a_column_that_blender_drops_is_named(tmp_path: Path) -> None:

@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from numpy.typing import NDArray
 from PIL import Image
 from pxr import Gf, Sdf, Usd, UsdGeom, UsdLux, UsdShade
 
@@ -58,10 +59,9 @@ def odd_scene() -> Scene:
     base = tiny_scene()
     rows = np.concatenate([base.materials, base.materials[:1], base.materials[LIGHT:]])
     rows[2, :7] = [0, 0, 0, 1, 1, 1, 0]
+    places = np.concatenate([base.vertex_positions, [[-0.0, 1e-40, 999.9]]])
     return tiny_scene(
-        vertex_positions=np.concatenate([base.vertex_positions, [[-0.0, 1e-40, 999.9]]]).astype(
-            np.float32
-        ),
+        vertex_positions=places.astype(np.float32),
         vertex_normals=np.concatenate([base.vertex_normals, [[0, 1, 0]]]).astype(np.float32),
         faces=np.array([[0, 1, 2], [4, 5, 6], [0, 2, 3], [1, 2, 3]], np.uint32),
         material_index=np.array([2, LIGHT, 0, 2], np.uint16),
@@ -95,18 +95,19 @@ def scenes(draw: st.DrawFn) -> Scene:
     rows[:, :6], rows[:, 6] = rng.random((materials, 6)) / 2, rng.random(materials)
     rows[-1, 7:] = rng.random(3) * 10.0 ** draw(st.integers(-20, 20)) + 1e-30
     emits = np.arange(triangles) == triangles - 1
+
+    def rows_of(count: int) -> NDArray[np.uint16]:
+        others = rng.integers(0, count - 1, triangles)
+        return np.where(emits, count - 1, others).astype(np.uint16)
+
     text = st.text(st.characters(exclude_categories=["Cs"], exclude_characters="\0"), max_size=8)
     return tiny_scene(
         vertex_positions=(scale * rng.normal(size=(count, 3))).astype(np.float32),
         vertex_normals=normals.astype(np.float32),
         faces=rng.integers(0, count, (triangles, 3)).astype(np.uint32),
-        material_index=np.where(
-            emits, materials - 1, rng.integers(0, materials - 1, triangles)
-        ).astype(np.uint16),
+        material_index=rows_of(materials),
         materials=rows,
-        object_index=np.where(emits, objects - 1, rng.integers(0, objects - 1, triangles)).astype(
-            np.uint16
-        ),
+        object_index=rows_of(objects),
         fov_deg=rng.uniform(1e-3, 179.9, 2).astype(np.float32),
         objects=tuple(
             SceneObject(
@@ -142,9 +143,8 @@ def test_stage_says_units_and_holds_no_path(tmp_path: Path) -> None:
     text = (tmp_path / "a.usda").read_text()
     assert str(tmp_path) not in text and "@" not in text
     camera = UsdGeom.Camera.Get(stage, "/Scene/Cameras/camera_0").GetCamera()
-    assert camera.focalLength / 10 == pytest.approx(
-        0.018 / math.tan(math.radians(float(scene.fov_deg[0])) / 2), rel=1e-6
-    )
+    wanted = 0.018 / math.tan(math.radians(float(scene.fov_deg[0])) / 2)
+    assert camera.focalLength / 10 == pytest.approx(wanted, rel=1e-6)
 
 
 def test_materials_are_bound_by_subsets_and_say_the_same_in_openpbr(tmp_path: Path) -> None:
@@ -156,9 +156,8 @@ def test_materials_are_bound_by_subsets_and_say_the_same_in_openpbr(tmp_path: Pa
             continue
         subsets = UsdShade.MaterialBindingAPI(prim).GetMaterialBindSubsets()
         rows = np.array(prim.GetAttribute("trilight:faceRows").Get())
-        assert sorted(i for s in subsets for i in s.GetIndicesAttr().Get()) == list(
-            range(len(rows))
-        )
+        bound = sorted(i for s in subsets for i in s.GetIndicesAttr().Get())
+        assert bound == list(range(len(rows)))
         for subset in subsets:
             material = UsdShade.MaterialBindingAPI(subset).ComputeBoundMaterial()[0]
             (row,) = set(scene.material_index[rows[list(subset.GetIndicesAttr().Get())]])
@@ -218,42 +217,29 @@ def set_default(path: str, value: Any) -> Callable[[Any], None]:
     return lambda layer: setattr(layer.GetObjectAtPath(path), "default", value)
 
 
-@for_each(
-    "edit",
-    [
+def test_what_was_changed_or_added_is_no_longer_ours(tmp_path: Path) -> None:
+    edits: list[Callable[[Any], object]] = [
         set_default("/Scene/Objects/floor.points", [(0, 0, 0)] * 4),
         set_default("/Scene/Objects/light.inputs:intensity", 3.0),
         set_default("/Scene/Cameras/camera_0.focalLength", 3.0),
         lambda layer: layer.GetObjectAtPath("/Scene/Objects/floor").SetInfo("active", False),
         lambda layer: layer.GetObjectAtPath("/Scene/Objects/floor").SetInfo("instanceable", True),
         lambda layer: UsdLux.SphereLight.Define(Usd.Stage.Open(layer), "/Scene/Objects/more"),
-    ],
-)
-def test_what_was_changed_or_added_is_no_longer_ours(
-    tmp_path: Path, edit: Callable[[Any], None]
-) -> None:
-    assert edited_layer(tmp_path, tiny_scene(), edit).notes
+    ]
+    for folder, edit in with_folders(tmp_path, edits):
+        assert edited_layer(folder, tiny_scene(), edit).notes, folder.name
 
 
-@pytest.mark.parametrize(
-    ("scene", "name", "message"),
-    [
+def test_what_is_not_written(tmp_path: Path) -> None:
+    odd = (SceneObject(name="a\0b", kind="shell"), tiny_scene().objects[1])
+    for scene, name, message in (
         (tiny_scene(), "a.usd", "ends in .usda, .usdc, .usdz"),
         (tiny_scene(fov_deg=np.array([45, 181], np.float32)), "a.usda", "fov_deg"),
-        (
-            dataclasses.replace(
-                tiny_scene(),
-                objects=(SceneObject(name="a\0b", kind="shell"), tiny_scene().objects[1]),
-            ),
-            "a.usda",
-            "a character that USD cannot store",
-        ),
-    ],
-)
-def test_what_is_not_written(tmp_path: Path, scene: Scene, name: str, message: str) -> None:
-    with pytest.raises(TrilightError, match=message):
-        write_usd(tmp_path / name, scene)
-    assert not list(tmp_path.iterdir())
+        (tiny_scene(objects=odd), "a.usda", "a character that USD cannot store"),
+    ):
+        with pytest.raises(TrilightError, match=message):
+            write_usd(tmp_path / name, scene)
+        assert not list(tmp_path.iterdir())
 
 
 def _sky(scene: Scene) -> Environment:
@@ -356,10 +342,8 @@ def test_a_map_is_read_or_named(tmp_path: Path, asset: str, expected: Any) -> No
     (tmp_path / "text.exr").write_bytes(b"no picture")
     wide = encode_channels({"RGB": np.ones((4, 4, 3), np.float32)})
     (tmp_path / "wide.exr").write_bytes(wide)
-    found = edited(
-        tmp_path / "a.usda",
-        lambda stage, light: light.GetTextureFileAttr().Set(Sdf.AssetPath(asset)),
-    )
+    path = Sdf.AssetPath(asset)
+    found = edited(tmp_path / "a.usda", lambda stage, light: light.GetTextureFileAttr().Set(path))
     if isinstance(expected, str):
         assert found.scene.environment is None
         assert any(expected in text for text in found.notes)
@@ -377,12 +361,10 @@ def _all_textured() -> Scene:
                      source=MapSource(name='a "b" ü', licence="MIT", attribution="Ö"))  # fmt: skip
     base = textured_scene()
     index = np.array([[0, 1, 2], [-1, -1, -1], [-1, -1, 2]], np.int32)
-    rows = np.concatenate([base.materials, base.materials[:1]])
-    material_index = np.array([FLOOR, 2, LIGHT], np.uint16)
     return dataclasses.replace(
         base,
-        materials=rows,
-        material_index=material_index,
+        materials=np.concatenate([base.materials, base.materials[:1]]),
+        material_index=np.array([FLOOR, 2, LIGHT], np.uint16),
         textures=(diffuse, specular, number),
         material_textures=index,
     )
@@ -432,10 +414,8 @@ def test_other_programs_find_every_corner_where_we_have_it(tmp_path: Path) -> No
 def test_renderers_of_materialx_get_the_textures_too(tmp_path: Path) -> None:
     """A textured material has no constant OpenPBR that they would prefer; others keep it."""
     stage = written(tmp_path, textured_scene(), "a.usda")
-    for row, expected in (
-        (FLOOR, "UsdPreviewSurface"),
-        (LIGHT, "ND_open_pbr_surface_surfaceshader"),
-    ):
+    shaders = {FLOOR: "UsdPreviewSurface", LIGHT: "ND_open_pbr_surface_surfaceshader"}
+    for row, expected in shaders.items():
         material = UsdShade.Material(stage.GetPrimAtPath(f"/Scene/Materials/material_{row}"))
         assert material.ComputeSurfaceSource("mtlx")[0].GetShaderId() == expected
 

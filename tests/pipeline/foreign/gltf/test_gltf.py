@@ -230,9 +230,8 @@ def test_an_object_and_a_scene_are_what_the_file_says(
     dialect: dict[str, Any], tmp_path: Path
 ) -> None:
     path, wanted = written(dialect, tmp_path)
-    assert read_source(path, KEPT).unread == (
-        ("1 of 2 scenes: the default one is read",) if dialect["scenes"] == "default" else ()
-    )
+    unread = ("1 of 2 scenes: the default one is read",)
+    assert read_source(path, KEPT).unread == (unread if dialect["scenes"] == "default" else ())
     found = surface(path)
     assert found.shape == wanted.shape
     np.testing.assert_allclose(found, wanted, atol=2e-3)
@@ -300,6 +299,9 @@ def _set(path: str, value: Any) -> Callable[[GltfWriter], None]:
 
 PRIMITIVE = "meshes/0/primitives/0"
 NOTHING = {"componentType": 5126, "type": "VEC3"}
+HIDDEN = {"KHR_node_visibility": {"visible": False}}
+BEYOND = {"bufferView": 0, "byteOffset": 14, "componentType": 5121}
+SPARSE = {"count": 2, "indices": BEYOND, "values": {"bufferView": 0}}
 REFUSED: dict[str, tuple[str, Callable[[GltfWriter], None]]] = {
     "a later version": ("unsupported_format", _set("asset/minVersion", "2.1")),
     "an older version": ("unsupported_format", _set("asset/version", "1.0")),
@@ -310,21 +312,8 @@ REFUSED: dict[str, tuple[str, Callable[[GltfWriter], None]]] = {
     "half a triangle": ("load_error", _set("accessors/1/count", 5)),
     "an index that counts from the end": ("load_error", _set("nodes/0/mesh", -1)),
     "doubles": ("unsupported_accessor", _set("accessors/0/componentType", 5130)),
-    "a sparse value beyond": (
-        "load_error",
-        _set(
-            "accessors/0/sparse",
-            {
-                "count": 2,
-                "indices": {"bufferView": 0, "byteOffset": 14, "componentType": 5121},
-                "values": {"bufferView": 0},
-            },
-        ),
-    ),
-    "a hidden mesh": (
-        "no_faces",
-        _set("nodes/0/extensions", {"KHR_node_visibility": {"visible": False}}),
-    ),
+    "a sparse value beyond": ("load_error", _set("accessors/0/sparse", SPARSE)),
+    "a hidden mesh": ("no_faces", _set("nodes/0/extensions", HIDDEN)),
     "a bomb of nothing": ("too_many_faces", _set("accessors/0", {**NOTHING, "count": 1 << 40})),
 }
 

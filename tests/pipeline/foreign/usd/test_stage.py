@@ -14,9 +14,8 @@ from pipeline.foreign.usd.stage import OpenedStage, read_quietly
 from pipeline.foreign.usd.texture_nodes import asset_bytes
 from storage.errors import TrilightError
 from tests.for_each import for_each
+from tests.hostile.usd_cases import HEAD, chain, paired_arcs
 from tests.scenes_by_hand import tiny_scene
-
-HEAD = "#usda 1.0\n"
 
 
 def prims_of(opened: OpenedStage) -> list[str]:
@@ -76,11 +75,11 @@ def test_brackets_in_the_name_of_a_folder_are_no_archive(tmp_path: Path, packed:
         with zipfile.ZipFile(folder / "s.usdz", "w") as archive:
             for name, text in layers.items():
                 archive.writestr(name, text)
-        assert asset_bytes(f"{folder}/s.usdz[lib.usda]", 100) == layers["lib.usda"].encode()
     else:
         for name, text in layers.items():
             (folder / name).write_text(text)
-        assert asset_bytes(f"{folder}/lib.usda", 100) == layers["lib.usda"].encode()
+    library = "s.usdz[lib.usda]" if packed else "lib.usda"
+    assert asset_bytes(f"{folder}/{library}", 100) == layers["lib.usda"].encode()
     opened = OpenedStage(folder / ("s.usdz" if packed else "s.usda"))
     assert prims_of(opened) == ["/x", "/x/L"]
     assert opened.files == [opened.path, *([] if packed else [folder / "lib.usda"])]
@@ -142,20 +141,6 @@ def test_cut_files(tmp_path: Path, suffix: str) -> None:
             OpenedStage(cut)
 
 
-def chain(length: int) -> str:
-    arcs = "".join(f'def "L{i}" (references = </L{i + 1}>) {{}}\n' for i in range(length))
-    return f'{HEAD}{arcs}def "L{length}" {{}}'
-
-
-def doubled(levels: int) -> str:
-    arcs = "".join(
-        f'def "{name}{i}" (references = [</A{i + 1}>, </B{i + 1}>]) {{}}\n'
-        for i in range(levels)
-        for name in "AB"
-    )
-    return f'{HEAD}{arcs}def "A{levels}" {{}}\ndef "B{levels}" {{}}\n'
-
-
 HEIR = 'def "A" (references = @./lib.usda@</A>) {}\nclass "_c" (references = </L0>) {}\n'
 TENFOLD = "".join(
     f'def "L{i}" {{'
@@ -170,8 +155,12 @@ DEEP = opening.MAX_DEPTH + 1
     "text, most_s, message",
     [
         (f"{HEAD}{HEIR}{TENFOLD}", 20, "composes more than 1000 prims"),
-        (chain(999), 0.3, "processor seconds to compose and more follow"),
-        (doubled(16), 20, "too many arcs meet in one prim"),
+        (f'{HEAD}{chain(999)}def "L999" {{}}', 0.3, "processor seconds to compose and more follow"),
+        (
+            f'{HEAD}{paired_arcs(16)}def "A16" {{}}\ndef "B16" {{}}\n',
+            20,
+            "too many arcs meet in one prim",
+        ),
         (HEAD + 'def "a" {\n' * DEEP + "}\n" * DEEP, 20, "nested more than 150 deep"),
     ],
 )
@@ -206,9 +195,8 @@ def test_instances_of_one_prototype_count_once(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     inner = "".join(f'def "c{i}" {{}}\n' for i in range(50))
-    heirs = "".join(
-        f'def "I{i}" (instanceable = true\nreferences = </P>) {{}}\n' for i in range(50)
-    )
+    heir = 'def "I{}" (instanceable = true\nreferences = </P>) {{}}\n'
+    heirs = "".join(map(heir.format, range(50)))
     (tmp_path / "i.usda").write_text(f'{HEAD}def "P" {{\n{inner}}}\n{heirs}')
     monkeypatch.setattr(opening, "MAX_PRIMS", 1 + 51 + 50 + 50)
     prims_of(OpenedStage(tmp_path / "i.usda"))

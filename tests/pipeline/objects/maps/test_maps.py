@@ -51,58 +51,53 @@ def _find(folder: Path, kind: str = TEXTURE, licence: str | None = None) -> Foun
     return find_maps(kind, str(folder), licence=licence, allowed_licences=DEFAULT_ALLOWED)
 
 
-@for_each(
-    "stem, texture, part",
-    [
-        tuple(row.split())
-        for row in """
-            Bricks076_1K_Color                Bricks076_1K             base
-            Bricks076_1K-JPG_NormalGL         Bricks076_1K-JPG         normal
-            oak_nor_gl_2k                     oak_2k                   normal
-            oak_arm_1k                        oak_1k                   orm
-            WoodFloor_COL_VAR1_3K             WoodFloor_VAR1_3K        base
-            WoodFloor_NRM16_3K                WoodFloor_3K             normal
-            Plate_METALNESS_2K_METALNESS      Plate_2K_METALNESS       metallic
-            Plate_COL_2K_METALNESS            Plate_2K_METALNESS       base
-            Wood_Normal_(2)                   Wood_(2)                 normal
-            wood_norm_tex                     wood_tex                 normal
-            WoodColor                         Wood                     base
-            Wood_Normal_OpenGL                Wood                     normal
-            Wood_Roughness_Raw_2k             Wood_2k                  roughness
-            Wood_Mixed_AO                     Wood                     occlusion
-            vckndbi_Preview                   vckndbi                  preview
-            mat_metallicRoughness             mat                      orm
-            mat_specularf0                    mat                      other
-            tiles_color_2048x2048             tiles_2048x2048          base
-            x_BaseColor.1001                  x.1001                   base
-            Holz_Höhe_2k                      Holz_2k                  height
-            bois_rugosité                     bois                     roughness
-            木_法线                           木                       normal
-            oak_metalness                     oak                      metallic
-            oak                               oak                      base
-            color                             color                    base
-            roughness/oak                     roughness/oak            roughness
-        """.strip().split("\n")
-    ],
-)
-def test_the_words_of_a_name_are_its_part(stem: str, texture: str, part: str) -> None:
-    named = _parse_name(stem)
-    assert ((named.stem, named.part) if named else (stem, "base")) == (texture, part)
+NAMES = """
+    Bricks076_1K_Color                Bricks076_1K             base
+    Bricks076_1K-JPG_NormalGL         Bricks076_1K-JPG         normal
+    oak_nor_gl_2k                     oak_2k                   normal
+    oak_arm_1k                        oak_1k                   orm
+    WoodFloor_COL_VAR1_3K             WoodFloor_VAR1_3K        base
+    WoodFloor_NRM16_3K                WoodFloor_3K             normal
+    Plate_METALNESS_2K_METALNESS      Plate_2K_METALNESS       metallic
+    Plate_COL_2K_METALNESS            Plate_2K_METALNESS       base
+    Wood_Normal_(2)                   Wood_(2)                 normal
+    wood_norm_tex                     wood_tex                 normal
+    WoodColor                         Wood                     base
+    Wood_Normal_OpenGL                Wood                     normal
+    Wood_Roughness_Raw_2k             Wood_2k                  roughness
+    Wood_Mixed_AO                     Wood                     occlusion
+    vckndbi_Preview                   vckndbi                  preview
+    mat_metallicRoughness             mat                      orm
+    mat_specularf0                    mat                      other
+    tiles_color_2048x2048             tiles_2048x2048          base
+    x_BaseColor.1001                  x.1001                   base
+    Holz_Höhe_2k                      Holz_2k                  height
+    bois_rugosité                     bois                     roughness
+    木_法线                           木                       normal
+    oak_metalness                     oak                      metallic
+    oak                               oak                      base
+    color                             color                    base
+    roughness/oak                     roughness/oak            roughness
+"""
+"""Names of files without their suffixes, with the texture and the part that they are of."""
+
+
+def test_the_words_of_a_name_are_its_part() -> None:
+    for stem, texture, part in map(str.split, NAMES.strip().split("\n")):
+        named = _parse_name(stem)
+        assert ((named.stem, named.part) if named else (stem, "base")) == (texture, part)
 
 
 def test_sets_are_found_and_the_rest_is_said(tmp_path: Path) -> None:
-    for name in ("oak.png", "oak_roughness.png", "deep/tin_col.jpg", "deep/tin_metal.png"):
-        png(tmp_path / name, noise(1))
-    for name in ("oak_normal.png", "steel_rough.png", "Oak076.png", ".hidden.png"):
+    used = ("oak.png", "oak_roughness.png", "deep/tin_col.jpg", "deep/tin_metal.png")
+    for name in (*used, "oak_normal.png", "steel_rough.png", "Oak076.png", ".hidden.png"):
         png(tmp_path / name, noise(1))
     for name in ("readme.txt", "oak.zip", "deep/tin.psd"):
         (tmp_path / name).write_text("no picture")
     found = _find(tmp_path)
     files = {one.record.uid: sorted(one.files) for one in found.maps}
-    assert files == {
-        "texture:oak": ["base", "roughness"],
-        "texture:deep/tin": ["base", "metallic"],
-    }
+    expected = {"texture:oak": ["base", "roughness"], "texture:deep/tin": ["base", "metallic"]}
+    assert files == expected
     assert {failure.item: failure.reason for failure in found.failures} == {
         "texture:oak_normal.png": "map_not_used",
         "texture:steel_rough.png": "no_base_colour",
@@ -113,9 +108,8 @@ def test_sets_are_found_and_the_rest_is_said(tmp_path: Path) -> None:
     assert {one.record.licence for one in found.maps} == {"LicenseRef-user-provided"}
 
 
-@for_each(
-    "names, textures, unused",
-    [
+def test_folders_of_the_large_collections() -> None:
+    for names, textures, unused in (
         ("a.png b.jpg sky.exr", {"a": "a.png", "b": "b.jpg"}, "sky.exr:unknown_map"),
         ("T_W_D.png T_W_N.png T_W_ORM.png T_W_M.png", {"T_W": "T_W_D.png T_W_ORM.png"},
          "T_W_M.png:map_not_used T_W_N.png:map_not_used"),
@@ -136,14 +130,10 @@ def test_sets_are_found_and_the_rest_is_said(tmp_path: Path) -> None:
         ("albedo/o.png roughness/o.png", {"albedo/o": "albedo/o.png roughness/o.png"}, ""),
         ("o_diff.exr o_diff.png o_rough.exr o.png", {"o": "o_diff.png o_rough.exr"},
          "o.png:unknown_map o_diff.exr:name_clash"),
-    ],
-)  # fmt: skip
-def test_folders_of_the_large_collections(
-    names: str, textures: dict[str, str], unused: str
-) -> None:
-    sets, left = group_textures(names.split())
-    assert {stem: " ".join(sorted(files.values())) for stem, files in sets.items()} == textures
-    assert " ".join(f"{name}:{reason}" for name, (reason, _) in sorted(left.items())) == unused
+    ):  # fmt: skip
+        sets, left = group_textures(names.split())
+        assert {stem: " ".join(sorted(files.values())) for stem, files in sets.items()} == textures
+        assert " ".join(f"{name}:{reason}" for name, (reason, _) in sorted(left.items())) == unused
 
 
 def test_packed_pictures_gloss_and_floats_are_parts(tmp_path: Path) -> None:
@@ -177,12 +167,10 @@ def test_licences_are_those_of_the_catalogue_or_the_stated_one(tmp_path: Path) -
         exr(tmp_path / f"{name}.exr", np.ones((1, 2, 3), np.float32))
     png(tmp_path / "a.png", noise(1))
     assert _find(tmp_path, licence="CC-BY-4.0").maps[0].record.licence == "CC-BY-4.0"
-    assert "licence_refused" in {
-        one.reason for one in _find(tmp_path, licence="CC-BY-NC-4.0").failures
-    }
-    (tmp_path / "skies.csv").write_text(
-        "uid,path,licence,attribution\na,a.exr,CC-BY-4.0,Ada\nb,b.exr,,\nc,c.exr,CC-BY-NC-4.0,Cy\n"
-    )
+    refused = _find(tmp_path, licence="CC-BY-NC-4.0").failures
+    assert "licence_refused" in {one.reason for one in refused}
+    rows = "a,a.exr,CC-BY-4.0,Ada\nb,b.exr,,\nc,c.exr,CC-BY-NC-4.0,Cy\n"
+    (tmp_path / "skies.csv").write_text(f"uid,path,licence,attribution\n{rows}")
     found = _find(tmp_path, SKY)
     (only,) = found.maps
     assert (only.record.uid, only.record.licence, only.record.attribution) == (

@@ -13,19 +13,15 @@ import pytest
 
 from pipeline.objects.listing import Listing
 from pipeline.objects.objaverse import source as objaverse
-from tests.for_each import for_each
+from tests.for_each import case, for_each
 from tests.http_server import Fault, Site
 from tests.pipeline.objects import find_kit
 
 pytestmark = pytest.mark.usefixtures("place")
 
 
-def uid_of(name: str) -> str:
-    return hashlib.md5(name.encode(), usedforsecurity=False).hexdigest()
-
-
 NAMES = ("a", "b", "c", "d", "paid", "mute")
-UID = {name: uid_of(name) for name in NAMES}
+UID = {name: hashlib.md5(name.encode(), usedforsecurity=False).hexdigest() for name in NAMES}
 NAME = {uid: name for name, uid in UID.items()}
 IN_ORDER = [NAME[uid] for uid in sorted(NAME)]
 FREE = [name for name in IN_ORDER if name not in ("paid", "mute")]
@@ -74,10 +70,8 @@ def found_names(found: Listing) -> list[str]:
 
 
 def reasons(found: Listing) -> dict[str, str]:
-    return {
-        NAME.get(one.item.removeprefix("objaverse/"), one.item): one.reason
-        for one in found.failures
-    }
+    rows = find_kit.reasons(found).items()
+    return {NAME.get(item.removeprefix("objaverse/"), item): reason for item, reason in rows}
 
 
 @pytest.fixture
@@ -156,34 +150,29 @@ def test_unknown_uids_and_paths_that_lead_out_cost_themselves_only(site: Site) -
     assert reasons(found) == dict.fromkeys(("a", "c", f"objaverse/{'0' * 32}"), "unknown_uid")
 
 
-@for_each(
-    "text, message",
-    [
+def test_mistakes() -> None:
+    for text, message in (
         ("", "names no file and no uid"),
         ("category/", "malformed"),
         ("category/chair:0", "malformed"),
         ("category/chair,,vase", "malformed"),
         ("category/chairs", "no such category.*3 LVIS categories.*Did you mean chair"),
         ("category/sofabed", "Did you mean sofa_bed"),
-    ],
-)
-def test_mistakes(text: str, message: str) -> None:
-    find_kit.refusal(f"objaverse:{text}", message)
+    ):
+        with case(text):
+            find_kit.refusal(f"objaverse:{text}", message)
 
 
-@for_each(
-    "content, message",
-    [
-        (f"{uid_of('a')}\nchair\n", r"uids\.txt:2: got 'chair'"),
-        (f"{uid_of('a')} {uid_of('b')}", r"uids\.txt:1"),
-        ("# nothing\n", "holds no uid"),
-        (b"\xff\xfe", "UTF-8"),
-    ],
-)
-def test_mistakes_in_a_file_of_uids(tmp_path: Path, content: str | bytes, message: str) -> None:
+def test_mistakes_in_a_file_of_uids(tmp_path: Path) -> None:
     path = tmp_path / "uids.txt"
-    path.write_bytes(content if isinstance(content, bytes) else content.encode())
-    find_kit.refusal(f"objaverse:{path}", message)
+    for content, message in (
+        (f"{UID['a']}\nchair\n".encode(), r"uids\.txt:2: got 'chair'"),
+        (f"{UID['a']} {UID['b']}".encode(), r"uids\.txt:1"),
+        (b"# nothing\n", "holds no uid"),
+        (b"\xff\xfe", "UTF-8"),
+    ):
+        path.write_bytes(content)
+        find_kit.refusal(f"objaverse:{path}", message)
 
 
 @for_each("status, message", [(404, "no such file"), (500, "status 500")])
