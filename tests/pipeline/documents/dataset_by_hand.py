@@ -6,8 +6,10 @@ per object two flat triangles of two colours, seen by two cameras.
 And pages as a browser would read them, with text and rows of objects that mean harm.
 """
 
+import base64
 import contextlib
 import dataclasses
+import io
 import json
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from html.parser import HTMLParser
@@ -15,6 +17,8 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
+from PIL import Image
 
 from storage.dataset.dataset import Dataset, open_dataset
 from storage.dataset.layout import DatasetFolder
@@ -154,7 +158,14 @@ def edit_manifest(dataset: Dataset, **changes: Any) -> Path:
     return dataset.folder.root
 
 
+def files_of(folder: Path) -> dict[Path, bytes]:
+    return {path: path.read_bytes() for path in folder.rglob("*") if path.is_file()}
+
+
 HARM = """<script>alert(1)</script><img src=x onerror=alert(2)>"'&"""
+RIGHTS = {"licence": HARM, "attribution": HARM, "source_url": "javascript:alert(3)"}
+NOWHERE = {"report": "../report.html", "before": None, "after": None}
+"""The links of a scene's page that stands alone."""
 VOID = {"meta", "img", "br", "input"}
 
 
@@ -198,6 +209,12 @@ def read(page: bytes) -> Tags:
     tags.close()
     assert tags._open == []
     return tags
+
+
+def pixels_of(link: str) -> NDArray[np.uint8]:
+    """Return the picture that a page holds as an address of data."""
+    data = base64.b64decode(link.partition(",")[2])
+    return np.asarray(Image.open(io.BytesIO(data)))
 
 
 def row(uid: str = "made/ball", **changes: Any) -> AssetRow:

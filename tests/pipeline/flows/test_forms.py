@@ -167,13 +167,6 @@ def test_a_place_to_write_to_holds_no_secret(name: str) -> None:
         FLOWS[name].validate_parameters({"out": out})
 
 
-def test_a_place_that_cannot_be_written_is_refused_by_name() -> None:
-    """Before anything is begun: a flow makes its order first."""
-    for out in ("https://host/set", "hf://datasets/ada/set", "ftp://host/set"):
-        with pytest.raises(TrilightError, match=f"^out '{out}'"):
-            options_of_form(_parameters(out=out), GenerateOptions)
-
-
 def test_only_what_can_pass_is_tried_again_documents_too() -> None:
     errors = (EnvironmentFailure("disk"), OSError("gone"), TrilightError("wrong"), KeyError())
     for error, again in zip(errors, (True, True, False, False), strict=True):
@@ -191,13 +184,13 @@ def test_so_many_flow_runs_are_so_many_in_all(monkeypatch: pytest.MonkeyPatch) -
     def started(deployment: str, *, parameters: dict[str, Any], **options: Any) -> None:
         made.append(f"{deployment} {parameters['shards']}")
 
-    status = SimpleNamespace(shards_planned=10)
-    monkeypatch.setattr(prefect_flows, "prepare_assets", lambda **given: None)
-    monkeypatch.setattr(prefect_flows, "read_status", lambda out: status)
-    monkeypatch.setattr(prefect_flows, "run_deployment", started)
-    monkeypatch.setattr(
-        prefect_flows, "generate_scenes", lambda **given: made.append(given["shards"])
-    )
+    for name, stand_in in (
+        ("prepare_assets", lambda **given: None),
+        ("read_status", lambda out: SimpleNamespace(shards_planned=10)),
+        ("run_deployment", started),
+        ("generate_scenes", lambda **given: made.append(given["shards"])),
+    ):
+        monkeypatch.setattr(prefect_flows, name, stand_in)
     flow: Any = prefect_flows.build_dataset
     flow.fn(**_parameters(DatasetInRuns, flow_runs=3, deployment="d/x"))
     assert made == ["d/x 3:6", "d/x 6:10", "0:3", None]
@@ -208,16 +201,21 @@ def test_so_many_flow_runs_are_so_many_in_all(monkeypatch: pytest.MonkeyPatch) -
 
 
 @for_each(
-    ("given", "message"),
+    ("kind", "given", "message"),
     [
-        ({"flow_runs": 0}, "flow_runs is 0; expected a whole number from 1"),
-        ({"flow_runs": 10**6}, "flow_runs is 1000000"),
-        ({"shards": "0:2"}, "shards is '0:2'; expected no range"),
+        (DatasetInRuns, {"flow_runs": 0}, "flow_runs is 0; expected a whole number from 1"),
+        (DatasetInRuns, {"flow_runs": 10**6}, "flow_runs is 1000000"),
+        (DatasetInRuns, {"shards": "0:2"}, "shards is '0:2'; expected no range"),
+        *((GenerateOptions, {"out": out}, f"^out '{out}'")
+          for out in ("https://host/set", "hf://datasets/ada/set", "ftp://host/set")),
     ],
-)
-def test_wrong_numbers_of_runs_are_named(given: dict[str, Any], message: str) -> None:
+)  # fmt: skip
+def test_numbers_of_runs_and_places_that_cannot_be_are_named(
+    kind: type, given: dict[str, Any], message: str
+) -> None:
+    """Before anything is begun: a flow makes its order first."""
     with pytest.raises(TrilightError, match=message):
-        options_of_form(_parameters(DatasetInRuns, **given), DatasetInRuns)
+        options_of_form(_parameters(kind, **given), kind)
 
 
 @for_each(("device", "held"), [("gpu", [1]), ("cpu", [])])
@@ -257,10 +255,8 @@ def test_a_dask_worker_that_sees_another_folder_is_named_before_any_work(tmp_pat
 
 def test_a_dask_scheduler_that_does_not_answer_is_named() -> None:
     pytest.importorskip("distributed", reason="needs the package distributed (setup-all)")
-    with (
-        pytest.raises(TrilightError, match="--address http://127.0.0.1:1: no Dask scheduler"),
-        flow_executors._client("http://127.0.0.1:1"),
-    ):
+    said = "--address http://127.0.0.1:1: no Dask scheduler"
+    with pytest.raises(TrilightError, match=said), flow_executors._client("http://127.0.0.1:1"):
         pass
 
 

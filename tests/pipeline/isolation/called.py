@@ -16,10 +16,6 @@ def prepare(folder: str) -> None:
     (Path(folder) / f"started-{os.getpid()}").touch()
 
 
-def nothing() -> None:
-    """Set up nothing."""
-
-
 def double(value: int) -> int:
     return 2 * value
 

@@ -267,9 +267,8 @@ class Hostile:
 
 @pytest.fixture
 def child() -> Iterator[IsolatedChild]:
-    child = IsolatedChild(limits=LIMITS)
-    yield child
-    child.close()
+    with closing(IsolatedChild(limits=LIMITS)) as child:
+        yield child
 
 
 def test_a_hostile_pickle_makes_no_file(tmp_path: Path) -> None:

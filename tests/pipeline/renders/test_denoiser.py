@@ -405,17 +405,17 @@ def test_far_from_its_targets_a_view_goes_on_by_its_halves(
 
 
 def test_other_versions_and_damage(tmp_path: Path) -> None:
-    record = json.loads(json.dumps(dataclasses.asdict(STATEMENT)))
-    path = tmp_path / "same.json"
-    path.write_text(json.dumps(record))
-    assert load_statement(path) == STATEMENT
-    other = tmp_path / "other.json"
-    other.write_text(json.dumps({**record, "versions": {**record["versions"], "denoiser": "0"}}))
-    assert load_statement(other) is None
-    damaged = tmp_path / "damaged.json"
-    damaged.write_text(json.dumps({**record, "layouts": "many"}))
+    record = dataclasses.asdict(STATEMENT)
+
+    def stored(name: str, **changes: object) -> Path:
+        path = tmp_path / name
+        path.write_text(json.dumps(record | changes))
+        return path
+
+    assert load_statement(stored("same")) == STATEMENT
+    assert load_statement(stored("other", versions={**record["versions"], "denoiser": "0"})) is None
     with pytest.raises(TrilightError, match="layouts"):
-        load_statement(damaged)
+        load_statement(stored("damaged", layouts="many"))
 
 
 def test_the_included_statement_is_of_these_pictures() -> None:

@@ -37,9 +37,9 @@ from tests.pipeline.renders.scene_kit import (
     lit_by_a_mirror,
     material,
     mirrors,
-    quad,
     sampled_like_scene,
     sphere,
+    textured_floor,
 )
 from tests.pipeline.renders.test_renderer import lit_scene
 from tests.storage.optics.test_multiscatter import stretched
@@ -97,7 +97,7 @@ def _render(scene: Scene, settings: RenderSettings = SETTINGS) -> None:
 
 
 def _smallest() -> Scene:
-    floor = quad([[-1, -1, 0], [1, -1, 0], [1, 1, 0], [-1, 1, 0]], material(diffuse=0.5))
+    floor = textured_floor(material(diffuse=0.5))
     return join([floor, light([[-0.1, -0.1, 2], [0, 0.1, 2], [0.1, -0.1, 2]], 100.0)])
 
 
@@ -123,9 +123,8 @@ def test_one_set_of_kernels_serves_every_scene_and_view() -> None:
         _render(scene)
     _render(_large(), dataclasses.replace(SETTINGS, per_light=True))
     assert _launched() <= first
-    _render(
-        _large(), dataclasses.replace(SETTINGS, resolution=40, max_spp=16, max_depth=5, rr_depth=4)
-    )
+    other = dataclasses.replace(SETTINGS, resolution=40, max_spp=16, max_depth=5, rr_depth=4)
+    _render(_large(), other)
     assert _launched() <= first
 
 
@@ -319,10 +318,8 @@ def test_nothing_is_negative_and_nothing_is_nan() -> None:
         wo[:, 5000:20_000] = wi[:, 5000:20_000] * np.array([[-1], [-1], [1]])
         for diffuse, specular in ((0.0, 1.0), (0.0, 0.0), (1.0, 0.0), (0.3, [0.7, 0.1, 0.0])):
             lobes = kernel_lobes(diffuse=diffuse, specular=specular, roughness=roughness)
-            directions = [
-                mi.Vector3f(mi.TensorXf(d.astype(np.float32))) for d in (wi, wo, geometric)
-            ]
-            result = ggx.evaluate_bsdf(seen_at(lobes, directions[0]), *directions)
+            each = [mi.Vector3f(mi.TensorXf(d.astype(np.float32))) for d in (wi, wo, geometric)]
+            result = ggx.evaluate_bsdf(seen_at(lobes, each[0]), *each)
             for values in result:
                 dr.eval(values)
                 assert np.isfinite(np.array(values)).all()
