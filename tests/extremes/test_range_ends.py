@@ -424,16 +424,14 @@ def test_angles_keep_their_digits_to_the_farthest_position(distance: float) -> N
 
 def test_a_vertex_beyond_is_refused_with_its_distance() -> None:
     scene = toy_scene(0)
+    beyond = np.nextafter(np.float32(MAX_NETWORK_M), np.float32(np.inf))
     positions = scene.vertex_positions.copy()
-    positions[0, 0] = np.nextafter(np.float32(MAX_NETWORK_M), np.float32(np.inf))
-    at_the_end = positions.copy()
-    at_the_end[0, 0] = -MAX_NETWORK_M
-    scene_tensors(dataclasses.replace(scene, vertex_positions=at_the_end))
-    with pytest.raises(TrilightError, match="a vertex stands 1000 m from the origin"):
-        scene_tensors(dataclasses.replace(scene, vertex_positions=positions))
-    positions[0, 0] = np.nan
-    with pytest.raises(TrilightError, match="a vertex stands nan m from the origin"):
-        scene_tensors(dataclasses.replace(scene, vertex_positions=positions))
+    positions[0, 0] = -MAX_NETWORK_M
+    scene_tensors(dataclasses.replace(scene, vertex_positions=positions))
+    for value, said in ((beyond, "1000 m"), (np.nan, "nan m")):
+        positions[0, 0] = value
+        with pytest.raises(TrilightError, match=f"a vertex stands {said} from the origin"):
+            scene_tensors(dataclasses.replace(scene, vertex_positions=positions))
 
 
 @pytest.mark.parametrize("keys", [1, 16384])

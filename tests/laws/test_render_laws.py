@@ -37,7 +37,6 @@ from tests.pipeline.renders.sampling import (
     render_blocks,
 )
 from tests.pipeline.renders.scene_kit import (
-    Part,
     bumpy_room,
     flat,
     furnace,
@@ -95,9 +94,8 @@ ENDS = {
 
 def test_the_ends_of_the_mixture_are_exact() -> None:
     for name, row in ENDS.items():
-        estimate = render_blocks(
-            _furnace_plate(row, 0.8), resolution=8, block=8, max_depth=2, passes=12
-        )
+        scene = _furnace_plate(row, 0.8)
+        estimate = render_blocks(scene, resolution=8, block=8, max_depth=2, passes=12)
         expected = exact(_albedo(row, 0.8)[None, None])
         assert_agree(estimate, expected, slack=1e-3, name=name)
 
@@ -108,12 +106,8 @@ def test_a_surface_shades_the_same_from_behind() -> None:
     floor = quad([[-3, -3, 0], [3, -3, 0], [3, 3, 0], [-3, 3, 0]], material(diffuse=0.5))
     lamp = light([[-0.5, 0, 2], [0.5, 0, 2], [0, 0.6, 1.8]], 6.0)
     ball = sphere([0, 0, 0.5], 0.5, row, rings=8)
-    turned = Part(
-        triangles=ball.triangles[:, ::-1],
-        normals=-ball.normals[:, ::-1],
-        material=row,
-        kind="object",
-    )
+    triangles, normals = ball.triangles[:, ::-1], -ball.normals[:, ::-1]
+    turned = dataclasses.replace(ball, triangles=triangles, normals=normals)
     front, back = (
         render_blocks(join([floor, part, lamp], eye=(0, -2, 1)), first_seed=seed, passes=8)
         for seed, part in enumerate([ball, turned])

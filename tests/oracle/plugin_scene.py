@@ -24,7 +24,7 @@ from tests.oracle.plugin_textures import (
     PLUGIN,
     normal_mapped,
     plugin_sky,
-    register_plugin,
+    register_textures,
     textured_slots,
 )
 
@@ -75,7 +75,7 @@ def _material(scene: Scene, row: int) -> Any:
 
 def plugin_scene(scene: Scene) -> Any:
     """Return the mi.Scene of everything."""
-    register_plugin()
+    register_textures()
     surfaces, emitters = split_triangles(scene)
     shapes = {
         f"surfaces_{row}": _surfaces(scene, triangles, row)

@@ -219,7 +219,8 @@ def commands(page: str) -> list[str]:
 
 def test_colours_and_captions_say_the_value() -> None:
     scene = furnished(["a"])
-    shown = figures(page_of(sample(0, scene)))
+    page = page_of(sample(0, scene))
+    shown = figures(page)
     for view in range(scene.num_views):
         seen = view_passes(scene, SHOWN_PASSES, view=view, resolution=SIZE)
         depth_m, normal, ids, _, roughness = seen.values()
@@ -243,10 +244,7 @@ def test_colours_and_captions_say_the_value() -> None:
     assert ": 2 seen" in shown["view 1, object ids"][1]
     assert ": 0.00 to 0.60 (no unit)" in shown["view 1, diffuse albedo"][1]
     assert ": 0.30 to 0.50 (no unit)" in shown["view 1, roughness"][1]
-
-
-def test_the_table_of_objects_has_the_colours_of_the_ids() -> None:
-    page = page_of(sample(0, furnished(["a"])))
+    # The table of objects has the colours of the ids.
     squares = re.findall(r'class="id" style="background: #(\w+)"></i> (.+?)</td>', page)
     assert squares == [("800000", "floor"), ("008000", "light"), ("808000", "0 a")]
 

@@ -94,10 +94,6 @@ def count_and_die(folder: str, number: int, times: int) -> int:
     return calls
 
 
-def set_up_dying(folder: str, number: int, times: int) -> None:
-    count_and_die(folder, number, times)
-
-
 def fail_set_up(folder: str) -> None:
     count_and_die(folder, 0, 0)
     raise ModuleNotFoundError("a library is broken")

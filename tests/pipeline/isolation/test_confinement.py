@@ -341,7 +341,7 @@ def test_every_end_has_tries_and_only_two_are_verdicts() -> None:
 def test_kills_while_a_child_is_set_up_are_tried_again_and_end_the_run_at_last(
     tmp_path: Path,
 ) -> None:
-    dying = functools.partial(IsolatedChild, limits=PATIENT, factory=called.set_up_dying)
+    dying = functools.partial(IsolatedChild, limits=PATIENT, factory=called.count_and_die)
     with closing(dying(args=(str(tmp_path), signal.SIGKILL, 2))) as child:
         assert child.call(called.double, 4) == 8
     assert len(list(tmp_path.iterdir())) == 3

@@ -214,12 +214,10 @@ def _light_size(scene: Scene) -> float:
     corners = _emitters(scene)
     edges = np.linalg.norm(corners - np.roll(corners, 1, axis=1), axis=-1)
     assert np.ptp(edges) < ROUNDING
-    area = np.linalg.norm(
-        np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]), axis=1
-    )
+    area = trimesh.triangles.area(corners)
     factor = float(edges.mean()) / (2.25 * math.sqrt(0.005))
     # The size is that of the edge; the area, and with it the light, goes by its square.
-    assert np.abs(area / (2 * 0.0021651 * 2.25**2) / factor**2 - 1).max() < 1e-3
+    assert np.abs(area / (0.0021651 * 2.25**2) / factor**2 - 1).max() < 1e-3
     return factor
 
 

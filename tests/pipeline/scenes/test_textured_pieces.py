@@ -107,11 +107,8 @@ def _pool(every: int = 0, *, mapped: bool = False) -> list[PooledAsset]:
 
 def test_textures_and_own_materials_change_no_other_draw() -> None:
     for index in range(5):
-        plain, drawn, own = (
-            _scene(PLAIN, index),
-            _scene(TEXTURED, index),
-            _scene(OWN, index, _pool()),
-        )
+        plain, drawn = (_scene(settings, index) for settings in (PLAIN, TEXTURED))
+        own = _scene(OWN, index, _pool())
         for scene in (drawn, own):
             for name in ("vertex_positions", "vertex_normals", "faces", "object_index", "c2w"):
                 assert np.array_equal(getattr(plain, name), getattr(scene, name)), name
@@ -133,10 +130,8 @@ def test_as_many_surfaces_and_objects_are_textured_as_stated() -> None:
         scene = _scene(TEXTURED, index)
         for row, entry in enumerate(scene.objects):
             if entry.kind != "emitter":
-                mine, textures = (
-                    scene.material_index[scene.object_index == row],
-                    scene.material_textures,
-                )
+                mine = scene.material_index[scene.object_index == row]
+                textures = scene.material_textures
                 drawn.append(textures is not None and bool((textures[mine] >= 0).any()))
     some = apply_overrides(OWN, {"materials.own_share": 0.3})
     entries = _pool()[1:]
@@ -354,11 +349,8 @@ def test_textures_have_the_rights_and_the_means_of_their_objects() -> None:
     assert scene.textures and scene.material_textures is not None
     for texture in scene.textures:
         owner, source = owners[texture.source.name.rsplit(" ", 1)[0]], texture.source
-        assert (source.licence, source.attribution, source.source_url) == (
-            owner.licence,
-            owner.attribution,
-            owner.source_url,
-        )
+        for name in ("licence", "attribution", "source_url"):
+            assert getattr(source, name) == getattr(owner, name), name
     both = apply_overrides(OWN, {"textures.share": 1.0, "textures.surfaces.size": 8})
     drawn = _scene(both, 1, _pool())
     assert {texture.source.name.startswith("made/") for texture in drawn.textures} == {True, False}
@@ -490,12 +482,10 @@ def _object(emission: list[list[float]], name: str = "screen") -> ScenePiece:
     """A square of two triangles that emit so much."""
     entry = SceneObject(name=name, kind="object", uid=f"made/{name}")
     rng = np.random.default_rng(0)
-    first, second, third = (
-        Texture(texels=np.full((1, 1, channels), 0.1, np.float32)) for channels in (3, 3, 1)
-    )
+    colour, number = (Texture(texels=np.full((1, 1, k), 0.1, np.float32)) for k in (3, 1))
     skin = Skin(
         uv=np.zeros((6, 2), np.float32),
-        textures=(first, second, third),
+        textures=(colour, colour, number),
         emission=np.array(emission, np.float32),
     )
     return object_piece(entry, QUAD, FACES, LOOK, rng, 30.0, skin)
@@ -530,9 +520,7 @@ def test_no_part_outshines_the_brightest_lamp_and_what_emits_stays_in_its_place(
     assert len(pieces[0].materials) == 2 and pieces[0].skin is None
     entry = pieces[0].entry
     assert locked_uids([(entry.kind, entry.uid), ("emitter", "")], {}) == ["made/screen"]
-
-
-def test_without_lamps_or_share_all_stays_dark() -> None:
+    # Without lamps or a share all stays dark.
     for lamps, share_ in (([_lamp(QUAD[FACES[0]], (1.0, 1.0, 1.0))], 0.0), ([], 1.0)):
         (piece,), more = with_source_emission([_object([[1, 1, 1], [0, 0, 0]])], lamps, share_)
         assert not more and len(piece.mesh.faces) == 2

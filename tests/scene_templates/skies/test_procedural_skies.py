@@ -213,24 +213,17 @@ def test_texel_centres_are_where_the_convention_shows_them() -> None:
             assert (1 - v) * height == pytest.approx(row + 0.5, abs=1e-9)
 
 
-@for_each("height", [1, 2, 7, 64])
-def test_solid_angles_sum_to_the_sphere(height: int) -> None:
-    texels = SkyTexels(height)
-    ones = np.ones((height, 2 * height))
-    assert float(texels.flux(ones)) == pytest.approx(4 * math.pi, rel=1e-13)
-    assert texels.solid_angle.shape == (height, 1) and (texels.solid_angle > 0).all()
-
-
-def test_a_sky_cannot_write_into_the_arrays_of_the_next_one() -> None:
-    texels = SkyTexels(4)
-    shared = (texels.directions, texels.z, texels.solid_angle)
-    assert not any(array.flags.writeable for array in shared)
-
-
-def test_a_white_sky_sends_pi_onto_the_ground() -> None:
-    found = SkyTexels(64).irradiance(np.ones((64, 128, 3)))
+def test_solid_angles_sum_to_the_sphere_and_no_sky_can_write_into_those_of_the_next_one() -> None:
+    """And a white one sends pi onto the ground."""
+    for height in (1, 2, 7, 64):
+        texels = SkyTexels(height)
+        white = np.ones((height, 2 * height, 3))
+        np.testing.assert_allclose(texels.flux(white), 4 * math.pi, rtol=1e-13)
+        assert texels.solid_angle.shape == (height, 1) and (texels.solid_angle > 0).all()
+        shared = (texels.directions, texels.z, texels.solid_angle)
+        assert not any(array.flags.writeable for array in shared)
     # the midpoint rule on 64 rows errs by (pi / 64)^2 / 6
-    np.testing.assert_allclose(found, math.pi, rtol=5e-4)
+    np.testing.assert_allclose(texels.irradiance(white), math.pi, rtol=5e-4)
 
 
 @for_each("height", [1, 2, 8, 33, 64, 256])
@@ -267,9 +260,8 @@ def test_panes_have_the_solid_angle_of_rectangles_and_stand_upright() -> None:
     texels = SkyTexels(256)
     for seed in range(3):
         towards, half = _unit(seed), (0.4, 0.25)
-        expected = 4 * math.asin(
-            half[0] * half[1] / math.sqrt((1 + half[0] ** 2) * (1 + half[1] ** 2))
-        )
+        across, up = (side / math.sqrt(1 + side**2) for side in half)
+        expected = 4 * math.asin(across * up)
         found = float(texels.flux(texels.pane(towards, half, roll_rad=seed / 2)))
         # edges are ramps of about a texel whose width grows off the middle
         assert found == pytest.approx(expected, rel=0.03)
@@ -416,9 +408,8 @@ def test_only_the_sky_is_new() -> None:
     plain = preset_settings("pretrain-256").scenes
     skies = preset_settings("sky-256").scenes
     assert dataclasses.replace(skies, skies=SkySettings()) == plain
-    always = dataclasses.replace(
-        skies, skies=dataclasses.replace(skies.skies, share=1.0, maps=SMALL)
-    )
+    every = dataclasses.replace(skies.skies, share=1.0, maps=SMALL)
+    always = dataclasses.replace(skies, skies=every)
     before, after = (
         first_scene(settings, small_pool(), seed=1, scene_index=2) for settings in (plain, always)
     )
