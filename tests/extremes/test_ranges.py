@@ -157,10 +157,7 @@ def last_inside(field: FieldDescription, end: End) -> float:
     """Return the extreme number that a range admits."""
     within = field.within
     assert within is not None
-    bound, is_open = {
-        "low": (within.low, within.low_open),
-        "high": (within.high, within.high_open),
-    }[end]
+    bound, is_open = getattr(within, end), getattr(within, f"{end}_open")
     if field.kind is int:
         assert isinstance(bound, int) and not is_open
         return bound

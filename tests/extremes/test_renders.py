@@ -26,7 +26,7 @@ from storage.records.exr import decode_exr, encode_exr
 from storage.records.lights import sum_of_parts
 from storage.records.scene import Scene
 from tests.for_each import case
-from tests.pipeline.renders.sampling import camera_of, render_view
+from tests.pipeline.renders.sampling import camera_of, render_view, view_settings
 from tests.pipeline.renders.scene_kit import (
     Part,
     flat,
@@ -38,9 +38,7 @@ from tests.pipeline.renders.scene_kit import (
     sphere,
 )
 
-SETTINGS = RenderSettings(
-    resolution=16, noise_floor_db=1.0, min_spp=32, max_spp=32, aux_spp=16, min_mean_radiance=0.0
-)
+SETTINGS = view_settings(32, resolution=16, noise_floor_db=1.0, min_mean_radiance=0.0)
 NOT_DENOISED = dataclasses.replace(SETTINGS, min_spp=128, max_spp=128, denoiser="off")
 FLOOR = np.array([[-1.0, -1, 0], [1, -1, 0], [1, 1, 0], [-1, 1, 0]])
 LAMP = np.array([[-0.1, -0.1, 2], [0, 0.1, 2], [0.1, -0.1, 2]])
@@ -195,7 +193,7 @@ WIDE_VIEW = join([_floor(), light(LAMP * [9, 9, 1], 5.0)], fov_deg=60)
 @pytest.fixture(scope="module")
 def truth() -> NDArray[np.float32]:
     """Return the wide view in 8 x 8 pixels, nearly converged."""
-    most = {"resolution": 8, "min_spp": 4096, "max_spp": 4096, "denoiser": "off"}
+    most: dict[str, Any] = {"resolution": 8, "min_spp": 4096, "max_spp": 4096, "denoiser": "off"}
     return _render(WIDE_VIEW, seed=1, **most).radiance_rgb
 
 

@@ -36,7 +36,8 @@ from scene_templates.skies.procedural_skies import SkySettings
 from scene_templates.templates import TEMPLATES
 from storage.errors import TrilightError
 from storage.settings.described import from_record, settings_record
-from tests.for_each import for_each
+from storage.settings.overrides import apply_overrides
+from tests.for_each import case, for_each
 from tests.scene_templates.balls import MANY, Drawn, drawn, template_settings
 from tests.scene_templates.published import DEFAULT, STAGE_1, STAGE_2, Row
 from tests.scene_templates.statistics import (
@@ -298,9 +299,7 @@ def test_shared_rooms_are_drawn_as_stated() -> None:
     require_plausible(_shared_room_table(SharedRoom()))
     for patches in _placements(SharedRoom(), "open_box", 50):
         assert len({(one.scale, one.translation) for one in patches}) == 1
-
-
-def test_a_wrong_room_is_noticed() -> None:
+    # A wrong room is noticed.
     wrong = SharedRoom(
         square_share=0.35, scale=(1.0, 1.3), shift=0.03, raise_z=(0.0, 0.2), tilt_deg=1.5
     )
@@ -450,12 +449,10 @@ def _roll_twin(sector: Sector) -> list[float]:
     ]
 
 
-@for_each("name", TEMPLATES)
-def test_cameras_are_drawn_as_stated(name: str) -> None:
-    require_plausible(_camera_table(TEMPLATES[name].cameras))
-
-
-def test_wrong_cameras_are_noticed() -> None:
+def test_cameras_are_drawn_as_stated_and_wrong_ones_are_noticed() -> None:
+    for name, template in TEMPLATES.items():
+        with case(name):
+            require_plausible(_camera_table(template.cameras))
     wrong = {"fov_deg": (30.0, 54.0), "distance": (1.5, 1.85), "up_jitter": 0.2}
     table = _camera_table(TEMPLATES["wall"].cameras, **wrong, target_jitter=0.13)
     targets = {f"target {axis}" for axis in range(3)}
@@ -522,19 +519,13 @@ def test_records_of_random_cameras_say_nothing_of_a_path() -> None:
     assert from_record(CameraSettings, settings_record(orbit)) == orbit
 
 
-def test_an_object_alone_stands_in_the_middle() -> None:
-    settings = SceneSettings(families=(alone(),))
-    settings = dataclasses.replace(
-        settings, placement=dataclasses.replace(settings.placement, orientation="kept")
-    )
-    for one in drawn(settings, 10):
+def test_an_object_without_a_room_is_alone_and_stands_in_the_middle() -> None:
+    kept = {"placement.orientation": "kept"}
+    for one in drawn(apply_overrides(SceneSettings(families=(alone(),)), kept), 10):
         (placement,) = one.layout.objects
         assert one.layout.shell == ()
         assert not placement.pose.centre.any() and placement.pose.radius == 0.5
         assert np.array_equal(placement.pose.rotation, np.eye(3))
-
-
-def test_a_layout_without_a_room_holds_one_object() -> None:
     with pytest.raises(TrilightError, match=r"\(1, 2\); expected \(1, 1\) for alone"):
         Family(**{**vars(alone()), "num_objects": (1, 2)})
 

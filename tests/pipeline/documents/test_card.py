@@ -403,9 +403,8 @@ def test_it_is_json_whatever_the_licences_are_called(tmp_path: Path, licence: st
 def eleven(tmp_path: Path) -> Dataset:
     """Return 11 shards of one scene each, one of them for testing."""
     shards = {f"train-{row:06d}.tar": [sample(row, tiny_scene())] for row in range(10)}
-    return write_dataset(
-        tmp_path / "set", {**shards, "test-000010.tar": [sample(10, tiny_scene())]}
-    )
+    shards["test-000010.tar"] = [sample(10, tiny_scene())]
+    return write_dataset(tmp_path / "set", shards)
 
 
 def test_shards_are_spread_over_each_split(

@@ -369,7 +369,7 @@ def cells(data: bytes) -> list[dict[str, str]]:
     return list(csv.DictReader(io.StringIO(data.decode(), newline="")))
 
 
-def test_rows_are_sorted_complete_and_come_back_as_they_were() -> None:
+def test_rows_are_sorted_complete_inert_and_come_back_as_they_were() -> None:
     read = cells(encode_attribution([row("b"), row("a", attribution="somebody, and others")]))
     assert [entry["uid"] for entry in read] == ["a", "b"]
     assert list(read[0])[:4] == ["uid", "title", "licence", "licence_source"]
@@ -386,9 +386,7 @@ def test_rows_are_sorted_complete_and_come_back_as_they_were() -> None:
         (again,) = cells(encode_attribution([row(title=text)]))
         assert again["title"] == text
     assert encode_attribution([]).count(b"\n") == 1
-
-
-def test_formulas_are_made_inert() -> None:
+    # Formulas are made inert.
     fields = ["uid", "title", "licence", "licence_source", "attribution", "source_url"]
     for field, start in itertools.product(fields, ["=", "+", "-", "@", "\t", "\r"]):
         formula = f'{start}HYPERLINK("https://example.org/?"&A1)'
@@ -433,8 +431,10 @@ def test_all_are_chosen_where_there_are_few_and_exactly_as_many_as_asked_for() -
         assert len(keys) == len(set(keys)) == count
 
 
-def test_small_splits_are_seen() -> None:
-    chosen = chosen_of(48, train=4000, validation=20, test=3)
+def test_small_splits_are_seen_and_only_shards_of_chosen_scenes_are_opened() -> None:
+    listed = Listed(train=4000, validation=20, test=3)
+    chosen = choose_scenes(cast(Dataset, listed), 48)
+    assert sorted(listed.opened) == sorted({shard.name for shard, _ in chosen})
     splits = [shard.split for shard, _ in chosen]
     assert (splits.count("validation"), splits.count("test")) == (6, 3)
     assert len(set(key for _, key in chosen)) == len(chosen) == 48
@@ -442,9 +442,3 @@ def test_small_splits_are_seen() -> None:
     gaps = [after - before for before, after in itertools.pairwise(train)]
     assert (train[0], train[-1]) == (0, 3999)
     assert max(gaps) - min(gaps) <= 1
-
-
-def test_only_shards_of_chosen_scenes_are_opened() -> None:
-    listed = Listed(train=4000, test=40)
-    chosen = choose_scenes(cast(Dataset, listed), 10)
-    assert sorted(listed.opened) == sorted({shard.name for shard, _ in chosen})

@@ -14,6 +14,7 @@ from concurrent.futures import Future
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any, cast
+from unittest.mock import Mock
 
 import pytest
 from PIL import Image
@@ -279,9 +280,7 @@ class Cancelled(BaseException):
 
 
 def test_what_is_cancelled_saves_and_status_and_lines_are_passed_on(tmp_path: Path) -> None:
-    def cancel(line: str) -> None:
-        raise Cancelled
-
+    cancel = Mock(side_effect=Cancelled)
     with pytest.raises(Cancelled):
         run_to_end([sys.executable, "-c", SAVES, str(tmp_path / "saved")], cancel)
     assert (tmp_path / "saved").read_text() == "1"
@@ -373,9 +372,7 @@ def test_a_run_of_a_range_shows_its_own_shards_and_cost(
 def test_a_run_that_fails_says_so_in_its_summary(
     tables: Shown, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    def full(*arguments: object) -> None:
-        raise TrilightError("the disk is full of https://me:secret@host/x")
-
+    full = Mock(side_effect=TrilightError("the disk is full of https://me:secret@host/x"))
     monkeypatch.setattr(prefect_runner, "make_dataset", full)
     with pytest.raises(TrilightError):
         make_with_page(GenerateOptions(out=str(tmp_path)), PrefectRunner())
@@ -455,9 +452,7 @@ def test_who_watches_alone_asks_for_nothing_and_waits_so_long(
 def test_a_page_that_cannot_be_shown_ends_neither_a_run_nor_an_array(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
 ) -> None:
-    def gone(*args: object, **named: object) -> None:
-        raise ConnectionError("gone")
-
+    gone = Mock(side_effect=ConnectionError("gone"))
     monkeypatch.setattr(prefect_runner, "create_progress_artifact", gone)
     monkeypatch.setattr(prefect_runner, "create_table_artifact", gone)
     page = RunPage(str(tmp_path))

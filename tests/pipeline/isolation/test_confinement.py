@@ -11,6 +11,7 @@ from collections.abc import Callable, Iterator, Mapping
 from contextlib import closing
 from pathlib import Path
 from types import SimpleNamespace
+from unittest.mock import Mock
 
 import pytest
 
@@ -31,7 +32,7 @@ from pipeline.isolation.call_failures import ENDS, with_retries
 from pipeline.isolation.system_calls import landlock_version, seccomp_works
 from storage.errors import EnvironmentFailure, TrilightError
 from tests.conftest import ROOT
-from tests.for_each import for_each
+from tests.for_each import case, for_each
 from tests.pipeline.isolation import called, probes
 from tests.pipeline.isolation.probes import PROBES
 
@@ -315,21 +316,13 @@ def test_the_same_call_is_made_again(plain_child: IsolatedChild, tmp_path: Path)
     assert call_with_retries(plain_child, *call) == 3
 
 
-@for_each(("reason", "end"), ENDS.items())
-def test_tries_end(reason: str, end: call_failures.End) -> None:
-    calls: list[str] = []
-
-    def fail() -> None:
-        calls.append(reason)
-        raise ChildFailed(reason, "as ever")
-
-    with pytest.raises(ChildFailed) as caught:
-        with_retries(fail)
-    assert (len(calls), caught.value.is_verdict) == (end.tries, end.is_verdict)
-
-
-def test_every_end_has_tries_and_only_two_are_verdicts() -> None:
+def test_tries_end_and_only_two_ends_are_verdicts() -> None:
     """A verdict may be kept, and lead to other data: whoever adds one must say so here."""
+    for reason, end in ENDS.items():
+        fail = Mock(side_effect=ChildFailed(reason, "as ever"))
+        with case(reason), pytest.raises(ChildFailed) as caught:
+            with_retries(fail)
+        assert (fail.call_count, caught.value.is_verdict) == (end.tries, end.is_verdict), reason
     verdicts = {name for name, end in ENDS.items() if end.is_verdict}
     assert verdicts == {"timeout_cpu", "crashed_signal"}
     assert all(1 <= end.tries <= 3 for end in ENDS.values())

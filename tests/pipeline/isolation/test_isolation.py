@@ -17,6 +17,7 @@ from multiprocessing import popen_forkserver
 from pathlib import Path
 from types import ModuleType
 from typing import Any
+from unittest.mock import Mock
 
 import pytest
 
@@ -49,9 +50,7 @@ def child(tmp_path: Path) -> Iterator[IsolatedChild]:
 def test_a_child_that_cannot_start_leaves_the_program_as_it_was(
     child: IsolatedChild, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    def full() -> str:
-        raise FileNotFoundError("no usable temporary folder")
-
+    full = Mock(side_effect=FileNotFoundError("no usable temporary folder"))
     program = ModuleType("__main__")
     monkeypatch.setitem(sys.modules, "__main__", program)
     monkeypatch.delenv("PYTHONSAFEPATH", raising=False)

@@ -33,14 +33,21 @@ from pipeline.renders.pictures import (
     squared_error,
 )
 from pipeline.renders.samples import DualBuffer, TileChoice
-from pipeline.renders.settings import Arithmetic, RenderSettings
+from pipeline.renders.settings import Arithmetic
 from pipeline.renders.tracer import load_tracer
 from pipeline.renders.view_pictures import LEAST_PASSES, with_mean_of
 from storage import denoiser
 from storage.denoiser import Features, denoise, load_oidn, set_denoiser_device
 from storage.errors import TrilightError
 from tests.for_each import for_each
-from tests.pipeline.renders.sampling import Half, camera_of, floor_of, halves_of, render_view
+from tests.pipeline.renders.sampling import (
+    Half,
+    camera_of,
+    floor_of,
+    halves_of,
+    render_view,
+    view_settings,
+)
 from tests.pipeline.renders.scene_kit import sampled_like_scene
 from tests.pipeline.renders.test_renderer import lit_scene
 
@@ -268,19 +275,15 @@ def test_the_standard_error_is_that_between_passes() -> None:
 @pytest.mark.parametrize(("max_spp", "per_light"), [(32, False), (256, True)])
 def test_a_view_is_as_bright_as_its_samples_at_every_cap(max_spp: int, per_light: bool) -> None:
     scene = sampled_like_scene(np.random.default_rng(5), num_views=1)
-    settings = RenderSettings(
-        resolution=16, noise_floor_db=80.0, min_spp=32, max_spp=max_spp, per_light=per_light
-    )
+    settings = view_settings(32, resolution=16, max_spp=max_spp, per_light=per_light)
     # Tiles are chosen by denoised pictures: without the denoiser others would get more samples.
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(TileChoice, "passes", lambda self, samples, mean_spp: None)
         view = render_view(scene, settings, 7)
         raw = render_view(scene, dataclasses.replace(settings, denoiser="off"), 7)
+    shown, sampled = (each.radiance_rgb.mean(dtype=np.float64) for each in (view, raw))
     # Pictures of single lights are rounded to half floats, by up to 1 part in 2048 each.
-    tolerance = 5e-4 if per_light else 1e-6
-    assert view.radiance_rgb.mean(dtype=np.float64) == pytest.approx(
-        raw.radiance_rgb.mean(dtype=np.float64), rel=tolerance
-    )
+    assert shown == pytest.approx(sampled, rel=5e-4 if per_light else 1e-6)
 
 
 WEIGHTS = dict.fromkeys((*MEASURES, "hits", "samples", "width"), 0.2)
@@ -300,14 +303,7 @@ STATEMENT = CalibratedStatement(
     widths=(32, 256),
     metrics=dict.fromkeys(METRICS, METRIC),
 )
-SETTINGS = RenderSettings(
-    resolution=32,
-    noise_floor_db=99.0,
-    min_spp=32,
-    max_spp=256,
-    min_mean_radiance=0.0,
-    stated_error="calibrated",
-)
+SETTINGS = view_settings(32, max_spp=256, min_mean_radiance=0.0, stated_error="calibrated")
 
 
 @pytest.fixture

@@ -30,7 +30,7 @@ from storage.optics.bsdf import bsdf_lobes
 from storage.optics.multiscatter import directional_albedo, scattered_again
 from storage.records.scene import Scene
 from tests.for_each import for_each
-from tests.pipeline.renders.sampling import camera_of, render_view
+from tests.pipeline.renders.sampling import camera_of, render_view, view_settings
 from tests.pipeline.renders.scene_kit import (
     join,
     light,
@@ -48,9 +48,7 @@ pytestmark = pytest.mark.usefixtures("llvm")
 
 PX = 32
 
-SETTINGS = RenderSettings(
-    resolution=32, noise_floor_db=99.0, min_spp=8, max_spp=8, aux_spp=4, min_mean_radiance=0.0
-)
+SETTINGS = view_settings(8, aux_spp=4, min_mean_radiance=0.0)
 
 
 @pytest.fixture

@@ -27,7 +27,6 @@ from pipeline.renders.guide_table import (
     learn,
 )
 from pipeline.renders.renderer import RenderedView, SceneRenderer
-from pipeline.renders.settings import RenderSettings
 from pipeline.renders.tracer import PixelCamera
 from pipeline.renders.vector_tracer import (
     VectorTracer,
@@ -45,6 +44,7 @@ from tests.pipeline.renders.sampling import (
     camera_of,
     render_blocks,
     render_passes,
+    view_settings,
 )
 from tests.pipeline.renders.scene_kit import (
     GUIDED_FLOOR,
@@ -178,9 +178,7 @@ def test_a_caustic_has_a_fraction_of_the_noise() -> None:
 _SEEDS = ((11, 5), (12, 6), (13, 7))
 """Of the camera paths and of the light paths of three passes."""
 
-SHARED = RenderSettings(
-    resolution=32, noise_floor_db=99.0, min_spp=64, max_spp=64, light_paths="scene"
-)
+SHARED = view_settings(64, light_paths="scene")
 
 
 def _orbit() -> tuple[Scene, list[PixelCamera]]:
@@ -416,11 +414,8 @@ def test_only_views_that_miss_their_floor_are_guided(monkeypatch: pytest.MonkeyP
     scene = mirrors()
     camera = camera_of(scene, 16)
     for floor_db, max_spp, times in ((1.0, 512, 0), (90.0, 256, 0), (90.0, 512, 1)):
-        settings = RenderSettings(
-            resolution=16, noise_floor_db=floor_db, min_spp=8, max_spp=max_spp,
-            min_mean_radiance=0.0,
-            per_light=True,
-        )  # fmt: skip
+        settings = view_settings(8, resolution=16, min_mean_radiance=0.0, per_light=True)
+        settings = dataclasses.replace(settings, noise_floor_db=floor_db, max_spp=max_spp)
         renderer = SceneRenderer(scene, settings)
         for seed in range(2):
             renderer.render_view(camera.c2w, camera.fov_deg, seed)

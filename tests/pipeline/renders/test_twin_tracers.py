@@ -48,6 +48,7 @@ from tests.pipeline.renders.sampling import (
     render_blocks,
     render_view,
     scores,
+    view_settings,
 )
 from tests.pipeline.renders.scene_kit import (
     SKY_LAMP,
@@ -221,15 +222,13 @@ def test_a_faint_emitter_is_a_surface() -> None:
     faint = row + material(roughness=0, emission=1e-6)
     scenes = [_panel_in_a_mirror(flat(PANEL, *kind)) for kind in ((row,), (faint, "emitter"))]
     surface, emitter = (
-        render_blocks(scene, passes=8, first_seed=seed) for seed, scene in enumerate(scenes)
+        render_blocks(each, passes=8, first_seed=k) for k, each in enumerate(scenes)
     )
     assert surface.mean.max() > 0.01
     assert_agree(emitter, surface, slack=2e-3)  # as above
 
 
-SETTINGS = RenderSettings(
-    resolution=32, noise_floor_db=60.0, min_spp=32, max_spp=32, aux_spp=16, split=True
-)
+SETTINGS = view_settings(32, noise_floor_db=60.0, aux_spp=16, split=True)
 
 KINDS = [{"split": True}, {"split_lobes": True}, {"split": True, "split_lobes": True}]
 FLOOR = quad([[-2, -2, 0], [2, -2, 0], [2, 2, 0], [-2, 2, 0]], material(diffuse=0.5))

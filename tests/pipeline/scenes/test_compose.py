@@ -150,11 +150,6 @@ def test_rights_travel_and_names_are_unique(pool: list[PooledAsset]) -> None:
         assert entry.source_url == "https://example.org/made/wall1"
 
 
-def test_an_empty_pool_is_a_users_mistake() -> None:
-    with pytest.raises(TrilightError, match="pool"):
-        compose_scene(SETTINGS, [], SceneKey(0, 0))
-
-
 def test_a_scene_without_objects_is_a_scene(pool: list[PooledAsset]) -> None:
     """The published families have some; a view of one need not show any object."""
     settings = template_settings("open_box", {"families.num_objects": [0, 0]})
@@ -430,7 +425,9 @@ def test_the_worst_error_is_the_least_that_the_budget_allows() -> None:
     assert better > 100  # else any choice would do
 
 
-def test_too_little_room_is_rejected_with_the_numbers() -> None:
+def test_too_little_room_is_rejected_with_the_numbers_and_an_empty_pool_is_a_mistake() -> None:
+    with pytest.raises(TrilightError, match="pool"):
+        compose_scene(SETTINGS, [], SceneKey(0, 0))
     with pytest.raises(Rejected, match="1 objects need 300 triangles at least.*has 200"):
         levels_within([_asset([(300, 0.1), (600, 0.0)])], 200, 0.0)
     with pytest.raises(Rejected, match="^over_budget: 3 objects of at least 50 .* into the 149"):
