@@ -67,16 +67,17 @@ FIELDS = [
 """Every declared range of settings."""
 
 
-def _held(settings: Any) -> Iterator[Any]:
+def _walk_settings(settings: Any) -> Iterator[Any]:
     """Yield settings, and those that their fields hold."""
     yield settings
     for field in dataclasses.fields(settings):
         if dataclasses.is_dataclass(value := getattr(settings, field.name)):
-            yield from _held(value)
+            yield from _walk_settings(value)
 
 
-_OF_PRESETS = {type(each): each for each in (*_held(SMOKE), *_held(RUN), *_held(WatchSettings()))}
-_STATED: tuple[Any, ...] = (
+_PRESETS = (SMOKE, RUN, WatchSettings())
+_FROM_PRESETS = {type(each): each for preset in _PRESETS for each in _walk_settings(preset)}
+_HAND_MADE: tuple[Any, ...] = (
     DatasetInRuns(), ONE_FAMILY_EACH[0], SharedRoom(), SideRanges(),
     dataclasses.replace(SMOKE.scenes.cameras, elevation_deg=(0.0, 60.0)),
     Excursion(axis="fov_deg", value=10.0, changes=()), ListedShard(split="train", scenes=4),
@@ -87,8 +88,8 @@ _STATED: tuple[Any, ...] = (
     LeaderboardOptions(source="a", width=(64,)),
 )  # fmt: skip
 EXAMPLES: dict[type, Any] = {
-    **{kind: _OF_PRESETS[kind] for kind, _ in FIELDS if kind in _OF_PRESETS},
-    **{type(each): each for each in _STATED},
+    **{kind: _FROM_PRESETS[kind] for kind, _ in FIELDS if kind in _FROM_PRESETS},
+    **{type(each): each for each in _HAND_MADE},
 }
 """A valid value of every class that declares a range, but for `Scene`."""
 

@@ -193,8 +193,8 @@ WIDE_VIEW = join([_floor(), light(LAMP * [9, 9, 1], 5.0)], fov_deg=60)
 @pytest.fixture(scope="module")
 def truth() -> NDArray[np.float32]:
     """Return the wide view in 8 x 8 pixels, nearly converged."""
-    most: dict[str, Any] = {"resolution": 8, "min_spp": 4096, "max_spp": 4096, "denoiser": "off"}
-    return _render(WIDE_VIEW, seed=1, **most).radiance_rgb
+    changes: dict[str, Any] = {"resolution": 8, "min_spp": 4096, "max_spp": 4096, "denoiser": "off"}
+    return _render(WIDE_VIEW, seed=1, **changes).radiance_rgb
 
 
 @pytest.mark.parametrize(("resolution", "spp"), [(8, 1024), (40, 128), (136, 16)])

@@ -169,9 +169,8 @@ def test_lobes_add_up_to_the_material_and_never_exceed_one() -> None:
     bound = lobes.diffuse.max(1) + lobes.specular.max(1) + 1e-12
     assert (diffuse.max(1) <= bound).all() and (specular.max(1) <= bound).all()
     assert lobes.weight[0] == 0 and lobes.weight[1] == 1 and lobes.weight[2] == 0
-    np.testing.assert_allclose(
-        lobes.alpha, np.maximum(rows[:, 6].astype(np.float64) ** 2, MIN_ALPHA)
-    )
+    widths = np.maximum(rows[:, 6].astype(np.float64) ** 2, MIN_ALPHA)
+    np.testing.assert_allclose(lobes.alpha, widths)
 
 
 def _mean_radiance_of_a_ball() -> float:

@@ -144,9 +144,8 @@ def _emitter(scene: Scene, triangles: NDArray[np.intp], side: int) -> Any:
     properties = mi.Properties()
     properties["bsdf"] = _material(scene, int(scene.material_index[triangles[0]]))
     colour = {"type": "rgb", "value": radiance.tolist()}
-    properties["emitter"] = mi.load_dict(
-        {"type": "area", "radiance": colour, "sampling_weight": power}
-    )
+    area = {"type": "area", "radiance": colour, "sampling_weight": power}
+    properties["emitter"] = mi.load_dict(area)
     twin = corners[:, ::side] + side * _TWIN_OFFSET * normal[:, None]
     vertices = {"positions": twin.reshape(-1, 3)}
     if scene.uv is not None:

@@ -103,7 +103,7 @@ def register_textures() -> None:
     _register(_WIDTH, _squared_roughness, "roughness", mean=dr.square)
     for smith in get_args(Smith):
         _register(_AGAIN[smith], partial(_scattered_again, smith), "specular", "alpha")
-    _register(PLUGIN, _compensated, "specular", "again", "alpha")
+    _register(PLUGIN, _compensated_specular, "specular", "again", "alpha")
 
 
 def _register(
@@ -139,20 +139,21 @@ def _squared_roughness(si: Any, active: Any, roughness: Any) -> Any:
 
 
 def _scattered_again(smith: Smith, si: Any, active: Any, specular: Any, alpha: Any) -> Any:
-    place = _texel(dr.sqrt(alpha.eval_1(si, active)), ROUGHNESS_STEPS)
+    place = _texel_coordinate(dr.sqrt(alpha.eval_1(si, active)), ROUGHNESS_STEPS)
     mean, color = _mean_table(smith).eval(mi.Point1f(place))[0], specular.eval(si, active)
     return color * mean / (1 - color * (1 - mean))
 
 
-def _compensated(si: Any, active: Any, specular: Any, again: Any, alpha: Any) -> Any:
+def _compensated_specular(si: Any, active: Any, specular: Any, again: Any, alpha: Any) -> Any:
     width, cosine = alpha.eval_1(si, active), dr.maximum(si.wi.z, _LEAST_COS)
     stretched = cosine * dr.rsqrt(dr.square(cosine) + dr.square(width) * (1 - dr.square(cosine)))
-    u, v = _texel(dr.sqrt(stretched), X_STEPS), _texel(dr.sqrt(width), ROUGHNESS_STEPS)
+    u = _texel_coordinate(dr.sqrt(stretched), X_STEPS)
+    v = _texel_coordinate(dr.sqrt(width), ROUGHNESS_STEPS)
     albedo = _albedo_table().eval(mi.Point2f(u, v))[0]
     return specular.eval(si, active) * (1 + again.eval(si, active) * ((1 - albedo) / albedo))
 
 
-def _texel(share: Any, steps: int) -> Any:
+def _texel_coordinate(share: Any, steps: int) -> Any:
     """Return where a table has a number from 0 to 1: the centre of texel k is (k + 0.5) / steps."""
     return (share * (steps - 1) + 0.5) / steps
 

@@ -211,13 +211,9 @@ def _table(scenes: list[Drawn], stated: Stated) -> Table:
         for axis, name in enumerate("xyz"):
             table[f"centre {name}"] = uniform(centres[:, axis], -0.5, 0.5)
         for low, high in sorted({row[3] for row in stated.rows}):
-            found = [
-                4 * placement.pose.radius
-                for one in scenes
-                for placement in one.layout.objects
-                if stated.row_of(one)[3] == (low, high)
-            ]
-            table[f"sizes {low} to {high}"] = uniform(found, low, high)
+            chosen = [one.layout for one in scenes if stated.row_of(one)[3] == (low, high)]
+            sizes = [4 * each.pose.radius for layout in chosen for each in layout.objects]
+            table[f"sizes {low} to {high}"] = uniform(sizes, low, high)
     return table
 
 
@@ -253,10 +249,8 @@ def test_everything_is_distributed_as_stated(build: str) -> None:
 def test_the_second_training_stage_draws_the_same() -> None:
     """Its budget, and how finely it is spent, are all that differs: one table stands for both."""
     pretrain, finetune = (preset_settings(name).scenes for name in ("pretrain-256", "finetune-512"))
-    same = dataclasses.replace(
-        finetune, max_triangles=pretrain.max_triangles, enough_error=pretrain.enough_error
-    )
-    assert same == pretrain
+    budget = {name: getattr(pretrain, name) for name in ("max_triangles", "enough_error")}
+    assert dataclasses.replace(finetune, **budget) == pretrain
     assert (finetune.max_triangles, finetune.enough_error) == (4096, 0.0025)
 
 
@@ -279,9 +273,7 @@ def _shared_room_table(shell: SharedRoom) -> Table:
     table = {"square": share(square, 0.5)}
     for axis, name in enumerate("xyz"):
         table[f"scale {name}"] = uniform(scale[:, axis], 1.0, 1.35)
-        table[f"move {name}"] = uniform(
-            move[:, axis], *((-0.05, 0.25) if axis == 2 else (-0.05, 0.05))
-        )
+        table[f"move {name}"] = uniform(move[:, axis], -0.05, 0.25 if axis == 2 else 0.05)
     for row, part in enumerate(TEMPLATES["corner"].parts):
         turns = np.array([patches[row].rotation_deg for patches in rooms])
         axis = SIDES[part].axis
@@ -520,8 +512,8 @@ def test_records_of_random_cameras_say_nothing_of_a_path() -> None:
 
 
 def test_an_object_without_a_room_is_alone_and_stands_in_the_middle() -> None:
-    kept = {"placement.orientation": "kept"}
-    for one in drawn(apply_overrides(SceneSettings(families=(alone(),)), kept), 10):
+    changes = {"placement.orientation": "kept"}
+    for one in drawn(apply_overrides(SceneSettings(families=(alone(),)), changes), 10):
         (placement,) = one.layout.objects
         assert one.layout.shell == ()
         assert not placement.pose.centre.any() and placement.pose.radius == 0.5

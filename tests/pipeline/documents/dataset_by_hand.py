@@ -44,7 +44,7 @@ def furnished(uids: Sequence[str], template: str = "plane", **entry: Any) -> Sce
     """Return the tiny scene with an object per uid; `entry` holds the rights of all of them."""
     scene, count = tiny_scene(), len(uids)
     quad = np.array([[0, 0, 0.1], [1, 0, 0.1], [1, 1, 0.1], [0, 0, 0.1], [1, 1, 0.1], [0, 1, 0.1]])
-    more: dict[str, Any] = {
+    added: dict[str, Any] = {
         "vertex_positions": np.tile(quad, (count, 1)),
         "vertex_normals": np.tile([[0, 0, 1]], (6 * count, 1)),
         "faces": 7 + np.arange(6 * count).reshape(-1, 3),
@@ -56,7 +56,7 @@ def furnished(uids: Sequence[str], template: str = "plane", **entry: Any) -> Sce
         SceneObject(name=f"{row} {uid}", kind="object", uid=uid, **entry)
         for row, uid in enumerate(uids)
     )
-    arrays = {name: np.concatenate([getattr(scene, name), rows]) for name, rows in more.items()}
+    arrays = {name: np.concatenate([getattr(scene, name), rows]) for name, rows in added.items()}
     arrays = {name: rows.astype(getattr(scene, name).dtype) for name, rows in arrays.items()}
     provenance = {**scene.provenance, "template": template}
     return tiny_scene(**arrays, objects=(*scene.objects, *objects), provenance=provenance)
@@ -158,7 +158,7 @@ def files_of(folder: Path) -> dict[Path, bytes]:
 
 HARM = """<script>alert(1)</script><img src=x onerror=alert(2)>"'&"""
 RIGHTS = {"licence": HARM, "attribution": HARM, "source_url": "javascript:alert(3)"}
-NOWHERE = {"report": "../report.html", "before": None, "after": None}
+NO_LINKS = {"report": "../report.html", "before": None, "after": None}
 """The links of a scene's page that stands alone."""
 VOID = {"meta", "img", "br", "input"}
 

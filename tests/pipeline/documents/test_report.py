@@ -29,7 +29,7 @@ from storage.records.scene import SceneObject
 from storage.records.texture import MapSource, Texture
 from tests.pipeline.documents.dataset_by_hand import (
     HARM,
-    NOWHERE,
+    NO_LINKS,
     RIGHTS,
     Tags,
     edit_manifest,
@@ -269,7 +269,7 @@ def test_a_texture_is_shown_as_it_lies() -> None:
     pictures = [pixels_of(shown.picture or "") for shown in shown_maps(scene)]
     assert pictures[0].tolist() == [[[0] * 3] * 2, [[0] * 3, [200, 100, 50]]]
     assert pictures[2].shape == (112, 224, 3) and pictures[2].max() == 255
-    page = read(encode_scene_page(sample(0, scene.with_provenance({})), "train", (), NOWHERE))
+    page = read(encode_scene_page(sample(0, scene.with_provenance({})), "train", (), NO_LINKS))
     assert "".join(page.text).count(HARM) == 2
 
 

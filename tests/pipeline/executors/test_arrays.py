@@ -261,9 +261,8 @@ def test_the_printed_command_does_what_submitting_does(cluster: Path) -> None:
     subprocess.run(["bash", "-c", dry.stdout.splitlines()[-1]], check=True, capture_output=True)
     assert (cluster / "logs").is_dir()
     printed = (cluster / "asked").read_text()
-    assert {"OUT=my set", "OBJECTS=my objects"} <= set(
-        (cluster / "asked.env").read_text().splitlines()
-    )
+    environment = (cluster / "asked.env").read_text().splitlines()
+    assert {"OUT=my set", "OBJECTS=my objects"} <= set(environment)
     assert trilight(words).exit_code == 0
     assert (cluster / "asked").read_text() == printed
 
@@ -359,9 +358,8 @@ def test_the_pod_has_the_rights_of_the_other_manifests(made: Made) -> None:
     assert pod["securityContext"] == theirs["securityContext"]
     for name in ("securityContext", "resources", "envFrom", "imagePullPolicy"):
         assert ours[name] == other[name], name
-    assert {mount["mountPath"] for mount in ours["volumeMounts"]} == {
-        mount["mountPath"] for mount in other["volumeMounts"]
-    }
+    mounts = [{each["mountPath"] for each in one["volumeMounts"]} for one in (ours, other)]
+    assert mounts[0] == mounts[1]
     assert not pod["automountServiceAccountToken"]
 
 

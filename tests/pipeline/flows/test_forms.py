@@ -87,9 +87,8 @@ def test_the_forms_within_have_every_setting_of_a_build_and_its_range() -> None:
     renders = groups["RenderSettingsChanges"]["properties"]
     assert renders["max_spp"]["description"].startswith("The cap")
     assert renders["denoiser"]["anyOf"][0]["enum"] == ["high", "fast", "off"]
-    assert set(groups["DatasetSettingsChanges"]["properties"]) == set(
-        DatasetSettings.__dataclass_fields__
-    )
+    settings = groups["DatasetSettingsChanges"]["properties"]
+    assert set(settings) == set(DatasetSettings.__dataclass_fields__)
     # As declared at the fields, but for what no form can hold exactly.
     shown = schema["properties"]
     assert shown["scenes"]["anyOf"][0] == {"type": "integer", "minimum": 1, "maximum": 10**9}

@@ -334,12 +334,12 @@ def test_tries_end_and_only_two_ends_are_verdicts() -> None:
 def test_kills_while_a_child_is_set_up_are_tried_again_and_end_the_run_at_last(
     tmp_path: Path,
 ) -> None:
-    dying = functools.partial(IsolatedChild, limits=PATIENT, factory=called.count_and_die)
-    with closing(dying(args=(str(tmp_path), signal.SIGKILL, 2))) as child:
+    dying_child = functools.partial(IsolatedChild, limits=PATIENT, factory=called.count_and_die)
+    with closing(dying_child(args=(str(tmp_path), signal.SIGKILL, 2))) as child:
         assert child.call(called.double, 4) == 8
     assert len(list(tmp_path.iterdir())) == 3
     (tmp_path / "again").mkdir()
-    child = dying(args=(str(tmp_path / "again"), signal.SIGKILL, 99))
+    child = dying_child(args=(str(tmp_path / "again"), signal.SIGKILL, 99))
     with pytest.raises(EnvironmentFailure, match="cannot be set up.*SIGKILL.*doctor"):
         child.call(called.double, 4)
     assert len(list((tmp_path / "again").iterdir())) == 3
@@ -347,9 +347,9 @@ def test_kills_while_a_child_is_set_up_are_tried_again_and_end_the_run_at_last(
 
 def test_a_set_up_that_cannot_succeed_is_tried_once_at_each_call(tmp_path: Path) -> None:
     """And no call is made in a child that was not set up."""
-    failing = IsolatedChild(limits=PATIENT, factory=called.fail_set_up, args=(str(tmp_path),))
-    with closing(failing):
+    child = IsolatedChild(limits=PATIENT, factory=called.fail_set_up, args=(str(tmp_path),))
+    with closing(child):
         for calls in (1, 2):
             with pytest.raises(EnvironmentFailure, match="cannot be set up.*a library is broken"):
-                failing.call(called.double, 4)
+                child.call(called.double, 4)
             assert len(list(tmp_path.iterdir())) == calls

@@ -261,9 +261,8 @@ def test_the_standard_error_is_that_between_passes() -> None:
     for _ in samples.passes_to(256):
         pass
     assert len(asked) == LEAST_PASSES
-    greys = np.stack(
-        [tracer.radiance(camera, seed=seed, spp=spp).mean(axis=-1) for seed, spp in asked]
-    ).astype(np.float64)
+    pictures = [tracer.radiance(camera, seed=seed, spp=spp) for seed, spp in asked]
+    greys = np.stack([picture.mean(axis=-1) for picture in pictures]).astype(np.float64)
     weights = np.array([spp for _, spp in asked], np.float64)
     mean = np.tensordot(weights / weights.sum(), greys, 1)
     variance = np.tensordot(weights, np.square(greys - mean), 1) / (len(asked) - 1) / weights.sum()
@@ -439,11 +438,9 @@ def test_the_unbiased_measures_are_the_true_errors() -> None:
         Half(raw_rgb=raw.astype(np.float32), denoised_rgb=denoise(raw).astype(np.float32))
         for raw in raws
     )
-    picture = denoise((raws[0] + raws[1]) / 2).astype(np.float32)
+    picture = denoise((raws[0] + raws[1]) / 2).astype(np.float32).astype(np.float64)
     everywhere = np.ones((px, px), bool)
-    totals, surprises = error_measures(
-        halves_of(a, b), picture.astype(np.float64), everywhere, NUMPY
-    )
+    totals, surprises = error_measures(halves_of(a, b), picture, everywhere, NUMPY)
     found = measures_of_totals(totals.reshape(3, 6)[1], surprises[1].max(), px * px, 1.0)
     noise = 0.25 * 0.05**2 / 2
     assert found.agreement == pytest.approx(noise, rel=0.02)

@@ -146,9 +146,8 @@ def test_all_views_and_lights_share_one_load(monkeypatch: pytest.MonkeyPatch) ->
     changes = {"renders.min_spp": 8, "renders.max_spp": 8, "renders.per_light": True}
     changes["scenes.num_views"] = 2
     settings = preset_settings("smoke", resolution=16, changes=changes)
-    sample = render_sample(
-        "000000000", RenderInput(scene=scene), settings, [], ViewProgress(None, 0)
-    )
+    scene_input = RenderInput(scene=scene)
+    sample = render_sample("000000000", scene_input, settings, [], ViewProgress(None, 0))
     assert len(sample.views) == 2
     assert load.call_count == 2  # what camera rays meet, and what all other rays meet
 

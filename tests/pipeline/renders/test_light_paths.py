@@ -90,7 +90,7 @@ def _tracer(
     return kind(scene, max_depth=max_depth, rr_depth=2)
 
 
-_mean = functools.partial(render_blocks, block=32, passes=12)
+mean_picture = functools.partial(render_blocks, block=32, passes=12)
 """The mean of a picture."""
 
 LAMP = [[0.8, 0.3, 1.6], [1.1, 0.3, 1.6], [0.9, 0.6, 1.7]]
@@ -143,19 +143,19 @@ def test_together_they_show_what_the_path_tracer_shows(scene: Scene, max_depth: 
 def test_any_number_of_light_paths_gives_the_same_light(monkeypatch: pytest.MonkeyPatch) -> None:
     """However the weights are shared out."""
     scene = _leaning()
-    alone = _mean(scene, tracer=_tracer(scene, CameraPathsOnly))
+    alone = mean_picture(scene, tracer=_tracer(scene, CameraPathsOnly))
     for light_paths in (1e-3, 4.0):
         monkeypatch.setattr(vector_tracer, "LIGHT_PATHS", light_paths)
         monkeypatch.setattr(VectorTracer, "_light_paths", light_paths)
-        assert_agree(_mean(scene, first_seed=300, tracer=_tracer(scene)), alone)
+        assert_agree(mean_picture(scene, first_seed=300, tracer=_tracer(scene)), alone)
 
 
 def test_beside_light_paths_without_number_only_direct_light_is_left() -> None:
     """Of a large light, so that as much would be hit as picked."""
     row = material(diffuse=0.3, specular=0.5, roughness=0.4)
     scene = _by_a_large_light([quad(WIDE, row), quad(WALL, row)])
-    left = _mean(scene, first_seed=100, tracer=_tracer(scene, CameraPathsLeft))
-    direct = _mean(scene, tracer=_tracer(scene, CameraPathsOnly, max_depth=2))
+    left = mean_picture(scene, first_seed=100, tracer=_tracer(scene, CameraPathsLeft))
+    direct = mean_picture(scene, tracer=_tracer(scene, CameraPathsOnly, max_depth=2))
     # Weights leave a millionth, but more where a vertex is close to the next one, in the corner.
     assert_agree(left, direct, slack=1e-3)
 

@@ -257,10 +257,9 @@ def test_lights_apart_add_up_to_one_denoised_picture() -> None:
     (pictures,) = means(read_sums(samples), NUMPY, of_both=True)
     raw = np.sum(pictures, axis=0)
     expected = with_mean_of(denoise(raw, features, "high"), raw)
+    shown = render_view(scene, SETTINGS).radiance_rgb
     # rounded to half floats four times, each light and their sum: 2^-11 of each
-    np.testing.assert_allclose(
-        render_view(scene, SETTINGS).radiance_rgb, expected, rtol=2 * 2**-11, atol=1e-6
-    )
+    np.testing.assert_allclose(shown, expected, rtol=2 * 2**-11, atol=1e-6)
 
 
 def test_a_light_that_is_off_still_casts_a_shadow_and_is_still_hidden() -> None:
@@ -360,9 +359,8 @@ def test_plain_mitsuba_comes_to_the_same_picture(sampler: str) -> None:
     scene = tiny_scene()
     ours = render_shot(scene, fixed_samples(32, 2048)).radiance_rgb
     levels = render_levels(scene, 32, (16, 64, 1024), 5, sampler)
-    assert [(raw.samples, denoised.samples) for raw, denoised in levels] == [
-        (spp, spp) for spp in (16, 64, 1024)
-    ]
+    samples = [(raw.samples, denoised.samples) for raw, denoised in levels]
+    assert samples == [(spp, spp) for spp in (16, 64, 1024)]
     assert 0 < (levels[0][0].cpu_seconds or 0) < (levels[0][1].cpu_seconds or 0)
     errors = [psnr_log_db(denoised.radiance_rgb, ours) for _, denoised in levels]
     # With three seeds 57 to 59, 60 to 62, and 68 to 69 dB; light off by half a percent is at 60.

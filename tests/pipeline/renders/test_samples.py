@@ -34,7 +34,7 @@ from storage.errors import TrilightError
 from storage.metrics import MAX_DB, psnr_linear_db, psnr_log_db
 from storage.records.scene import Scene
 from tests.oracle.plugin_tracer import HostSum
-from tests.pipeline.renders.sampling import Half, camera_of, floor_of, halves_of
+from tests.pipeline.renders.sampling import Half, camera_of, floor_of, halves_of, view_settings
 from tests.pipeline.renders.scene_kit import lit_by_a_mirror, sampled_like_scene
 
 CAMERA = PixelCamera(c2w=np.eye(4), fov_deg=40.0, resolution=32)
@@ -385,10 +385,7 @@ def test_a_scene_keeps_its_light_over_many_views(
     scene: Scene, resolution: int, max_spp: int, num_views: int, most: float
 ) -> None:
     """With the denoiser, which keeps the mean; no tiles are chosen below 512 samples."""
-    settings = RenderSettings(
-        resolution=resolution, noise_floor_db=90.0, min_spp=32, max_spp=max_spp,
-        min_mean_radiance=0.0,
-    )  # fmt: skip
+    settings = view_settings(32, resolution=resolution, max_spp=max_spp, min_mean_radiance=0.0)
     renderer, camera = SceneRenderer(scene, settings), camera_of(scene, resolution)
     adaptive = [
         renderer.render_view(camera.c2w, camera.fov_deg, seed).radiance_rgb.mean(dtype=np.float64)
@@ -464,10 +461,8 @@ def test_a_pass_over_some_pixels_agrees_with_passes_over_all() -> None:
     assert lit.sum() > 100
     assert np.abs(score).max() < 5.5
     assert 0.7 < np.sqrt(np.mean(score**2)) < 1.4
-    np.testing.assert_array_equal(
-        tracer.radiance(camera, seed=3, spp=16, chosen=np.ones_like(chosen)),
-        tracer.radiance(camera, seed=3, spp=16),
-    )
+    all_pixels = tracer.radiance(camera, seed=3, spp=16, chosen=np.ones_like(chosen))
+    np.testing.assert_array_equal(all_pixels, tracer.radiance(camera, seed=3, spp=16))
 
 
 def test_sums_over_chosen_pixels_are_those_of_the_passes() -> None:

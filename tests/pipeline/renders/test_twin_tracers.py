@@ -345,9 +345,8 @@ def test_a_build_with_the_setting_stores_what_verify_accepts() -> None:
             "smoke", resolution=16, changes={**changes, "scenes.num_views": 2}
         )
         scene = tiny_scene(provenance={"camera_attempts": [0, 0]})
-        sample = render_sample(
-            "000000007", RenderInput(scene=scene), settings, [], ViewProgress(None, 7)
-        )
+        scene_input = RenderInput(scene=scene)
+        sample = render_sample("000000007", scene_input, settings, [], ViewProgress(None, 7))
         manifest = Manifest(
             build="smoke",
             settings=settings_record(settings),
@@ -434,9 +433,8 @@ def test_in_a_furnace_each_lobe_shows_its_albedo_by_direct_light_alone() -> None
         np.testing.assert_array_equal(found[name], 0)
     for name, albedo in (("diffuse_direct", diffuse), ("specular_direct", specular)):
         # so smooth a lobe loses 0.2 % to its own shadows, of which colour keeps a part
-        assert_agree(
-            blocks_of(found[name], 4), exact(np.broadcast_to(albedo, (2, 2, 3))), slack=0.005
-        )
+        albedos = exact(np.broadcast_to(albedo, (2, 2, 3)))
+        assert_agree(blocks_of(found[name], 4), albedos, slack=0.005)
 
 
 def test_kernels_of_other_parts_are_apart() -> None:

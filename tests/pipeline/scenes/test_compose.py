@@ -401,11 +401,8 @@ def test_the_worst_error_is_the_least_that_the_budget_allows() -> None:
     for _ in range(400):
         assets, total = _sample_assets(rng, most=3), int(rng.integers(100, 2500))
         enough = float(rng.choice([0.0, 0.01]))
-        fitting = [
-            combination
-            for combination in itertools.product(*(asset.levels for asset in assets))
-            if _count(combination) <= total
-        ]
+        combinations = itertools.product(*(asset.levels for asset in assets))
+        fitting = [levels for levels in combinations if _count(levels) <= total]
         if not fitting:
             with pytest.raises(Rejected):
                 levels_within(assets, total, enough)
@@ -469,11 +466,8 @@ def _slow_twin(
     for following in range(count - 1, -1, -1):
         fitting_rows = []
         for row in sorted(allowed):
-            beside = [
-                least[other]
-                for other in allowed
-                if not camps[row] or camps[other] in ("", camps[row])
-            ]
+            camps_beside = ("", camps[row]) if camps[row] else camps
+            beside = [least[other] for other in allowed if camps[other] in camps_beside]
             if least[row] + following * min(beside) <= left:
                 fitting_rows.append(row)
         if not fitting_rows:

@@ -18,7 +18,6 @@ from pipeline.scenes.pieces import (
     concatenate_pieces,
     cube_coordinates,
     emitter_piece,
-    object_piece,
     source_skins,
     with_drawn_textures,
     with_source_emission,
@@ -55,7 +54,14 @@ from tests.pipeline.assets.source_materials.textured_kit import (
     picture_bytes,
     textured_glb,
 )
-from tests.pipeline.scenes.small_pool import LOOK, first_scene, floor_piece, pooled, small_pool
+from tests.pipeline.scenes.small_pool import (
+    LOOK,
+    first_scene,
+    floor_piece,
+    piece_of,
+    pooled,
+    small_pool,
+)
 from tests.scene_templates.balls import DEFAULTS
 from tests.scene_templates.statistics import require_plausible, share
 from tests.textured_by_hand import bumps
@@ -202,12 +208,9 @@ ROUNDING = 1e-6
 
 
 def _piece(mesh: trimesh.Trimesh, *, smooth: bool) -> ScenePiece:
-    entry = SceneObject(name="it", kind="object", uid="made/it")
-    positions = (0.5 * mesh.vertices).astype(np.float32)
-    faces = mesh.faces.astype(np.uint32)
-    rng = np.random.default_rng(0)
+    positions, faces = (0.5 * mesh.vertices).astype(np.float32), mesh.faces.astype(np.uint32)
     look = dataclasses.replace(LOOK, smooth=smooth, colours="triangles" if smooth else "one")
-    return object_piece(entry, positions, faces, look, rng, 30.0)
+    return piece_of(positions, faces, look)
 
 
 def _open_and_odd() -> trimesh.Trimesh:
@@ -393,12 +396,10 @@ def test_a_normal_map_comes_with_the_rights_of_its_object_and_changes_nothing_el
 def test_subdivision_moves_no_colour() -> None:
     level = _skinned(small_pool()[1].asset.levels[0])
     assert level.skin is not None
-    positions = level.positions
-    box, rng = SceneObject(name="box", kind="object"), np.random.default_rng(0)
     entries = [pooled("a", [trimesh.creation.box()])]
     (skin,) = source_skins(entries, [level], OWN.materials, SceneKey(0, 0))
     assert skin is not None
-    whole = object_piece(box, positions, level.faces, LOOK, rng, 30.0, skin)
+    whole = piece_of(level.positions, level.faces, skin=skin)
     more = subdivide(whole, 100)
     assert more.skin is not None and len(more.mesh.faces) > 90
 
@@ -421,9 +422,7 @@ def test_a_picture_has_the_colours_of_a_file_in_their_corners(tmp_path: Path) ->
     level, entry = asset.levels[0], PooledAsset(locked=small_pool()[0].locked, asset=asset)
     (skin,) = source_skins([entry], [level], OWN.materials, SceneKey(0, 0))
     assert skin is not None
-    shape = level.positions, level.faces
-    named, rng = SceneObject(name="square", kind="object"), np.random.default_rng(0)
-    square = object_piece(named, *shape, LOOK, rng, 30.0, skin)
+    square = piece_of(level.positions, level.faces, skin=skin)
     scene = Scene(
         **concatenate_pieces([square]),
         c2w=look_at_c2w(eye=[0, -2, 0], target=[0, 0, 0], up=[0, 0, 1])[None].astype(np.float32),
@@ -478,17 +477,15 @@ def test_parts_that_emit_give_the_stated_share_of_light() -> None:
     assert found >= 2
 
 
-def _object(emission: list[list[float]], name: str = "screen") -> ScenePiece:
+def _object(emission: list[list[float]]) -> ScenePiece:
     """A square of two triangles that emit so much."""
-    entry = SceneObject(name=name, kind="object", uid=f"made/{name}")
-    rng = np.random.default_rng(0)
     colour, number = (Texture(texels=np.full((1, 1, k), 0.1, np.float32)) for k in (3, 1))
     skin = Skin(
         uv=np.zeros((6, 2), np.float32),
         textures=(colour, colour, number),
         emission=np.array(emission, np.float32),
     )
-    return object_piece(entry, QUAD, FACES, LOOK, rng, 30.0, skin)
+    return piece_of(QUAD, FACES, skin=skin, name="screen")
 
 
 def _lamp(corners: np.ndarray, radiance: tuple[float, float, float]) -> ScenePiece:

@@ -99,13 +99,11 @@ def test_skies_without_light_and_with_suns_of_a_million_are_finite() -> None:
 def test_the_same_seed_is_the_same_sky_at_every_height(family: str) -> None:
     (coarse, draws), (fine, again) = (_with_draws(family, 1, height=each) for each in (32, 64))
     assert draws == again
-    moments = [
-        SkyTexels(len(sky)).flux(
-            sky.astype(float).mean(axis=-1)[..., None] * SkyTexels(len(sky)).directions
-        )
-        / draws["mean radiance"][0]
-        for sky in (coarse, fine)
-    ]
+    moments = []
+    for sky in (coarse, fine):
+        texels, grey = SkyTexels(len(sky)), sky.astype(float).mean(axis=-1)
+        moment = texels.flux(grey[..., None] * texels.directions)
+        moments.append(moment / draws["mean radiance"][0])
     # the vector irradiance, of at most 4 pi times the mean; spots and edges lie within a texel of
     # 5.6 degrees, and clouds lose octaves
     assert np.abs(moments[0] - moments[1]).max() < 0.1 * 4 * math.pi, family
