@@ -73,16 +73,10 @@ def many_lights() -> Scene:
     return join([floor, *lamps])
 
 
-def scaled(size: float) -> Scene:
+def shrunk(*corners: ArrayLike, first: int = 0) -> Scene:
+    """Return the tiny scene with another triangle, of three vertices: in its floor, or the lamp."""
     scene = tiny_scene()
-    scene.vertex_positions[:] *= np.float32(size)
-    return scene
-
-
-def shrunk(*corners: ArrayLike) -> Scene:
-    """Return the tiny scene with another first triangle in its floor, of three vertices."""
-    scene = tiny_scene()
-    scene.vertex_positions[[0, 1, 2]] = np.asarray(corners, np.float32)
+    scene.vertex_positions[first : first + 3] = np.asarray(corners, np.float32)
     return scene
 
 
@@ -96,7 +90,9 @@ SCENES: dict[str, Callable[[], Scene]] = {
     "fov 0.001 and 179": lambda: seen_at(0.001, 179),
     "64 lights": many_lights,
     "sliver 1e-7": lambda: shrunk([0, 0, 0], [1, 0, 0], [0.5, 1e-7, 0]),
-    "to the farthest position": lambda: scaled(500),
+    "to the farthest position": lambda: tiny_scene(
+        vertex_positions=tiny_scene().vertex_positions * np.float32(500)
+    ),
 }
 
 
@@ -169,16 +165,10 @@ def test_the_ends_of_floats_come_back_in_usd_and_hdf5(tmp_path: Path) -> None:
     assert_h5_keeps_light(h5_and_back(scene, tmp_path), scene)
 
 
-def without_a_lit_area() -> Scene:
-    scene = tiny_scene()
-    scene.vertex_positions[4:] = 1.0
-    return scene
-
-
 REFUSED: dict[str, tuple[Callable[[], Scene], str]] = {
     "brighter than the form says": (lambda: glowing(2e9), "emissive.*expected"),
     "wider than the form says": (lambda: seen_at(40, 179.5), "fov.*expected"),
-    "a light of no area": (without_a_lit_area, "no emitter has an area"),
+    "a light of no area": (lambda: shrunk(*np.ones((3, 3)), first=4), "no emitter has an area"),
 }
 
 
@@ -223,16 +213,12 @@ def _spike(resolution: int) -> NDArray[np.float32]:
     return picture
 
 
-def _denormals(resolution: int) -> NDArray[np.float32]:
-    return _halfs(resolution, FINITE[:1024])
-
-
 PICTURES: dict[str, Callable[[int], NDArray[np.float32]]] = {
     "zeros": _constant,
     "brightest": lambda resolution: _constant(resolution, HALF_FLOAT_MAX),
     "one brightest pixel": _spike,
     "all half floats": _halfs,
-    "denormals": _denormals,
+    "denormals": lambda resolution: _halfs(resolution, FINITE[:1024]),
     "smallest": lambda resolution: _constant(resolution, SMALLEST),
 }
 RESOLUTIONS = (1, 8, 9, 33, 72)

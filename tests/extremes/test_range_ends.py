@@ -25,7 +25,7 @@ from model.positions import TriangleRotary
 from model.renderformer import RenderFormer
 from model.scene_tensors import MAX_NETWORK_M, SceneBatch, batch_scenes, scene_tensors
 from pipeline.renders.renderer import RenderedView, SceneRenderer
-from pipeline.renders.settings import MAX_SPP, RenderSettings
+from pipeline.renders.settings import MAX_SPP
 from pipeline.scenes.compose import compose_scene
 from pipeline.scenes.triangle_budget import PooledAsset
 from scene_templates.families import Family
@@ -54,6 +54,7 @@ from tests.model.kit import (
     tensors_of,
     tiny_config,
 )
+from tests.pipeline.renders.sampling import view_settings
 from tests.pipeline.renders.scene_kit import join, light, material, quad
 from tests.pipeline.scenes.small_pool import BLIND
 from tests.train.kit import stepper, tiny_run
@@ -170,9 +171,7 @@ def test_scenes_at_several_ends_keep_their_laws_or_have_a_reason(
         assert rejection.reason in SCENE_REASONS, rejection
 
 
-RENDER = RenderSettings(
-    resolution=8, noise_floor_db=1.0, min_spp=8, max_spp=8, aux_spp=4, min_mean_radiance=0.0
-)
+RENDER = view_settings(8, resolution=8, noise_floor_db=1.0, aux_spp=4, min_mean_radiance=0.0)
 WALL = quad([[-1, 1, 0], [1, 1, 0], [1, 1, 2], [-1, 1, 2]], material(diffuse=0.8))
 
 
@@ -424,16 +423,14 @@ def test_angles_keep_their_digits_to_the_farthest_position(distance: float) -> N
 
 def test_a_vertex_beyond_is_refused_with_its_distance() -> None:
     scene = toy_scene(0)
+    beyond = np.nextafter(np.float32(MAX_NETWORK_M), np.float32(np.inf))
     positions = scene.vertex_positions.copy()
-    positions[0, 0] = np.nextafter(np.float32(MAX_NETWORK_M), np.float32(np.inf))
-    at_the_end = positions.copy()
-    at_the_end[0, 0] = -MAX_NETWORK_M
-    scene_tensors(dataclasses.replace(scene, vertex_positions=at_the_end))
-    with pytest.raises(TrilightError, match="a vertex stands 1000 m from the origin"):
-        scene_tensors(dataclasses.replace(scene, vertex_positions=positions))
-    positions[0, 0] = np.nan
-    with pytest.raises(TrilightError, match="a vertex stands nan m from the origin"):
-        scene_tensors(dataclasses.replace(scene, vertex_positions=positions))
+    positions[0, 0] = -MAX_NETWORK_M
+    scene_tensors(dataclasses.replace(scene, vertex_positions=positions))
+    for value, said in ((beyond, "1000 m"), (np.nan, "nan m")):
+        positions[0, 0] = value
+        with pytest.raises(TrilightError, match=f"a vertex stands {said} from the origin"):
+            scene_tensors(dataclasses.replace(scene, vertex_positions=positions))
 
 
 @pytest.mark.parametrize("keys", [1, 16384])

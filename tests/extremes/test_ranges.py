@@ -19,25 +19,19 @@ from numpy.typing import NDArray
 from infra.render.options import RenderOptions
 from infra.serving.train_model import TrainOptions
 from infra.setup.generated_pages import ROOTS, reachable
-from model.config import SIZES, BaseWidths, ModelConfig
-from pipeline.assets.settings import AssetSettings, GateSettings, OwnMaterialSettings
+from model.config import SIZES, ModelConfig
+from pipeline.assets.settings import AssetSettings, GateSettings
 from pipeline.flows.forms import DatasetInRuns
 from pipeline.generation.generate_options import CorePrice, RevisitOptions
 from pipeline.presets.registry import preset_settings
-from pipeline.presets.settings import DatasetSettings, GivenCamera, RevisitSettings
+from pipeline.presets.settings import GivenCamera, RevisitSettings
 from pipeline.renders.settings import MAX_SPP, RenderSettings
-from scene_templates.families import Family
 from scene_templates.frozen_v1 import ONE_FAMILY_EACH
-from scene_templates.placement import PlacementSettings
 from scene_templates.rooms import SharedRoom, SideRanges
-from scene_templates.sample_camera import CameraSettings
 from scene_templates.sample_lights import LightSettings
 from scene_templates.sample_material import MaterialSettings
-from scene_templates.scene_maps import TextureSettings
-from scene_templates.settings import MAX_TRIANGLES, Excursion, SceneSettings, ViewLaws
-from scene_templates.skies.procedural_skies import SkyMapSettings, SkySettings
-from scene_templates.surfaces.procedural_textures import SurfaceMapSettings
-from storage.dataset.settings import ListedShard, SplitSettings
+from scene_templates.settings import MAX_TRIANGLES, Excursion, SceneSettings
+from storage.dataset.settings import ListedShard
 from storage.errors import TrilightError
 from storage.records.material import PUBLISHED_COLUMNS, laid_out
 from storage.records.scene import MAP_ARRAYS, MAX_TEXTURES, Scene
@@ -50,7 +44,7 @@ from tests.scenes_by_hand import FLOOR, LIGHT, tiny_scene
 from tests.textured_by_hand import bumpy_scene
 from train.evaluation.options import EvaluationOptions, LeaderboardOptions
 from train.presets import training_preset
-from train.settings import AugmentationSettings, LossSettings, TrainSettings, WatchSettings
+from train.settings import TrainSettings, WatchSettings
 
 End = Literal["low", "high"]
 
@@ -63,44 +57,40 @@ ASKED = RenderOptions(
 SMOKE = preset_settings("smoke")
 RUN = training_preset("smoke")
 
+FIELDS = [
+    (settings, field)
+    for settings in reachable(*(root for roots in ROOTS.values() for root in roots))
+    if settings is not Scene
+    for field in describe_fields(settings)
+    if field.within is not None
+]
+"""Every declared range of settings."""
+
+
+def _walk_settings(settings: Any) -> Iterator[Any]:
+    """Yield settings, and those that their fields hold."""
+    yield settings
+    for field in dataclasses.fields(settings):
+        if dataclasses.is_dataclass(value := getattr(settings, field.name)):
+            yield from _walk_settings(value)
+
+
+_PRESETS = (SMOKE, RUN, WatchSettings())
+_FROM_PRESETS = {type(each): each for preset in _PRESETS for each in _walk_settings(preset)}
+_HAND_MADE: tuple[Any, ...] = (
+    DatasetInRuns(), ONE_FAMILY_EACH[0], SharedRoom(), SideRanges(),
+    dataclasses.replace(SMOKE.scenes.cameras, elevation_deg=(0.0, 60.0)),
+    Excursion(axis="fov_deg", value=10.0, changes=()), ListedShard(split="train", scenes=4),
+    RevisitOptions(dataset="a", out="b"),
+    RevisitSettings(source_digest="", kept_cameras=4, lights="new", num_lights=2),
+    GivenCamera(c2w=(0.0,) * 16, fov_deg=40.0), ASKED, CorePrice(), TrainOptions(),
+    SIZES["tiny"](), EvaluationOptions(checkpoint="a", data=("b",)),
+    LeaderboardOptions(source="a", width=(64,)),
+)  # fmt: skip
 EXAMPLES: dict[type, Any] = {
-    DatasetInRuns: DatasetInRuns(),
-    DatasetSettings: SMOKE,
-    AssetSettings: SMOKE.assets,
-    GateSettings: SMOKE.assets.gate,
-    OwnMaterialSettings: SMOKE.assets.own_materials,
-    SceneSettings: SMOKE.scenes,
-    Family: ONE_FAMILY_EACH[0],
-    SharedRoom: SharedRoom(),
-    SideRanges: SideRanges(),
-    PlacementSettings: SMOKE.scenes.placement,
-    MaterialSettings: SMOKE.scenes.materials,
-    LightSettings: SMOKE.scenes.lights,
-    CameraSettings: dataclasses.replace(SMOKE.scenes.cameras, elevation_deg=(0.0, 60.0)),
-    ViewLaws: SMOKE.scenes.views,
-    TextureSettings: TextureSettings(),
-    SurfaceMapSettings: SurfaceMapSettings(),
-    SkySettings: SkySettings(),
-    SkyMapSettings: SkyMapSettings(),
-    Excursion: Excursion(axis="fov_deg", value=10.0, changes=()),
-    RenderSettings: SMOKE.renders,
-    SplitSettings: SMOKE.splits,
-    ListedShard: ListedShard(split="train", scenes=4),
-    RevisitOptions: RevisitOptions(dataset="a", out="b"),
-    RevisitSettings: RevisitSettings(source_digest="", kept_cameras=4, lights="new", num_lights=2),
-    GivenCamera: GivenCamera(c2w=(0.0,) * 16, fov_deg=40.0),
-    RenderOptions: ASKED,
-    CorePrice: CorePrice(),
-    TrainOptions: TrainOptions(),
-    TrainSettings: RUN,
-    ModelConfig: SIZES["tiny"](),
-    LossSettings: RUN.loss,
-    AugmentationSettings: RUN.augmentation,
-    BaseWidths: RUN.base_widths,
-    EvaluationOptions: EvaluationOptions(checkpoint="a", data=("b",)),
-    LeaderboardOptions: LeaderboardOptions(source="a", width=(64,)),
-    WatchSettings: WatchSettings(),
-}  # fmt: skip
+    **{kind: _FROM_PRESETS[kind] for kind, _ in FIELDS if kind in _FROM_PRESETS},
+    **{type(each): each for each in _HAND_MADE},
+}
 """A valid value of every class that declares a range, but for `Scene`."""
 
 _LINEAR = {"head": "linear", "dpt_features": 0, "dpt_channels": (), "dpt_taps": ()}
@@ -147,15 +137,6 @@ BESIDE: dict[tuple[type, str, End], dict[str, Any]] = {
 }  # fmt: skip
 """What must stand beside an end."""
 
-FIELDS = [
-    (settings, field)
-    for settings in reachable(*(root for roots in ROOTS.values() for root in roots))
-    if settings is not Scene
-    for field in describe_fields(settings)
-    if field.within is not None
-]
-"""Every declared range of settings."""
-
 
 def at_end(settings: type, field: FieldDescription, end: End, number: Any) -> Any:
     """Return valid settings with one number of a field replaced; raises what they raise."""
@@ -177,10 +158,7 @@ def last_inside(field: FieldDescription, end: End) -> float:
     """Return the extreme number that a range admits."""
     within = field.within
     assert within is not None
-    bound, is_open = {
-        "low": (within.low, within.low_open),
-        "high": (within.high, within.high_open),
-    }[end]
+    bound, is_open = getattr(within, end), getattr(within, f"{end}_open")
     if field.kind is int:
         assert isinstance(bound, int) and not is_open
         return bound

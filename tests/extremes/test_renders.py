@@ -26,7 +26,7 @@ from storage.records.exr import decode_exr, encode_exr
 from storage.records.lights import sum_of_parts
 from storage.records.scene import Scene
 from tests.for_each import case
-from tests.pipeline.renders.sampling import camera_of
+from tests.pipeline.renders.sampling import camera_of, render_view, view_settings
 from tests.pipeline.renders.scene_kit import (
     Part,
     flat,
@@ -38,9 +38,7 @@ from tests.pipeline.renders.scene_kit import (
     sphere,
 )
 
-SETTINGS = RenderSettings(
-    resolution=16, noise_floor_db=1.0, min_spp=32, max_spp=32, aux_spp=16, min_mean_radiance=0.0
-)
+SETTINGS = view_settings(32, resolution=16, noise_floor_db=1.0, min_mean_radiance=0.0)
 NOT_DENOISED = dataclasses.replace(SETTINGS, min_spp=128, max_spp=128, denoiser="off")
 FLOOR = np.array([[-1.0, -1, 0], [1, -1, 0], [1, 1, 0], [-1, 1, 0]])
 LAMP = np.array([[-0.1, -0.1, 2], [0, 0.1, 2], [0.1, -0.1, 2]])
@@ -55,10 +53,11 @@ def _lamp(radiance: float = 100.0, scale: float = 1.0, diffuse: float = 0.0) -> 
     return light(LAMP * scale, radiance, diffuse)
 
 
-def _render(scene: Scene, settings: RenderSettings = SETTINGS, **changes: Any) -> RenderedView:
+def _render(
+    scene: Scene, settings: RenderSettings = SETTINGS, seed: int = 0, **changes: Any
+) -> RenderedView:
     scene.check()
-    renderer = SceneRenderer(scene, dataclasses.replace(settings, **changes))
-    return renderer.render_view(scene.c2w[0], float(scene.fov_deg[0]), seed=0)
+    return render_view(scene, dataclasses.replace(settings, **changes), seed)
 
 
 def _picture(parts: list[Part], settings: RenderSettings = SETTINGS) -> NDArray[np.float32]:
@@ -68,10 +67,10 @@ def _picture(parts: list[Part], settings: RenderSettings = SETTINGS) -> NDArray[
     return radiance_rgb
 
 
-def _mirror(side: float = 1.0) -> Part:
+def _mirror(side: float = 1.0, roughness: float = 0.0) -> Part:
     """A smooth wall beside the floor: it throws light of the lamp on it."""
     corners = np.array([[1, -1, 0], [1, 1, 0], [1, 1, 2], [1, -1, 2]]) * [side, 1, 1]
-    return quad(corners, material(specular=1.0, roughness=0.0))
+    return quad(corners, material(specular=1.0, roughness=roughness))
 
 
 SURFACES = {
@@ -194,8 +193,8 @@ WIDE_VIEW = join([_floor(), light(LAMP * [9, 9, 1], 5.0)], fov_deg=60)
 @pytest.fixture(scope="module")
 def truth() -> NDArray[np.float32]:
     """Return the wide view in 8 x 8 pixels, nearly converged."""
-    exact = dataclasses.replace(SETTINGS, resolution=8, min_spp=4096, max_spp=4096, denoiser="off")
-    return SceneRenderer(WIDE_VIEW, exact).render_view(WIDE_VIEW.c2w[0], 60.0, seed=1).radiance_rgb
+    changes: dict[str, Any] = {"resolution": 8, "min_spp": 4096, "max_spp": 4096, "denoiser": "off"}
+    return _render(WIDE_VIEW, seed=1, **changes).radiance_rgb
 
 
 @pytest.mark.parametrize(("resolution", "spp"), [(8, 1024), (40, 128), (136, 16)])
@@ -203,8 +202,7 @@ def test_any_multiple_of_eight_is_a_resolution(
     resolution: int, spp: int, truth: NDArray[np.float32]
 ) -> None:
     """8 is the least, 40 no power of two, 136 wider than 128; all show the same."""
-    settings = dataclasses.replace(SETTINGS, resolution=resolution, min_spp=spp, max_spp=spp)
-    view = SceneRenderer(WIDE_VIEW, settings).render_view(WIDE_VIEW.c2w[0], 60.0, seed=0)
+    view = _render(WIDE_VIEW, resolution=resolution, min_spp=spp, max_spp=spp)
     assert view.radiance_rgb.shape == (resolution, resolution, 3)
     assert view.hits.shape == (resolution, resolution)
     block = resolution // 8
@@ -224,11 +222,7 @@ def test_any_multiple_of_eight_is_a_resolution(
     ids=["roughness 0.01", "64 lights", "a light far away"],
 )
 def test_a_guided_view_is_finite(scene: Scene) -> None:
-    settings = RenderSettings(
-        resolution=16, noise_floor_db=90.0, min_spp=8, max_spp=512, min_mean_radiance=0.0
-    )
-    camera = camera_of(scene, 16)
-    view = SceneRenderer(scene, settings).render_view(camera.c2w, camera.fov_deg, seed=1)
+    view = _render(scene, seed=1, noise_floor_db=90.0, min_spp=8, max_spp=512)
     assert np.isfinite(view.radiance_rgb).all()
     assert view.radiance_rgb.max() > 0
 
@@ -350,13 +344,8 @@ def test_every_field_of_view_shows_what_its_rays_meet(
 
 @pytest.mark.usefixtures("llvm")
 def test_fireflies_are_part_of_the_mean_and_the_denoiser_takes_them_away_and_no_light() -> None:
-    mirror = quad(
-        [[1, -1, 0], [1, 1, 0], [1, 1, 2], [1, -1, 2]], material(specular=1.0, roughness=0.2)
-    )
-    scene, settings = (
-        join([_floor(), mirror, _lamp()]),
-        dataclasses.replace(SETTINGS, resolution=32),
-    )
+    scene = join([_floor(), _mirror(roughness=0.2), _lamp()])
+    settings = dataclasses.replace(SETTINGS, resolution=32)
     tracer, camera = load_tracer(scene, max_depth=10, rr_depth=2), camera_of(scene, 32)
     renderer = SceneRenderer(scene, settings)
     many, few, denoised = (

@@ -111,9 +111,8 @@ def test_a_pool_of_one_object_fills_every_scene(pool: list[PooledAsset], build: 
         for index in range(30, 32):
             scene = first_scene(settings, [entry], seed=0, scene_index=index)
             require_laws(scene, settings.of_scene(index))
-            assert {scene.objects[row].uid for row in rows_of(scene, "object")} <= {
-                entry.locked.uid
-            }
+            uids = {scene.objects[row].uid for row in rows_of(scene, "object")}
+            assert uids <= {entry.locked.uid}
             names = [entry.name for entry in scene.objects]
             assert len(set(names)) == len(names)
 

@@ -30,13 +30,13 @@ from tests.oracle.plugin_scene import scaled_albedos
 from tests.pipeline.renders.sampling import (
     Estimate,
     assert_agree,
+    blocks_of,
     camera_of,
     exact,
     lambert_irradiance,
     render_blocks,
 )
 from tests.pipeline.renders.scene_kit import (
-    Part,
     bumpy_room,
     flat,
     furnace,
@@ -94,9 +94,8 @@ ENDS = {
 
 def test_the_ends_of_the_mixture_are_exact() -> None:
     for name, row in ENDS.items():
-        estimate = render_blocks(
-            _furnace_plate(row, 0.8), resolution=8, block=8, max_depth=2, passes=12
-        )
+        scene = _furnace_plate(row, 0.8)
+        estimate = render_blocks(scene, resolution=8, block=8, max_depth=2, passes=12)
         expected = exact(_albedo(row, 0.8)[None, None])
         assert_agree(estimate, expected, slack=1e-3, name=name)
 
@@ -107,12 +106,8 @@ def test_a_surface_shades_the_same_from_behind() -> None:
     floor = quad([[-3, -3, 0], [3, -3, 0], [3, 3, 0], [-3, 3, 0]], material(diffuse=0.5))
     lamp = light([[-0.5, 0, 2], [0.5, 0, 2], [0, 0.6, 1.8]], 6.0)
     ball = sphere([0, 0, 0.5], 0.5, row, rings=8)
-    turned = Part(
-        triangles=ball.triangles[:, ::-1],
-        normals=-ball.normals[:, ::-1],
-        material=row,
-        kind="object",
-    )
+    triangles, normals = ball.triangles[:, ::-1], -ball.normals[:, ::-1]
+    turned = dataclasses.replace(ball, triangles=triangles, normals=normals)
     front, back = (
         render_blocks(join([floor, part, lamp], eye=(0, -2, 1)), first_seed=seed, passes=8)
         for seed, part in enumerate([ball, turned])
@@ -174,19 +169,17 @@ def test_lobes_add_up_to_the_material_and_never_exceed_one() -> None:
     bound = lobes.diffuse.max(1) + lobes.specular.max(1) + 1e-12
     assert (diffuse.max(1) <= bound).all() and (specular.max(1) <= bound).all()
     assert lobes.weight[0] == 0 and lobes.weight[1] == 1 and lobes.weight[2] == 0
-    np.testing.assert_allclose(
-        lobes.alpha, np.maximum(rows[:, 6].astype(np.float64) ** 2, MIN_ALPHA)
-    )
+    widths = np.maximum(rows[:, 6].astype(np.float64) ** 2, MIN_ALPHA)
+    np.testing.assert_allclose(lobes.alpha, widths)
 
 
-def ball(roughness: float) -> Scene:
-    """A smooth white mirror of many facets in a furnace, alone in the picture."""
-    mirror = sphere([0, 0, 0], 0.5, material(specular=1.0, roughness=roughness), rings=48)
-    return join([mirror, furnace()], eye=(0, -3, 0), fov_deg=20)
+def _mean_radiance_of_a_ball() -> float:
+    """Return the mean over what a rough white mirror of many facets covers of the picture.
 
-
-def mean_radiance(scene: Scene) -> float:
-    """Return the mean over what the surface, whose albedo is 1, covers of the picture."""
+    It is in a furnace, and its albedo is 1.
+    """
+    mirror = sphere([0, 0, 0], 0.5, material(specular=1.0, roughness=1.0), rings=48)
+    scene = join([mirror, furnace()], eye=(0, -3, 0), fov_deg=20)
     tracer, camera = load_tracer(scene, max_depth=2, rr_depth=5), camera_of(scene, 32)
     pictures = [tracer.radiance(camera, seed=k, spp=64) for k in range(4)]
     covered = tracer.features(camera, spp=64).albedo.mean()
@@ -196,17 +189,15 @@ def mean_radiance(scene: Scene) -> float:
 @pytest.mark.usefixtures("llvm")
 def test_single_scattering_would_lose_most_of_it(monkeypatch: pytest.MonkeyPatch) -> None:
     """A ball returns all; without the scale a ball of roughness 1 shows Eavg of the table."""
-    mean = mean_radiance(ball(1.0))
     # The rims of facets reflect to below themselves: another 0.1 %.
-    assert abs(mean - 1) < 0.003
+    assert abs(_mean_radiance_of_a_ball() - 1) < 0.003
 
     def nothing(specular: NDArray, *_: Any) -> NDArray:
         return np.zeros_like(specular)
 
     monkeypatch.setattr(surface_table, "scattered_again", nothing)
-    mean = mean_radiance(ball(1.0))
     # 96 facets around are a little off the sphere.
-    assert mean == pytest.approx(0.409, abs=0.004)
+    assert _mean_radiance_of_a_ball() == pytest.approx(0.409, abs=0.004)
 
 
 SETTINGS = SceneSettings(families=DEFAULT_FAMILIES, num_views=1)
@@ -266,20 +257,13 @@ def test_what_a_camera_sees_commutes_with_motion() -> None:
         assert abs(getattr(before, name) - getattr(after, name)) < 0.005, name
 
 
-PASSES = 12
-
 SKIES = {"smooth": smooth(), "sun": one_sun(1e5), "night": night()}
 
 
-def _traced_blocks(scene: Scene, part: slice | None, passes: int = PASSES) -> Estimate:
+def _traced_blocks(scene: Scene, passes: int) -> Estimate:
     """Return the means of 4 x 4 pixels over several noises, with their standard errors."""
-    pictures = []
-    for seed in range(passes):
-        inputs = traced(scene, 32, seed=seed)
-        picture = direct(inputs) if part is None else inputs.pixels[..., part]
-        pictures.append(picture.reshape(8, 4, 8, 4, 3).mean(axis=(1, 3)))
-    cells = np.array(pictures, np.float64)
-    return Estimate(mean=cells.mean(axis=0), error=cells.std(axis=0, ddof=1) / np.sqrt(passes))
+    pictures = [direct(traced(scene, 32, seed=seed)) for seed in range(passes)]
+    return blocks_of(np.array(pictures), 4)
 
 
 def _require_alike(ours: Estimate, theirs: Estimate, of_mean: float) -> None:
@@ -295,7 +279,7 @@ def _require_alike(ours: Estimate, theirs: Estimate, of_mean: float) -> None:
 @pytest.mark.parametrize("roughness", [0.15, 1.0])
 def test_direct_light_is_that_of_paths_of_two_edges(llvm: None, roughness: float) -> None:
     scene = corner(roughness=roughness)
-    ours = _traced_blocks(scene, None)
+    ours = _traced_blocks(scene, passes=12)
     theirs = render_blocks(scene, max_depth=2, passes=8)
     _require_alike(ours, theirs, of_mean=0.005)
 
@@ -308,7 +292,7 @@ def test_direct_light_of_a_sky_is_that_of_paths_of_two_edges(
 ) -> None:
     """With lamps beside it, and without any."""
     scene = open_scene(sky, num_lights)
-    ours = _traced_blocks(scene, None, passes=24)
+    ours = _traced_blocks(scene, passes=24)
     theirs = render_blocks(scene, max_depth=2, passes=8)
     _require_alike(ours, theirs, of_mean=0.01)
 
@@ -321,16 +305,11 @@ def test_diffuse_light_of_other_surfaces_is_that_of_longer_paths(llvm: None) -> 
     scene = corner()
     materials = scene.materials.copy()
     materials[:, 3:6] = 0
-    scene = type(scene)(**{**vars(scene), "materials": materials})
+    scene = dataclasses.replace(scene, materials=materials)
     found = [traced(scene, 32, anchors_a_side=32, gather_rays=32, seed=k) for k in range(3)]
-    ours = np.mean(
-        [
-            x.pixels[..., Channel.COVERAGE]
-            * x.pixels[..., Channel.DIFFUSE]
-            * x.gathered.reshape(32, 32, 3)
-            for x in found
-        ]
-    )
+    pixels = np.array([x.pixels for x in found])
+    gathered = np.array([x.gathered.reshape(32, 32, 3) for x in found])
+    ours = np.mean(pixels[..., Channel.COVERAGE] * pixels[..., Channel.DIFFUSE] * gathered)
     whole = render_blocks(scene, max_depth=10, passes=6).mean
     short = render_blocks(scene, max_depth=2, passes=6).mean
     # radiosity of triangles as large as the floor for the light of the third edge on: 4 %

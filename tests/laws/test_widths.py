@@ -17,14 +17,11 @@ from torch import Tensor, nn
 from model.config import BaseWidths, ModelConfig
 from model.hits.tracing import with_traced
 from tests.model.kit import hits_config
-from tests.train.kit import TINY_MODEL, tiny_run
+from tests.train.kit import TINY_MODEL, stepper, tiny_run
 from tests.train.toy import toy_sample
 from train.data.buckets import TrainingBatch, collate_batch
 from train.data.scenes import training_scene
-from train.loop.distributed import DistributedContext
-from train.loop.step import Stepper
 from train.loop.train_state import new_state
-from train.loss.training_loss import TrainingLoss
 
 PX, STEPS, RATE = 16, 4, 2e-3
 BASE = BaseWidths(width=32, head_width=32, pixel_width=16, filter_width=8)
@@ -70,10 +67,9 @@ def changes(config: ModelConfig, muon_rate: float, base: BaseWidths, seed: int) 
     )
     state, batch = new_state(settings, muon_precision="float32"), batch_for(config)
     before = outputs(state.model, batch)
-    crew = DistributedContext(device=torch.device("cpu"))
-    stepper = Stepper(state, TrainingLoss(settings.loss, None), crew)
+    moving = stepper(state)
     for _ in range(STEPS):
-        assert stepper.step([batch], RATE).applied
+        assert moving.step([batch], RATE).applied
         state.step += 1
     after = outputs(state.model, batch)
     return {

@@ -7,6 +7,7 @@ twin, and both are moved apart, or rays would meet either of two
 coincident faces at random and half of the emission would be lost.
 """
 
+from collections.abc import Callable
 from typing import Any
 
 import mitsuba as mi
@@ -24,7 +25,7 @@ from tests.oracle.plugin_textures import (
     PLUGIN,
     normal_mapped,
     plugin_sky,
-    register_plugin,
+    register_textures,
     textured_slots,
 )
 
@@ -75,12 +76,9 @@ def _material(scene: Scene, row: int) -> Any:
 
 def plugin_scene(scene: Scene) -> Any:
     """Return the mi.Scene of everything."""
-    register_plugin()
-    surfaces, emitters = split_triangles(scene)
-    shapes = {
-        f"surfaces_{row}": _surfaces(scene, triangles, row)
-        for row, triangles in _meshes(scene, surfaces)
-    }
+    register_textures()
+    _, emitters = split_triangles(scene)
+    shapes = _shapes(scene, _surfaces)
     sky = shining_sky(scene)
     if sky is not None:
         share = sky_share(scene, sky)
@@ -96,20 +94,17 @@ def plugin_scene(scene: Scene) -> Any:
 
 def plugin_feature_scene(scene: Scene) -> Any:
     """Return the mi.Scene of the surfaces alone, with diffuse + specular as its albedo."""
-    surfaces, _ = split_triangles(scene)
-    shapes = {
-        f"surfaces_{row}": _feature_surfaces(scene, triangles)
-        for row, triangles in _meshes(scene, surfaces)
+    return mi.load_dict({"type": "scene", **_shapes(scene, _feature_surfaces)})
+
+
+def _shapes(scene: Scene, mesh_of: Callable[[Scene, NDArray[np.intp], int], Any]) -> dict[str, Any]:
+    """Return the meshes of surfaces: one of all, or in textured scenes one for a material row."""
+    triangles, _ = split_triangles(scene)
+    rows = scene.material_index[triangles] if scene.textures else np.zeros_like(triangles)
+    return {
+        f"surfaces_{row}": mesh_of(scene, triangles[rows == row], int(row))
+        for row in np.unique(rows)
     }
-    return mi.load_dict({"type": "scene", **shapes})
-
-
-def _meshes(scene: Scene, triangles: NDArray[np.intp]) -> list[tuple[int, NDArray[np.intp]]]:
-    """Return what goes into each mesh: all, or where there are textures those of a material row."""
-    if not scene.textures:
-        return [(0, triangles)] if len(triangles) else []
-    rows = scene.material_index[triangles]
-    return [(int(row), triangles[rows == row]) for row in np.unique(rows)]
 
 
 def _surfaces(scene: Scene, triangles: NDArray[np.intp], row: int) -> Any:
@@ -118,7 +113,7 @@ def _surfaces(scene: Scene, triangles: NDArray[np.intp], row: int) -> Any:
     return mesh
 
 
-def _feature_surfaces(scene: Scene, triangles: NDArray[np.intp]) -> Any:
+def _feature_surfaces(scene: Scene, triangles: NDArray[np.intp], row: int) -> Any:
     lobes = bsdf_lobes(scene.materials[scene.material_index[triangles]])
     mesh = _mesh(scene, triangles, _two_sided({"type": "diffuse", "reflectance": _face("albedo")}))
     _add_attribute(mesh, "albedo", lobes.diffuse + lobes.specular)
@@ -149,9 +144,8 @@ def _emitter(scene: Scene, triangles: NDArray[np.intp], side: int) -> Any:
     properties = mi.Properties()
     properties["bsdf"] = _material(scene, int(scene.material_index[triangles[0]]))
     colour = {"type": "rgb", "value": radiance.tolist()}
-    properties["emitter"] = mi.load_dict(
-        {"type": "area", "radiance": colour, "sampling_weight": power}
-    )
+    area = {"type": "area", "radiance": colour, "sampling_weight": power}
+    properties["emitter"] = mi.load_dict(area)
     twin = corners[:, ::side] + side * _TWIN_OFFSET * normal[:, None]
     vertices = {"positions": twin.reshape(-1, 3)}
     if scene.uv is not None:

@@ -16,8 +16,9 @@ where ours are half a texel from them. Rows between ours, of which each is the m
 neighbours, make both the same function: its interpolation between them is ours.
 """
 
-from functools import cache
-from typing import Any
+from collections.abc import Callable
+from functools import cache, partial
+from typing import Any, get_args
 
 import drjit as dr
 import mitsuba as mi
@@ -31,7 +32,13 @@ from storage.records.material import laid_out
 from storage.records.scene import Scene
 from storage.records.texture import CONSTANT, TEXTURED
 
-_WIDTH, _AGAIN = "squared_roughness", "scattered_again"
+PLUGIN = "compensated_specular"
+"""Name in scene dictionaries; it has the textures specular, again (Fms) and alpha."""
+
+_WIDTH = "squared_roughness"
+_AGAIN: dict[Smith, str] = {smith: f"scattered_again_{smith}" for smith in get_args(Smith)}
+_LEAST_COS = 1e-4
+"""Only rays along the surface are below; the lookup divides by the cosine."""
 
 
 def textured_slots(scene: Scene, row: int, smith: Smith) -> dict[str, Any]:
@@ -42,7 +49,6 @@ def textured_slots(scene: Scene, row: int, smith: Smith) -> dict[str, Any]:
         row: of its materials.
         smith: of the specular lobe.
     """
-    _register()
     diffuse, specular, roughness = (_texels(scene, row, name) for name in TEXTURED)
     most, mirrored = diffuse.max(), specular.max()
     weight = mirrored / (most + mirrored) if most + mirrored > 0 else 0.0
@@ -52,7 +58,7 @@ def textured_slots(scene: Scene, row: int, smith: Smith) -> dict[str, Any]:
         "specular": _bitmap(specular / weight if weight > 0 else specular),
         "alpha": alpha,
         "weight": _bitmap(np.full((1, 1, 1), weight)),
-        "again": {"type": _AGAIN, "smith": smith, "specular": _bitmap(specular), "alpha": alpha},
+        "again": {"type": _AGAIN[smith], "specular": _bitmap(specular), "alpha": alpha},
     }
 
 
@@ -92,107 +98,78 @@ def _bitmap(texels: NDArray[np.float64]) -> dict[str, Any]:
 
 
 @cache
-def _register() -> None:
-    """Make both textures known to Mitsuba; a variant must be set, and stays for the process."""
-    _register_width()
-    _register_again()
+def register_textures() -> None:
+    """Make our textures known to Mitsuba; a variant must be set, and stays for the process."""
+    _register(_WIDTH, _squared_roughness, "roughness", mean=dr.square)
+    for smith in get_args(Smith):
+        _register(_AGAIN[smith], partial(_scattered_again, smith), "specular", "alpha")
+    _register(PLUGIN, _compensated_specular, "specular", "again", "alpha")
 
 
-def _register_width() -> None:
-    class SquaredRoughness(mi.Texture):
+def _register(
+    name: str,
+    value: Callable[..., Any],
+    *inputs: str,
+    mean: Callable[[Any], Any] = lambda mean: mean,
+) -> None:
+    """Make a texture known whose value, and mean by that of the first, go by other textures."""
+
+    class OfTextures(mi.Texture):
         def __init__(self, properties: Any) -> None:
             super().__init__(properties)
-            self._roughness = properties.get_texture("roughness")
+            self._inputs = [properties.get_texture(each) for each in inputs]
 
         def eval_1(self, si: Any, active: Any = True) -> Any:
-            return dr.maximum(dr.square(self._roughness.eval_1(si, active)), MIN_ALPHA)
+            return value(si, active, *self._inputs)
 
         def eval(self, si: Any, active: Any = True) -> Any:
             return mi.Color3f(self.eval_1(si, active))
 
         def mean(self) -> Any:
-            return dr.square(self._roughness.mean())
+            return mean(self._inputs[0].mean())
 
         def is_spatially_varying(self) -> bool:
             return True
 
-    mi.register_texture(_WIDTH, SquaredRoughness)
+    mi.register_texture(name, OfTextures)
 
 
-def _register_again() -> None:
-    class ScatteredAgain(mi.Texture):
-        def __init__(self, properties: Any) -> None:
-            super().__init__(properties)
-            self._specular = properties.get_texture("specular")
-            self._alpha = properties.get_texture("alpha")
-            widths = np.square(np.linspace(0, 1, ROUGHNESS_STEPS))
-            means = mean_albedo(widths, properties["smith"])
-            linear: Any = mi.Texture1f
-            self._means = linear(
-                mi.TensorXf(means.astype(np.float32)[:, None]), wrap_mode=dr.WrapMode.Clamp
-            )
-
-        def eval(self, si: Any, active: Any = True) -> Any:
-            roughness = dr.sqrt(self._alpha.eval_1(si, active))
-            # The centre of texel k of n lies at (k + 0.5) / n.
-            place = (roughness * (ROUGHNESS_STEPS - 1) + 0.5) / ROUGHNESS_STEPS
-            mean = self._means.eval(mi.Point1f(place))[0]
-            specular = self._specular.eval(si, active)
-            return specular * mean / (1 - specular * (1 - mean))
-
-        def mean(self) -> Any:
-            return self._specular.mean()
-
-        def is_spatially_varying(self) -> bool:
-            return True
-
-    mi.register_texture(_AGAIN, ScatteredAgain)
+def _squared_roughness(si: Any, active: Any, roughness: Any) -> Any:
+    return dr.maximum(dr.square(roughness.eval_1(si, active)), MIN_ALPHA)
 
 
-PLUGIN = "compensated_specular"
-"""Name in scene dictionaries; it has the textures specular, again (Fms) and alpha."""
+def _scattered_again(smith: Smith, si: Any, active: Any, specular: Any, alpha: Any) -> Any:
+    place = _texel_coordinate(dr.sqrt(alpha.eval_1(si, active)), ROUGHNESS_STEPS)
+    mean, color = _mean_table(smith).eval(mi.Point1f(place))[0], specular.eval(si, active)
+    return color * mean / (1 - color * (1 - mean))
 
-_LEAST_COS = 1e-4
-"""Only rays along the surface are below; the lookup divides by the cosine."""
+
+def _compensated_specular(si: Any, active: Any, specular: Any, again: Any, alpha: Any) -> Any:
+    width, cosine = alpha.eval_1(si, active), dr.maximum(si.wi.z, _LEAST_COS)
+    stretched = cosine * dr.rsqrt(dr.square(cosine) + dr.square(width) * (1 - dr.square(cosine)))
+    u = _texel_coordinate(dr.sqrt(stretched), X_STEPS)
+    v = _texel_coordinate(dr.sqrt(width), ROUGHNESS_STEPS)
+    albedo = _albedo_table().eval(mi.Point2f(u, v))[0]
+    return specular.eval(si, active) * (1 + again.eval(si, active) * ((1 - albedo) / albedo))
+
+
+def _texel_coordinate(share: Any, steps: int) -> Any:
+    """Return where a table has a number from 0 to 1: the centre of texel k is (k + 0.5) / steps."""
+    return (share * (steps - 1) + 0.5) / steps
 
 
 @cache
-def register_plugin() -> None:
-    """Make PLUGIN known to Mitsuba; a variant must be set, and stays for the process."""
-
-    class CompensatedSpecular(mi.Texture):
-        def __init__(self, properties: Any) -> None:
-            super().__init__(properties)
-            self._specular = properties.get_texture("specular")
-            self._again = properties.get_texture("again")
-            self._alpha = properties.get_texture("alpha")
-            texels = mi.TensorXf(albedo_table("separable").astype(np.float32)[..., None])
-            bilinear: Any = mi.Texture2f
-            self._table = bilinear(texels, wrap_mode=dr.WrapMode.Clamp)
-
-        def eval(self, si: Any, active: Any = True) -> Any:
-            place = _place_in_table(si.wi.z, self._alpha.eval_1(si, active))
-            albedo = self._table.eval(place)[0]
-            more = self._again.eval(si, active) * ((1 - albedo) / albedo)
-            return self._specular.eval(si, active) * (1 + more)
-
-        def mean(self) -> Any:
-            return self._specular.mean()
-
-        def is_spatially_varying(self) -> bool:
-            return True
-
-    mi.register_texture(PLUGIN, CompensatedSpecular)
+def _mean_table(smith: Smith) -> Any:
+    means = mean_albedo(np.square(np.linspace(0, 1, ROUGHNESS_STEPS)), smith)
+    linear: Any = mi.Texture1f
+    return linear(mi.TensorXf(means.astype(np.float32)[:, None]), wrap_mode=dr.WrapMode.Clamp)
 
 
-def _place_in_table(cosine: Any, alpha: Any) -> Any:
-    cosine = dr.maximum(cosine, _LEAST_COS)
-    cos_sq = cosine * cosine
-    stretched = cosine * dr.rsqrt(cos_sq + alpha * alpha * (1 - cos_sq))
-    # The centre of texel k of n lies at (k + 0.5) / n.
-    u = (dr.sqrt(stretched) * (X_STEPS - 1) + 0.5) / X_STEPS
-    v = (dr.sqrt(alpha) * (ROUGHNESS_STEPS - 1) + 0.5) / ROUGHNESS_STEPS
-    return mi.Point2f(u, v)
+@cache
+def _albedo_table() -> Any:
+    texels = mi.TensorXf(albedo_table("separable").astype(np.float32)[..., None])
+    bilinear: Any = mi.Texture2f
+    return bilinear(texels, wrap_mode=dr.WrapMode.Clamp)
 
 
 _TO_OUR_AXES = np.array([[0.0, 0.0, 1.0], [1.0, 0.0, 0.0], [0.0, 1.0, 0.0]])

@@ -36,7 +36,8 @@ from scene_templates.skies.procedural_skies import SkySettings
 from scene_templates.templates import TEMPLATES
 from storage.errors import TrilightError
 from storage.settings.described import from_record, settings_record
-from tests.for_each import for_each
+from storage.settings.overrides import apply_overrides
+from tests.for_each import case, for_each
 from tests.scene_templates.balls import MANY, Drawn, drawn, template_settings
 from tests.scene_templates.published import DEFAULT, STAGE_1, STAGE_2, Row
 from tests.scene_templates.statistics import (
@@ -210,13 +211,9 @@ def _table(scenes: list[Drawn], stated: Stated) -> Table:
         for axis, name in enumerate("xyz"):
             table[f"centre {name}"] = uniform(centres[:, axis], -0.5, 0.5)
         for low, high in sorted({row[3] for row in stated.rows}):
-            found = [
-                4 * placement.pose.radius
-                for one in scenes
-                for placement in one.layout.objects
-                if stated.row_of(one)[3] == (low, high)
-            ]
-            table[f"sizes {low} to {high}"] = uniform(found, low, high)
+            chosen = [one.layout for one in scenes if stated.row_of(one)[3] == (low, high)]
+            sizes = [4 * each.pose.radius for layout in chosen for each in layout.objects]
+            table[f"sizes {low} to {high}"] = uniform(sizes, low, high)
     return table
 
 
@@ -252,10 +249,8 @@ def test_everything_is_distributed_as_stated(build: str) -> None:
 def test_the_second_training_stage_draws_the_same() -> None:
     """Its budget, and how finely it is spent, are all that differs: one table stands for both."""
     pretrain, finetune = (preset_settings(name).scenes for name in ("pretrain-256", "finetune-512"))
-    same = dataclasses.replace(
-        finetune, max_triangles=pretrain.max_triangles, enough_error=pretrain.enough_error
-    )
-    assert same == pretrain
+    budget = {name: getattr(pretrain, name) for name in ("max_triangles", "enough_error")}
+    assert dataclasses.replace(finetune, **budget) == pretrain
     assert (finetune.max_triangles, finetune.enough_error) == (4096, 0.0025)
 
 
@@ -278,9 +273,7 @@ def _shared_room_table(shell: SharedRoom) -> Table:
     table = {"square": share(square, 0.5)}
     for axis, name in enumerate("xyz"):
         table[f"scale {name}"] = uniform(scale[:, axis], 1.0, 1.35)
-        table[f"move {name}"] = uniform(
-            move[:, axis], *((-0.05, 0.25) if axis == 2 else (-0.05, 0.05))
-        )
+        table[f"move {name}"] = uniform(move[:, axis], -0.05, 0.25 if axis == 2 else 0.05)
     for row, part in enumerate(TEMPLATES["corner"].parts):
         turns = np.array([patches[row].rotation_deg for patches in rooms])
         axis = SIDES[part].axis
@@ -298,9 +291,7 @@ def test_shared_rooms_are_drawn_as_stated() -> None:
     require_plausible(_shared_room_table(SharedRoom()))
     for patches in _placements(SharedRoom(), "open_box", 50):
         assert len({(one.scale, one.translation) for one in patches}) == 1
-
-
-def test_a_wrong_room_is_noticed() -> None:
+    # A wrong room is noticed.
     wrong = SharedRoom(
         square_share=0.35, scale=(1.0, 1.3), shift=0.03, raise_z=(0.0, 0.2), tilt_deg=1.5
     )
@@ -450,12 +441,10 @@ def _roll_twin(sector: Sector) -> list[float]:
     ]
 
 
-@for_each("name", TEMPLATES)
-def test_cameras_are_drawn_as_stated(name: str) -> None:
-    require_plausible(_camera_table(TEMPLATES[name].cameras))
-
-
-def test_wrong_cameras_are_noticed() -> None:
+def test_cameras_are_drawn_as_stated_and_wrong_ones_are_noticed() -> None:
+    for name, template in TEMPLATES.items():
+        with case(name):
+            require_plausible(_camera_table(template.cameras))
     wrong = {"fov_deg": (30.0, 54.0), "distance": (1.5, 1.85), "up_jitter": 0.2}
     table = _camera_table(TEMPLATES["wall"].cameras, **wrong, target_jitter=0.13)
     targets = {f"target {axis}" for axis in range(3)}
@@ -522,19 +511,13 @@ def test_records_of_random_cameras_say_nothing_of_a_path() -> None:
     assert from_record(CameraSettings, settings_record(orbit)) == orbit
 
 
-def test_an_object_alone_stands_in_the_middle() -> None:
-    settings = SceneSettings(families=(FAMILIES["alone"](),))
-    settings = dataclasses.replace(
-        settings, placement=dataclasses.replace(settings.placement, orientation="kept")
-    )
-    for one in drawn(settings, 10):
+def test_an_object_without_a_room_is_alone_and_stands_in_the_middle() -> None:
+    changes = {"placement.orientation": "kept"}
+    for one in drawn(apply_overrides(SceneSettings(families=(FAMILIES["alone"](),)), changes), 10):
         (placement,) = one.layout.objects
         assert one.layout.shell == ()
         assert not placement.pose.centre.any() and placement.pose.radius == 0.5
         assert np.array_equal(placement.pose.rotation, np.eye(3))
-
-
-def test_a_layout_without_a_room_holds_one_object() -> None:
     with pytest.raises(TrilightError, match=r"\(1, 2\); expected \(1, 1\) for alone"):
         Family(**{**vars(FAMILIES["alone"]()), "num_objects": (1, 2)})
 

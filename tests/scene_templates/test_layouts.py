@@ -49,8 +49,7 @@ def _gaps(one: Drawn) -> list[float]:
     poses = [placement.pose for placement in one.layout.objects]
     return [
         float(np.linalg.norm(a.centre - b.centre)) - a.radius - b.radius
-        for row, a in enumerate(poses)
-        for b in poses[:row]
+        for a, b in itertools.combinations(poses, 2)
     ]
 
 

@@ -229,15 +229,12 @@ def test_every_excursion_meets_every_family_equally_often(turns: int) -> None:
         assert set(found.values()) == {turns}
 
 
-def test_sine_and_cosine_are_those_of_the_library() -> None:
+def test_sine_and_cosine_are_those_of_the_library_and_easing_has_no_kink() -> None:
     # a folded angle is off by half an ulp of pi, 2.2e-16, and a dozen products round as much again
     angles = np.linspace(-math.pi, math.pi, 20001)
     assert np.abs(sine(angles) - np.sin(angles)).max() < 1e-15
     assert np.abs(cosine(angles) - np.cos(angles)).max() < 1e-15
     assert float(sine(0.0)) == 0
-
-
-def test_easing_and_ramps() -> None:
     assert smoothstep([-1, 0, 0.5, 1, 2]).tolist() == [0, 0, 0.5, 1, 1]
     slope = np.diff(smoothstep(np.linspace(0, 1, 1001)))
     # 3 s^2 of a first step of a thousandth: no kink at either end

@@ -6,8 +6,10 @@ per object two flat triangles of two colours, seen by two cameras.
 And pages as a browser would read them, with text and rows of objects that mean harm.
 """
 
+import base64
 import contextlib
 import dataclasses
+import io
 import json
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from html.parser import HTMLParser
@@ -15,6 +17,8 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
+from PIL import Image
 
 from storage.dataset.dataset import Dataset, open_dataset
 from storage.dataset.layout import DatasetFolder
@@ -38,28 +42,22 @@ SETTINGS = {
 
 def furnished(uids: Sequence[str], template: str = "plane", **entry: Any) -> Scene:
     """Return the tiny scene with an object per uid; `entry` holds the rights of all of them."""
-    scene = tiny_scene()
-    parts: dict[str, list[Any]] = {
-        name: [getattr(scene, name)]
-        for name in (
-            "vertex_positions", "vertex_normals", "faces", "material_index", "materials",
-            "object_index",
-        )
-    }  # fmt: skip
+    scene, count = tiny_scene(), len(uids)
     quad = np.array([[0, 0, 0.1], [1, 0, 0.1], [1, 1, 0.1], [0, 0, 0.1], [1, 1, 0.1], [0, 1, 0.1]])
-    for row in range(len(uids)):
-        parts["vertex_positions"].append(quad.astype(np.float32))
-        parts["vertex_normals"].append(np.tile(np.array([[0, 0, 1]], np.float32), (6, 1)))
-        parts["faces"].append(np.arange(6, dtype=np.uint32).reshape(2, 3) + 7 + 6 * row)
-        parts["material_index"].append(np.array([2, 3], np.uint16) + 2 * row)
-        parts["materials"].append(np.array([RED, GREEN], np.float32))
-        parts["object_index"].append(np.full(2, 2 + row, np.uint16))
+    added: dict[str, Any] = {
+        "vertex_positions": np.tile(quad, (count, 1)),
+        "vertex_normals": np.tile([[0, 0, 1]], (6 * count, 1)),
+        "faces": 7 + np.arange(6 * count).reshape(-1, 3),
+        "material_index": 2 + np.arange(2 * count),
+        "materials": np.tile([RED, GREEN], (count, 1)),
+        "object_index": 2 + np.repeat(np.arange(count), 2),
+    }
     objects = tuple(
         SceneObject(name=f"{row} {uid}", kind="object", uid=uid, **entry)
         for row, uid in enumerate(uids)
     )
-    arrays = {name: np.concatenate(chunks) for name, chunks in parts.items()}
-    arrays = {name: values.astype(getattr(scene, name).dtype) for name, values in arrays.items()}
+    arrays = {name: np.concatenate([getattr(scene, name), rows]) for name, rows in added.items()}
+    arrays = {name: rows.astype(getattr(scene, name).dtype) for name, rows in arrays.items()}
     provenance = {**scene.provenance, "template": template}
     return tiny_scene(**arrays, objects=(*scene.objects, *objects), provenance=provenance)
 
@@ -154,7 +152,14 @@ def edit_manifest(dataset: Dataset, **changes: Any) -> Path:
     return dataset.folder.root
 
 
+def files_of(folder: Path) -> dict[Path, bytes]:
+    return {path: path.read_bytes() for path in folder.rglob("*") if path.is_file()}
+
+
 HARM = """<script>alert(1)</script><img src=x onerror=alert(2)>"'&"""
+RIGHTS = {"licence": HARM, "attribution": HARM, "source_url": "javascript:alert(3)"}
+NO_LINKS = {"report": "../report.html", "before": None, "after": None}
+"""The links of a scene's page that stands alone."""
 VOID = {"meta", "img", "br", "input"}
 
 
@@ -198,6 +203,12 @@ def read(page: bytes) -> Tags:
     tags.close()
     assert tags._open == []
     return tags
+
+
+def pixels_of(link: str) -> NDArray[np.uint8]:
+    """Return the picture that a page holds as an address of data."""
+    data = base64.b64decode(link.partition(",")[2])
+    return np.asarray(Image.open(io.BytesIO(data)))
 
 
 def row(uid: str = "made/ball", **changes: Any) -> AssetRow:

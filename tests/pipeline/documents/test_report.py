@@ -1,6 +1,5 @@
 """`report.html`, its gallery and figures: harmless, complete, the same whenever it is written."""
 
-import base64
 import io
 import re
 from pathlib import Path
@@ -30,11 +29,15 @@ from storage.records.scene import SceneObject
 from storage.records.texture import MapSource, Texture
 from tests.pipeline.documents.dataset_by_hand import (
     HARM,
+    NO_LINKS,
+    RIGHTS,
     Tags,
     edit_manifest,
+    files_of,
     five_scenes,
     furnished,
     locked,
+    pixels_of,
     read,
     sample,
     text_of,
@@ -58,9 +61,8 @@ def pages(report: Path) -> dict[Path, Tags]:
 
 def hostile(root: Path) -> Dataset:
     """Return a dataset whose every text from outside is markup."""
-    rights = {"licence": HARM, "attribution": HARM, "source_url": "javascript:alert(3)"}
     shell = SceneObject(name=HARM, kind="shell")
-    scene = furnished([HARM], HARM, **rights)
+    scene = furnished([HARM], HARM, **RIGHTS)
     scene = scene.with_provenance({**scene.provenance, HARM: [HARM]})
     object.__setattr__(scene, "objects", (shell, *scene.objects[1:]))
     failures = [
@@ -182,8 +184,8 @@ def test_the_report_says_which_objects_keep_their_materials(tmp_path: Path) -> N
 def test_one_scene_or_none_at_all(tmp_path: Path) -> None:
     dataset = write_dataset(tmp_path, {"validation-000002.tar": [sample(9, furnished([]))]})
     shown = pages(report_of(dataset))
-    assert shown[tmp_path / "report" / "000000009.html"].links[0] == "../report.html#gallery"
-    assert "before" not in text_of(shown[tmp_path / "report" / "000000009.html"])
+    page = shown[tmp_path / "report" / "000000009.html"]
+    assert page.links[0] == "../report.html#gallery" and "before" not in text_of(page)
     assert "1 of 1 scenes" in text_of(shown[tmp_path / "report.html"])
     assert _rejections(dataset_distributions(dataset)).notes == ["Nothing was rejected."]
     shown = pages(report_of(write_dataset(tmp_path / "none", {})))
@@ -210,7 +212,7 @@ def test_writing_elsewhere_gives_the_same_bytes_and_leaves_the_dataset_alone(
     tmp_path: Path, dataset: Dataset, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     root = dataset.folder.root
-    before = {path: path.read_bytes() for path in root.rglob("*") if path.is_file()}
+    before = files_of(root)
     found = dataset_distributions(dataset)
     monkeypatch.setenv("LC_ALL", "de_DE.UTF-8")
     report = write_report(dataset, found, out=DatasetFolder(tmp_path))
@@ -220,7 +222,7 @@ def test_writing_elsewhere_gives_the_same_bytes_and_leaves_the_dataset_alone(
         path.relative_to(root): path.read_bytes() for path in pages(root / "report.html")
     }
     assert not any(str(root).encode() in data for data in written.values())
-    assert {path: path.read_bytes() for path in root.rglob("*") if path.is_file()} == before
+    assert files_of(root) == before
 
 
 @pytest.fixture(scope="module")
@@ -264,17 +266,11 @@ def test_a_texture_is_shown_as_it_lies() -> None:
     texture = Texture(texels=texels, is_srgb=True, source=MapSource(name=HARM))
     number = Texture(texels=np.full((1, 1, 1), 128, np.uint8))
     scene = textured_scene(0, texture, number, environment=sky())
-    pictures = [_pixels(shown.picture or "") for shown in shown_maps(scene)]
+    pictures = [pixels_of(shown.picture or "") for shown in shown_maps(scene)]
     assert pictures[0].tolist() == [[[0] * 3] * 2, [[0] * 3, [200, 100, 50]]]
     assert pictures[2].shape == (112, 224, 3) and pictures[2].max() == 255
-    links = {"report": "", "before": None, "after": None}
-    page = read(encode_scene_page(sample(0, scene.with_provenance({})), "train", (), links))
+    page = read(encode_scene_page(sample(0, scene.with_provenance({})), "train", (), NO_LINKS))
     assert "".join(page.text).count(HARM) == 2
-
-
-def _pixels(link: str) -> np.ndarray:
-    data = base64.b64decode(link.partition(",")[2])
-    return np.asarray(Image.open(io.BytesIO(data)))
 
 
 VALUES: dict[str, list[float]] = {

@@ -10,6 +10,7 @@ from collections.abc import Callable
 from importlib import import_module
 from pathlib import Path
 from typing import Any
+from unittest.mock import Mock
 
 import pytest
 
@@ -42,25 +43,20 @@ def _array(task: int, first: int, last: int, count: int, **more: str) -> dict[st
     return {f"SLURM_ARRAY_TASK_{name}": str(value) for name, value in numbers.items()} | more
 
 
-def _shards(number: int) -> Callable[[], int]:
-    return lambda: number
-
-
 def test_the_tasks_of_an_array_have_equal_shares() -> None:
-    assert [shards_of_task(_array(k, 0, 3, 4), _shards(10)) for k in range(4)] == [
+    assert [shards_of_task(_array(k, 0, 3, 4), lambda: 10) for k in range(4)] == [
         "0:2", "2:5", "5:7", "7:10",
     ]  # fmt: skip
-    by_two = [shards_of_task(_array(k, 1, 5, 3), _shards(6)) for k in (1, 3, 5)]  # --array=1-5:2
+    by_two = [shards_of_task(_array(k, 1, 5, 3), lambda: 6) for k in (1, 3, 5)]  # --array=1-5:2
     assert by_two == ["0:2", "2:4", "4:6"]
-    assert shards_of_task(_array(7, 7, 7, 1), _shards(6)) == "0:6"
-    shares = [shards_of_task(_array(k, 0, 4, 5), _shards(2)) for k in range(5)]
+    assert shards_of_task(_array(7, 7, 7, 1), lambda: 6) == "0:6"
+    shares = [shards_of_task(_array(k, 0, 4, 5), lambda: 2) for k in range(5)]
     assert shares == ["0:1", "1:2", "0:1", "1:2", "0:1"], "more tasks than shards"
 
-    def unknown() -> int:
-        raise AssertionError("nobody needs to know: the dataset need not even be begun")
-
+    unknown = Mock()
     alone = {"SLURM_ARRAY_TASK_ID": "2", "SHARDS_PER_TASK": "4"}
     assert shards_of_task(alone, unknown) == "8:12"
+    assert not unknown.called, "nobody needs to know: the dataset need not even be begun"
 
 
 GIVEN = {"TASKS": "0-1,7", "SHARDS_PER_TASK": "4"}
@@ -91,7 +87,7 @@ def test_a_place_is_a_task_that_is_missing() -> None:
 def test_what_is_no_array_is_named(on: str, environment: dict[str, str], message: str) -> None:
     with pytest.raises(TrilightError, match=f"--runner {on}: .*{message}"):
         if on == "slurm":
-            shards_of_task(environment, _shards(8))
+            shards_of_task(environment, lambda: 8)
         shards_of_place(environment)
 
 
@@ -157,8 +153,6 @@ def test_an_array_fits_the_cluster_and_covers_every_shard(cluster: Path) -> None
     shards = -(-2_000_000 // 256)
     assert len(job.tasks) <= MAX_TASKS
     assert job.per_task * len(job.tasks) >= shards > job.per_task * (len(job.tasks) - 1)
-    with pytest.raises(TrilightError, match="shards-per-task is 1: .* task 7812; .* 8 shards"):
-        array_job(order, per_task=1, at_once=None)
 
 
 def test_settings_that_divide_the_dataset_count(cluster: Path) -> None:
@@ -171,9 +165,6 @@ def test_settings_that_divide_the_dataset_count(cluster: Path) -> None:
     assert words[4:] == ["--set", "splits.scenes_per_shard=8"]
     given = sbatch_environment(job)
     assert given["OBJECTS"] == "my objects" and given["SCENES"] == "64"
-    for refused in (GenerateOptions(shards="0:1"), GenerateOptions(scenes_from="folder")):
-        with pytest.raises(TrilightError, match="submit slurm: expected no"):
-            array_job(refused, per_task=None, at_once=None)
 
 
 def test_only_what_is_missing_is_submitted(cluster: Path) -> None:
@@ -227,10 +218,21 @@ def test_tasks_that_died_are_all_that_is_submitted_again(
     assert trilight(["status", order.place, "--missing"]).stdout == ""
 
 
-def test_passwords_do_not_reach_the_queue() -> None:
-    order = GenerateOptions(build="smoke", objects="http://ada:secret@host/objects/")
-    with pytest.raises(TrilightError, match="holds a password") as refused:
-        array_job(order, per_task=None, at_once=None)
+@for_each(
+    ("given", "per_task", "message"),
+    [
+        ({"objects": "http://ada:secret@host/objects/"}, None, "holds a password"),
+        ({"shards": "0:1"}, None, "submit slurm: expected no"),
+        ({"scenes_from": "folder"}, None, "submit slurm: expected no"),
+        ({"build": "pretrain-256", "scenes": 2_000_000}, 1,
+         "shards-per-task is 1: .* task 7812; .* 8 shards"),
+    ],
+)  # fmt: skip
+def test_what_no_array_can_make_is_refused_and_no_password_reaches_the_queue(
+    cluster: Path, given: dict[str, Any], per_task: int | None, message: str
+) -> None:
+    with pytest.raises(TrilightError, match=message) as refused:
+        array_job(GenerateOptions(**given), per_task=per_task, at_once=None)
     assert "secret" not in str(refused.value)
 
 
@@ -259,9 +261,8 @@ def test_the_printed_command_does_what_submitting_does(cluster: Path) -> None:
     subprocess.run(["bash", "-c", dry.stdout.splitlines()[-1]], check=True, capture_output=True)
     assert (cluster / "logs").is_dir()
     printed = (cluster / "asked").read_text()
-    assert {"OUT=my set", "OBJECTS=my objects"} <= set(
-        (cluster / "asked.env").read_text().splitlines()
-    )
+    environment = (cluster / "asked.env").read_text().splitlines()
+    assert {"OUT=my set", "OBJECTS=my objects"} <= set(environment)
     assert trilight(words).exit_code == 0
     assert (cluster / "asked").read_text() == printed
 
@@ -357,9 +358,8 @@ def test_the_pod_has_the_rights_of_the_other_manifests(made: Made) -> None:
     assert pod["securityContext"] == theirs["securityContext"]
     for name in ("securityContext", "resources", "envFrom", "imagePullPolicy"):
         assert ours[name] == other[name], name
-    assert {mount["mountPath"] for mount in ours["volumeMounts"]} == {
-        mount["mountPath"] for mount in other["volumeMounts"]
-    }
+    mounts = [{each["mountPath"] for each in one["volumeMounts"]} for one in (ours, other)]
+    assert mounts[0] == mounts[1]
     assert not pod["automountServiceAccountToken"]
 
 

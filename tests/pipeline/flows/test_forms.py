@@ -14,6 +14,7 @@ from concurrent.futures import Future
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any, cast
+from unittest.mock import Mock
 
 import pytest
 from PIL import Image
@@ -86,9 +87,8 @@ def test_the_forms_within_have_every_setting_of_a_build_and_its_range() -> None:
     renders = groups["RenderSettingsChanges"]["properties"]
     assert renders["max_spp"]["description"].startswith("The cap")
     assert renders["denoiser"]["anyOf"][0]["enum"] == ["high", "fast", "off"]
-    assert set(groups["DatasetSettingsChanges"]["properties"]) == set(
-        DatasetSettings.__dataclass_fields__
-    )
+    settings = groups["DatasetSettingsChanges"]["properties"]
+    assert set(settings) == set(DatasetSettings.__dataclass_fields__)
     # As declared at the fields, but for what no form can hold exactly.
     shown = schema["properties"]
     assert shown["scenes"]["anyOf"][0] == {"type": "integer", "minimum": 1, "maximum": 10**9}
@@ -167,13 +167,6 @@ def test_a_place_to_write_to_holds_no_secret(name: str) -> None:
         FLOWS[name].validate_parameters({"out": out})
 
 
-def test_a_place_that_cannot_be_written_is_refused_by_name() -> None:
-    """Before anything is begun: a flow makes its order first."""
-    for out in ("https://host/set", "hf://datasets/ada/set", "ftp://host/set"):
-        with pytest.raises(TrilightError, match=f"^out '{out}'"):
-            options_of_form(_parameters(out=out), GenerateOptions)
-
-
 def test_only_what_can_pass_is_tried_again_documents_too() -> None:
     errors = (EnvironmentFailure("disk"), OSError("gone"), TrilightError("wrong"), KeyError())
     for error, again in zip(errors, (True, True, False, False), strict=True):
@@ -191,13 +184,13 @@ def test_so_many_flow_runs_are_so_many_in_all(monkeypatch: pytest.MonkeyPatch) -
     def started(deployment: str, *, parameters: dict[str, Any], **options: Any) -> None:
         made.append(f"{deployment} {parameters['shards']}")
 
-    status = SimpleNamespace(shards_planned=10)
-    monkeypatch.setattr(prefect_flows, "prepare_assets", lambda **given: None)
-    monkeypatch.setattr(prefect_flows, "read_status", lambda out: status)
-    monkeypatch.setattr(prefect_flows, "run_deployment", started)
-    monkeypatch.setattr(
-        prefect_flows, "generate_scenes", lambda **given: made.append(given["shards"])
-    )
+    for name, stand_in in (
+        ("prepare_assets", lambda **given: None),
+        ("read_status", lambda out: SimpleNamespace(shards_planned=10)),
+        ("run_deployment", started),
+        ("generate_scenes", lambda **given: made.append(given["shards"])),
+    ):
+        monkeypatch.setattr(prefect_flows, name, stand_in)
     flow: Any = prefect_flows.build_dataset
     flow.fn(**_parameters(DatasetInRuns, flow_runs=3, deployment="d/x"))
     assert made == ["d/x 3:6", "d/x 6:10", "0:3", None]
@@ -208,16 +201,21 @@ def test_so_many_flow_runs_are_so_many_in_all(monkeypatch: pytest.MonkeyPatch) -
 
 
 @for_each(
-    ("given", "message"),
+    ("kind", "given", "message"),
     [
-        ({"flow_runs": 0}, "flow_runs is 0; expected a whole number from 1"),
-        ({"flow_runs": 10**6}, "flow_runs is 1000000"),
-        ({"shards": "0:2"}, "shards is '0:2'; expected no range"),
+        (DatasetInRuns, {"flow_runs": 0}, "flow_runs is 0; expected a whole number from 1"),
+        (DatasetInRuns, {"flow_runs": 10**6}, "flow_runs is 1000000"),
+        (DatasetInRuns, {"shards": "0:2"}, "shards is '0:2'; expected no range"),
+        *((GenerateOptions, {"out": out}, f"^out '{out}'")
+          for out in ("https://host/set", "hf://datasets/ada/set", "ftp://host/set")),
     ],
-)
-def test_wrong_numbers_of_runs_are_named(given: dict[str, Any], message: str) -> None:
+)  # fmt: skip
+def test_numbers_of_runs_and_places_that_cannot_be_are_named(
+    kind: type, given: dict[str, Any], message: str
+) -> None:
+    """Before anything is begun: a flow makes its order first."""
     with pytest.raises(TrilightError, match=message):
-        options_of_form(_parameters(DatasetInRuns, **given), DatasetInRuns)
+        options_of_form(_parameters(kind, **given), kind)
 
 
 @for_each(("device", "held"), [("gpu", [1]), ("cpu", [])])
@@ -257,10 +255,8 @@ def test_a_dask_worker_that_sees_another_folder_is_named_before_any_work(tmp_pat
 
 def test_a_dask_scheduler_that_does_not_answer_is_named() -> None:
     pytest.importorskip("distributed", reason="needs the package distributed (setup-all)")
-    with (
-        pytest.raises(TrilightError, match="--address http://127.0.0.1:1: no Dask scheduler"),
-        flow_executors._client("http://127.0.0.1:1"),
-    ):
+    said = "--address http://127.0.0.1:1: no Dask scheduler"
+    with pytest.raises(TrilightError, match=said), flow_executors._client("http://127.0.0.1:1"):
         pass
 
 
@@ -283,9 +279,7 @@ class Cancelled(BaseException):
 
 
 def test_what_is_cancelled_saves_and_status_and_lines_are_passed_on(tmp_path: Path) -> None:
-    def cancel(line: str) -> None:
-        raise Cancelled
-
+    cancel = Mock(side_effect=Cancelled)
     with pytest.raises(Cancelled):
         run_to_end([sys.executable, "-c", SAVES, str(tmp_path / "saved")], cancel)
     assert (tmp_path / "saved").read_text() == "1"
@@ -377,9 +371,7 @@ def test_a_run_of_a_range_shows_its_own_shards_and_cost(
 def test_a_run_that_fails_says_so_in_its_summary(
     tables: Shown, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    def full(*arguments: object) -> None:
-        raise TrilightError("the disk is full of https://me:secret@host/x")
-
+    full = Mock(side_effect=TrilightError("the disk is full of https://me:secret@host/x"))
     monkeypatch.setattr(prefect_runner, "make_dataset", full)
     with pytest.raises(TrilightError):
         make_with_page(GenerateOptions(out=str(tmp_path)), PrefectRunner())
@@ -459,9 +451,7 @@ def test_who_watches_alone_asks_for_nothing_and_waits_so_long(
 def test_a_page_that_cannot_be_shown_ends_neither_a_run_nor_an_array(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
 ) -> None:
-    def gone(*args: object, **named: object) -> None:
-        raise ConnectionError("gone")
-
+    gone = Mock(side_effect=ConnectionError("gone"))
     monkeypatch.setattr(prefect_runner, "create_progress_artifact", gone)
     monkeypatch.setattr(prefect_runner, "create_table_artifact", gone)
     page = RunPage(str(tmp_path))

@@ -16,10 +16,6 @@ def prepare(folder: str) -> None:
     (Path(folder) / f"started-{os.getpid()}").touch()
 
 
-def nothing() -> None:
-    """Set up nothing."""
-
-
 def double(value: int) -> int:
     return 2 * value
 
@@ -96,10 +92,6 @@ def count_and_die(folder: str, number: int, times: int) -> int:
     if calls <= times:
         os.kill(os.getpid(), number)
     return calls
-
-
-def set_up_dying(folder: str, number: int, times: int) -> None:
-    count_and_die(folder, number, times)
 
 
 def fail_set_up(folder: str) -> None:

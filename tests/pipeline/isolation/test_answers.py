@@ -157,9 +157,8 @@ def test_values_come_back_as_they_were_and_damaged_ones_as_declared_or_a_sentenc
     at = data.draw(st.integers(1, len(wrong) - 1))
     cut, rest = (data.draw(st.integers(0, len(wrong[at]))) for _ in range(2))
     other = encode_result(data.draw(typed_values(1))[1])[1]
-    wrong[at] = (
-        wrong[at][:cut] + data.draw(st.binary(max_size=3) | st.just(other)) + wrong[at][rest:]
-    )
+    noise = data.draw(st.binary(max_size=3) | st.just(other))
+    wrong[at] = wrong[at][:cut] + noise + wrong[at][rest:]
     try:
         assert is_of(read(wrong, hint), hint)
     except ChildFailed as failure:
@@ -267,9 +266,8 @@ class Hostile:
 
 @pytest.fixture
 def child() -> Iterator[IsolatedChild]:
-    child = IsolatedChild(limits=LIMITS)
-    yield child
-    child.close()
+    with closing(IsolatedChild(limits=LIMITS)) as child:
+        yield child
 
 
 def test_a_hostile_pickle_makes_no_file(tmp_path: Path) -> None:

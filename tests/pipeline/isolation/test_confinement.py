@@ -1,5 +1,6 @@
 """A child that a file has taken over, or that dies: its tries are refused, its end is judged."""
 
+import functools
 import os
 import shutil
 import signal
@@ -10,6 +11,7 @@ from collections.abc import Callable, Iterator, Mapping
 from contextlib import closing
 from pathlib import Path
 from types import SimpleNamespace
+from unittest.mock import Mock
 
 import pytest
 
@@ -30,7 +32,7 @@ from pipeline.isolation.call_failures import ENDS, with_retries
 from pipeline.isolation.system_calls import landlock_version, seccomp_works
 from storage.errors import EnvironmentFailure, TrilightError
 from tests.conftest import ROOT
-from tests.for_each import for_each
+from tests.for_each import case, for_each
 from tests.pipeline.isolation import called, probes
 from tests.pipeline.isolation.probes import PROBES
 
@@ -56,14 +58,9 @@ def place(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 @pytest.fixture(scope="module")
 def child(place: Path) -> Iterator[IsolatedChild]:
-    child = confined(reach(files=[place / "in" / "file"], writes=[place / "out"]))
-    yield child
-    child.close()
-
-
-def _refused(child: IsolatedChild, function: object, *args: object) -> None:
-    with pytest.raises(ChildFailed, match="PermissionError"):
-        child.call(function, *args)  # type: ignore[arg-type]
+    files = reach(files=[place / "in" / "file"], writes=[place / "out"])
+    with closing(confined(files)) as child:
+        yield child
 
 
 @needs_landlock
@@ -193,7 +190,8 @@ def test_packages_that_a_path_of_pythons_names_are_read_and_its_other_folders_no
         monkeypatch.syspath_prepend(str(folder))
     with closing(confined(reach())) as child:
         assert child.call(called.read, packages / "file") == "found"
-        _refused(child, called.read, other / "file")
+        with pytest.raises(ChildFailed, match="PermissionError"):
+            child.call(called.read, other / "file")
 
 
 def test_off_confines_nothing(place: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -272,10 +270,6 @@ def test_the_filter_refuses_calls_by_number_and_by_argument(machine: str, column
 PATIENT = ChildLimits(memory_bytes=2 << 30, wall_s=120, calls_per_child=9)
 
 
-def child_with(setup, *args: object) -> IsolatedChild:  # type: ignore[no-untyped-def]
-    return IsolatedChild(limits=PATIENT, factory=setup, args=args)
-
-
 @pytest.fixture(autouse=True)
 def _no_pauses(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(call_failures, "_PAUSE_S", 0.0)
@@ -283,20 +277,17 @@ def _no_pauses(monkeypatch: pytest.MonkeyPatch) -> None:
 
 @pytest.fixture
 def plain_child() -> Iterator[IsolatedChild]:
-    plain_child = child_with(called.nothing)
-    yield plain_child
-    plain_child.close()
+    with closing(IsolatedChild(limits=PATIENT)) as plain_child:
+        yield plain_child
 
 
 def test_a_signal_of_native_code_is_told_from_one_of_somebody_else(
     plain_child: IsolatedChild,
 ) -> None:
-    with pytest.raises(ChildFailed, match="SIGSEGV") as caught:
-        plain_child.call(called.die_by, signal.SIGSEGV)
-    assert (caught.value.reason, caught.value.is_verdict) == ("crashed_signal_11", True)
-    with pytest.raises(ChildFailed, match="SIGTERM") as caught:
-        plain_child.call(called.die_by, signal.SIGTERM)
-    assert (caught.value.reason, caught.value.is_verdict) == ("killed", False)
+    for end, reason in ((signal.SIGSEGV, "crashed_signal_11"), (signal.SIGTERM, "killed")):
+        with pytest.raises(ChildFailed, match=end.name) as caught:
+            plain_child.call(called.die_by, end)
+        assert (caught.value.reason, caught.value.is_verdict) == (reason, reason != "killed")
 
 
 @for_each(
@@ -321,30 +312,19 @@ def test_ends_by_other_signals_are_told_apart_by_the_status(
 
 
 def test_the_same_call_is_made_again(plain_child: IsolatedChild, tmp_path: Path) -> None:
-    assert (
-        call_with_retries(plain_child, called.count_and_die, str(tmp_path), signal.SIGKILL, 2) == 3
-    )
+    call = called.count_and_die, str(tmp_path), signal.SIGKILL, 2
+    assert call_with_retries(plain_child, *call) == 3
 
 
-@for_each(("reason", "end"), ENDS.items())
-def test_tries_end(reason: str, end: call_failures.End) -> None:
-    calls: list[str] = []
-
-    def fail() -> None:
-        calls.append(reason)
-        raise ChildFailed(reason, "as ever")
-
-    with pytest.raises(ChildFailed) as caught:
-        with_retries(fail)
-    assert (len(calls), caught.value.is_verdict) == (end.tries, end.is_verdict)
-
-
-def test_every_end_has_tries_and_only_two_are_verdicts() -> None:
+def test_tries_end_and_only_two_ends_are_verdicts() -> None:
     """A verdict may be kept, and lead to other data: whoever adds one must say so here."""
-    assert {name for name, end in ENDS.items() if end.is_verdict} == {
-        "timeout_cpu",
-        "crashed_signal",
-    }
+    for reason, end in ENDS.items():
+        fail = Mock(side_effect=ChildFailed(reason, "as ever"))
+        with case(reason), pytest.raises(ChildFailed) as caught:
+            with_retries(fail)
+        assert (fail.call_count, caught.value.is_verdict) == (end.tries, end.is_verdict), reason
+    verdicts = {name for name, end in ENDS.items() if end.is_verdict}
+    assert verdicts == {"timeout_cpu", "crashed_signal"}
     assert all(1 <= end.tries <= 3 for end in ENDS.values())
     tries = {name: ENDS[name].tries for name in ("killed", "exception", "crashed_signal")}
     assert tries == {"killed": 3, "exception": 3, "crashed_signal": 2}
@@ -354,20 +334,22 @@ def test_every_end_has_tries_and_only_two_are_verdicts() -> None:
 def test_kills_while_a_child_is_set_up_are_tried_again_and_end_the_run_at_last(
     tmp_path: Path,
 ) -> None:
-    with closing(child_with(called.set_up_dying, str(tmp_path), signal.SIGKILL, 2)) as plain_child:
-        assert plain_child.call(called.double, 4) == 8
+    dying_child = functools.partial(IsolatedChild, limits=PATIENT, factory=called.count_and_die)
+    with closing(dying_child(args=(str(tmp_path), signal.SIGKILL, 2))) as child:
+        assert child.call(called.double, 4) == 8
     assert len(list(tmp_path.iterdir())) == 3
     (tmp_path / "again").mkdir()
-    plain_child = child_with(called.set_up_dying, str(tmp_path / "again"), signal.SIGKILL, 99)
+    child = dying_child(args=(str(tmp_path / "again"), signal.SIGKILL, 99))
     with pytest.raises(EnvironmentFailure, match="cannot be set up.*SIGKILL.*doctor"):
-        plain_child.call(called.double, 4)
+        child.call(called.double, 4)
     assert len(list((tmp_path / "again").iterdir())) == 3
 
 
 def test_a_set_up_that_cannot_succeed_is_tried_once_at_each_call(tmp_path: Path) -> None:
     """And no call is made in a child that was not set up."""
-    with closing(child_with(called.fail_set_up, str(tmp_path))) as plain_child:
+    child = IsolatedChild(limits=PATIENT, factory=called.fail_set_up, args=(str(tmp_path),))
+    with closing(child):
         for calls in (1, 2):
             with pytest.raises(EnvironmentFailure, match="cannot be set up.*a library is broken"):
-                plain_child.call(called.double, 4)
+                child.call(called.double, 4)
             assert len(list(tmp_path.iterdir())) == calls

@@ -1,6 +1,7 @@
 """Native code may crash, hang, stand still or eat memory in a child; stand-ins for libraries."""
 
 import ctypes
+import dataclasses
 import logging
 import os
 import signal
@@ -16,6 +17,7 @@ from multiprocessing import popen_forkserver
 from pathlib import Path
 from types import ModuleType
 from typing import Any
+from unittest.mock import Mock
 
 import pytest
 
@@ -35,21 +37,20 @@ from tests.for_each import for_each
 from tests.pipeline.isolation import called
 
 LIMITS = ChildLimits(memory_bytes=2 << 30, wall_s=2, calls_per_child=3)
+PATIENT = dataclasses.replace(LIMITS, wall_s=60, calls_per_child=9)
 
 
 @pytest.fixture
 def child(tmp_path: Path) -> Iterator[IsolatedChild]:
-    child = IsolatedChild(limits=LIMITS, factory=called.prepare, args=(str(tmp_path),))
-    yield child
-    child.close()
+    args = (str(tmp_path),)
+    with closing(IsolatedChild(limits=LIMITS, factory=called.prepare, args=args)) as child:
+        yield child
 
 
 def test_a_child_that_cannot_start_leaves_the_program_as_it_was(
     child: IsolatedChild, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    def full() -> str:
-        raise FileNotFoundError("no usable temporary folder")
-
+    full = Mock(side_effect=FileNotFoundError("no usable temporary folder"))
     program = ModuleType("__main__")
     monkeypatch.setitem(sys.modules, "__main__", program)
     monkeypatch.delenv("PYTHONSAFEPATH", raising=False)
@@ -134,8 +135,7 @@ def test_closing_frees_a_waiting_caller(child: IsolatedChild) -> None:
 @pytest.mark.slow("kills")
 def test_processor_seconds_are_for_one_call_each() -> None:
     """A call that uses them up ends its child; several that stay below do not add up."""
-    limits = ChildLimits(memory_bytes=2 << 30, wall_s=60, cpu_s=1, calls_per_child=9)
-    with closing(IsolatedChild(limits=limits)) as child:
+    with closing(IsolatedChild(limits=dataclasses.replace(PATIENT, cpu_s=1))) as child:
         assert len({child.call(called.burn, 0.6) for _ in range(3)}) == 1
         with pytest.raises(ChildFailed, match="timeout_cpu: used its 1 processor seconds"):
             child.call(called.burn, 30.0)
@@ -144,7 +144,7 @@ def test_processor_seconds_are_for_one_call_each() -> None:
 
 def test_waiting_uses_no_processor_seconds() -> None:
     """It uses the time of its call, and costs no more than that."""
-    limits = ChildLimits(memory_bytes=2 << 30, wall_s=1.5, cpu_s=1, calls_per_child=9)
+    limits = dataclasses.replace(PATIENT, wall_s=1.5, cpu_s=1)
     with closing(IsolatedChild(limits=limits)) as child:
         with pytest.raises(ChildFailed, match="timeout_wall"):
             child.call(called.hang)
@@ -160,18 +160,14 @@ def test_a_retired_child_is_replaced(child: IsolatedChild) -> None:
     assert child.call(called.process_id) != first
 
 
-PATIENT = ChildLimits(memory_bytes=2 << 30, wall_s=60, calls_per_child=9)
-
-
 @pytest.fixture
 def watched(monkeypatch: pytest.MonkeyPatch) -> Iterator[IsolatedChild]:
     """Looked at twenty times a second, and given up after three quarters of one."""
     monkeypatch.setattr(answers, "LOOK_S", 0.05)
     monkeypatch.setattr(answers, "LOOKS_BEFORE_KILL", 15)
     monkeypatch.setattr(call_failures, "_PAUSE_S", 0.0)
-    watched = IsolatedChild(limits=PATIENT)
-    yield watched
-    watched.close()
+    with closing(IsolatedChild(limits=PATIENT)) as watched:
+        yield watched
 
 
 def test_a_stopped_child_is_noticed_and_its_work_done_again(
@@ -212,35 +208,24 @@ def test_a_child_that_is_continued_in_time_answers_itself(
     assert len(caplog.records) == 1
 
 
-CALLED = """
-import os, time
-
-def wait_for(path) -> int:
-    while not os.path.exists(path):
-        time.sleep(0.02)
-    return os.getpid()
-"""
-
 PROGRAM = """
 import sys
-sys.path.insert(0, {root!r})
-from called import wait_for
 from pipeline.isolation import ChildLimits, IsolatedChild
-
+from tests.pipeline.isolation import called
 limits = ChildLimits(memory_bytes=2 << 30, wall_s=2, calls_per_child=9)
 child = IsolatedChild(limits=limits)
-print(child.call(wait_for, __file__), flush=True)
-print(child.call(wait_for, __file__ + ".go"), flush=True)
+for path in sys.argv[1:]:
+    print(child.call(called.wait_for, path), flush=True)
 """
 
 
 def test_a_command_that_is_stopped_as_a_whole_goes_on_where_it_was(tmp_path: Path) -> None:
     """As by Ctrl-Z and `fg`: the pause is longer than the child's wall time, and nobody is told."""
-    program = tmp_path / "program.py"
-    program.write_text(PROGRAM.format(root=str(ROOT)))
-    (tmp_path / "called.py").write_text(CALLED)
+    begun, go = tmp_path / "begun", tmp_path / "go"
+    begun.touch()
     with subprocess.Popen(
-        [sys.executable, str(program)],
+        [sys.executable, "-c", PROGRAM, str(begun), str(go)],
+        cwd=ROOT,
         stdout=subprocess.PIPE,
         stderr=subprocess.PIPE,
         text=True,
@@ -251,7 +236,7 @@ def test_a_command_that_is_stopped_as_a_whole_goes_on_where_it_was(tmp_path: Pat
         os.killpg(process.pid, signal.SIGTSTP)
         time.sleep(2.5)
         assert answers._is_stopped(process.pid) and answers._is_stopped(int(first))
-        (tmp_path / "program.py.go").touch()
+        go.touch()
         os.killpg(process.pid, signal.SIGCONT)
         second, errors = process.communicate(timeout=120)
     assert (second, errors) == (first, "")

@@ -41,6 +41,12 @@ def camera_of(scene: Scene, resolution: int, view: int = 0) -> PixelCamera:
     return pixel_camera(scene.c2w[view], scene.fov_deg[view], resolution)
 
 
+def view_settings(spp: int, **changes: Any) -> RenderSettings:
+    """Return settings of 32 pixels and so many samples, whose target of 99 dB no view reaches."""
+    plain = {"resolution": 32, "noise_floor_db": 99.0, "min_spp": spp, "max_spp": spp}
+    return RenderSettings(**{**plain, **changes})
+
+
 def render_view(scene: Scene, settings: RenderSettings, seed: int = 0) -> RenderedView:
     """Return the first view of a scene, as the stage makes it."""
     renderer = SceneRenderer(scene, settings)

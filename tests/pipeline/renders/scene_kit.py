@@ -232,9 +232,8 @@ def sampled_like_scene(rng: np.random.Generator, *, num_views: int = 4) -> Scene
     ]
     scene = join(parts)
     poses = np.stack([_random_pose(rng, kind) for _ in range(num_views)])
-    return scene.with_cameras(
-        poses.astype(np.float32), rng.uniform(30, 60, num_views).astype(np.float32)
-    )
+    fov_deg = rng.uniform(30, 60, num_views).astype(np.float32)
+    return scene.with_cameras(poses.astype(np.float32), fov_deg)
 
 
 def _shell(kind: int) -> list[NDArray]:
@@ -263,13 +262,8 @@ def _open_direction(rng: np.random.Generator, kind: int) -> NDArray[np.float64]:
     centre = [-0.5 * np.pi, -0.5 * np.pi, -0.25 * np.pi, -0.5 * np.pi][kind]
     azimuth = centre + rng.uniform(-half_width, half_width)
     elevation = np.radians(rng.uniform(10, 65))
-    return np.array(
-        [
-            np.cos(elevation) * np.cos(azimuth),
-            np.cos(elevation) * np.sin(azimuth),
-            np.sin(elevation),
-        ]
-    )
+    across = np.cos(elevation)
+    return np.array([across * np.cos(azimuth), across * np.sin(azimuth), np.sin(elevation)])
 
 
 def _random_pose(rng: np.random.Generator, kind: int) -> NDArray[np.float64]:

@@ -33,14 +33,21 @@ from pipeline.renders.pictures import (
     squared_error,
 )
 from pipeline.renders.samples import DualBuffer, TileChoice
-from pipeline.renders.settings import Arithmetic, RenderSettings
+from pipeline.renders.settings import Arithmetic
 from pipeline.renders.tracer import load_tracer
 from pipeline.renders.view_pictures import LEAST_PASSES, with_mean_of
 from storage import denoiser
 from storage.denoiser import Features, denoise, load_oidn, set_denoiser_device
 from storage.errors import TrilightError
 from tests.for_each import for_each
-from tests.pipeline.renders.sampling import Half, camera_of, floor_of, halves_of, render_view
+from tests.pipeline.renders.sampling import (
+    Half,
+    camera_of,
+    floor_of,
+    halves_of,
+    render_view,
+    view_settings,
+)
 from tests.pipeline.renders.scene_kit import sampled_like_scene
 from tests.pipeline.renders.test_renderer import lit_scene
 
@@ -254,9 +261,8 @@ def test_the_standard_error_is_that_between_passes() -> None:
     for _ in samples.passes_to(256):
         pass
     assert len(asked) == LEAST_PASSES
-    greys = np.stack(
-        [tracer.radiance(camera, seed=seed, spp=spp).mean(axis=-1) for seed, spp in asked]
-    ).astype(np.float64)
+    pictures = [tracer.radiance(camera, seed=seed, spp=spp) for seed, spp in asked]
+    greys = np.stack([picture.mean(axis=-1) for picture in pictures]).astype(np.float64)
     weights = np.array([spp for _, spp in asked], np.float64)
     mean = np.tensordot(weights / weights.sum(), greys, 1)
     variance = np.tensordot(weights, np.square(greys - mean), 1) / (len(asked) - 1) / weights.sum()
@@ -268,19 +274,15 @@ def test_the_standard_error_is_that_between_passes() -> None:
 @pytest.mark.parametrize(("max_spp", "per_light"), [(32, False), (256, True)])
 def test_a_view_is_as_bright_as_its_samples_at_every_cap(max_spp: int, per_light: bool) -> None:
     scene = sampled_like_scene(np.random.default_rng(5), num_views=1)
-    settings = RenderSettings(
-        resolution=16, noise_floor_db=80.0, min_spp=32, max_spp=max_spp, per_light=per_light
-    )
+    settings = view_settings(32, resolution=16, max_spp=max_spp, per_light=per_light)
     # Tiles are chosen by denoised pictures: without the denoiser others would get more samples.
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(TileChoice, "passes", lambda self, samples, mean_spp: None)
         view = render_view(scene, settings, 7)
         raw = render_view(scene, dataclasses.replace(settings, denoiser="off"), 7)
+    shown, sampled = (each.radiance_rgb.mean(dtype=np.float64) for each in (view, raw))
     # Pictures of single lights are rounded to half floats, by up to 1 part in 2048 each.
-    tolerance = 5e-4 if per_light else 1e-6
-    assert view.radiance_rgb.mean(dtype=np.float64) == pytest.approx(
-        raw.radiance_rgb.mean(dtype=np.float64), rel=tolerance
-    )
+    assert shown == pytest.approx(sampled, rel=5e-4 if per_light else 1e-6)
 
 
 WEIGHTS = dict.fromkeys((*MEASURES, "hits", "samples", "width"), 0.2)
@@ -300,14 +302,7 @@ STATEMENT = CalibratedStatement(
     widths=(32, 256),
     metrics=dict.fromkeys(METRICS, METRIC),
 )
-SETTINGS = RenderSettings(
-    resolution=32,
-    noise_floor_db=99.0,
-    min_spp=32,
-    max_spp=256,
-    min_mean_radiance=0.0,
-    stated_error="calibrated",
-)
+SETTINGS = view_settings(32, max_spp=256, min_mean_radiance=0.0, stated_error="calibrated")
 
 
 @pytest.fixture
@@ -405,17 +400,17 @@ def test_far_from_its_targets_a_view_goes_on_by_its_halves(
 
 
 def test_other_versions_and_damage(tmp_path: Path) -> None:
-    record = json.loads(json.dumps(dataclasses.asdict(STATEMENT)))
-    path = tmp_path / "same.json"
-    path.write_text(json.dumps(record))
-    assert load_statement(path) == STATEMENT
-    other = tmp_path / "other.json"
-    other.write_text(json.dumps({**record, "versions": {**record["versions"], "denoiser": "0"}}))
-    assert load_statement(other) is None
-    damaged = tmp_path / "damaged.json"
-    damaged.write_text(json.dumps({**record, "layouts": "many"}))
+    record = dataclasses.asdict(STATEMENT)
+
+    def stored(name: str, **changes: object) -> Path:
+        path = tmp_path / name
+        path.write_text(json.dumps(record | changes))
+        return path
+
+    assert load_statement(stored("same")) == STATEMENT
+    assert load_statement(stored("other", versions={**record["versions"], "denoiser": "0"})) is None
     with pytest.raises(TrilightError, match="layouts"):
-        load_statement(damaged)
+        load_statement(stored("damaged", layouts="many"))
 
 
 def test_the_included_statement_is_of_these_pictures() -> None:
@@ -443,11 +438,9 @@ def test_the_unbiased_measures_are_the_true_errors() -> None:
         Half(raw_rgb=raw.astype(np.float32), denoised_rgb=denoise(raw).astype(np.float32))
         for raw in raws
     )
-    picture = denoise((raws[0] + raws[1]) / 2).astype(np.float32)
+    picture = denoise((raws[0] + raws[1]) / 2).astype(np.float32).astype(np.float64)
     everywhere = np.ones((px, px), bool)
-    totals, surprises = error_measures(
-        halves_of(a, b), picture.astype(np.float64), everywhere, NUMPY
-    )
+    totals, surprises = error_measures(halves_of(a, b), picture, everywhere, NUMPY)
     found = measures_of_totals(totals.reshape(3, 6)[1], surprises[1].max(), px * px, 1.0)
     noise = 0.25 * 0.05**2 / 2
     assert found.agreement == pytest.approx(noise, rel=0.02)

@@ -30,16 +30,16 @@ from storage.optics.bsdf import bsdf_lobes
 from storage.optics.multiscatter import directional_albedo, scattered_again
 from storage.records.scene import Scene
 from tests.for_each import for_each
-from tests.pipeline.renders.sampling import camera_of, render_view
+from tests.pipeline.renders.sampling import camera_of, render_view, view_settings
 from tests.pipeline.renders.scene_kit import (
     join,
     light,
     lit_by_a_mirror,
     material,
     mirrors,
-    quad,
     sampled_like_scene,
     sphere,
+    textured_floor,
 )
 from tests.pipeline.renders.test_renderer import lit_scene
 from tests.storage.optics.test_multiscatter import stretched
@@ -48,9 +48,7 @@ pytestmark = pytest.mark.usefixtures("llvm")
 
 PX = 32
 
-SETTINGS = RenderSettings(
-    resolution=32, noise_floor_db=99.0, min_spp=8, max_spp=8, aux_spp=4, min_mean_radiance=0.0
-)
+SETTINGS = view_settings(8, aux_spp=4, min_mean_radiance=0.0)
 
 
 @pytest.fixture
@@ -97,7 +95,7 @@ def _render(scene: Scene, settings: RenderSettings = SETTINGS) -> None:
 
 
 def _smallest() -> Scene:
-    floor = quad([[-1, -1, 0], [1, -1, 0], [1, 1, 0], [-1, 1, 0]], material(diffuse=0.5))
+    floor = textured_floor(material(diffuse=0.5))
     return join([floor, light([[-0.1, -0.1, 2], [0, 0.1, 2], [0.1, -0.1, 2]], 100.0)])
 
 
@@ -123,9 +121,8 @@ def test_one_set_of_kernels_serves_every_scene_and_view() -> None:
         _render(scene)
     _render(_large(), dataclasses.replace(SETTINGS, per_light=True))
     assert _launched() <= first
-    _render(
-        _large(), dataclasses.replace(SETTINGS, resolution=40, max_spp=16, max_depth=5, rr_depth=4)
-    )
+    other = dataclasses.replace(SETTINGS, resolution=40, max_spp=16, max_depth=5, rr_depth=4)
+    _render(_large(), other)
     assert _launched() <= first
 
 
@@ -149,9 +146,8 @@ def test_all_views_and_lights_share_one_load(monkeypatch: pytest.MonkeyPatch) ->
     changes = {"renders.min_spp": 8, "renders.max_spp": 8, "renders.per_light": True}
     changes["scenes.num_views"] = 2
     settings = preset_settings("smoke", resolution=16, changes=changes)
-    sample = render_sample(
-        "000000000", RenderInput(scene=scene), settings, [], ViewProgress(None, 0)
-    )
+    scene_input = RenderInput(scene=scene)
+    sample = render_sample("000000000", scene_input, settings, [], ViewProgress(None, 0))
     assert len(sample.views) == 2
     assert load.call_count == 2  # what camera rays meet, and what all other rays meet
 
@@ -319,10 +315,8 @@ def test_nothing_is_negative_and_nothing_is_nan() -> None:
         wo[:, 5000:20_000] = wi[:, 5000:20_000] * np.array([[-1], [-1], [1]])
         for diffuse, specular in ((0.0, 1.0), (0.0, 0.0), (1.0, 0.0), (0.3, [0.7, 0.1, 0.0])):
             lobes = kernel_lobes(diffuse=diffuse, specular=specular, roughness=roughness)
-            directions = [
-                mi.Vector3f(mi.TensorXf(d.astype(np.float32))) for d in (wi, wo, geometric)
-            ]
-            result = ggx.evaluate_bsdf(seen_at(lobes, directions[0]), *directions)
+            each = [mi.Vector3f(mi.TensorXf(d.astype(np.float32))) for d in (wi, wo, geometric)]
+            result = ggx.evaluate_bsdf(seen_at(lobes, each[0]), *each)
             for values in result:
                 dr.eval(values)
                 assert np.isfinite(np.array(values)).all()

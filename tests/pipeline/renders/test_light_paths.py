@@ -1,6 +1,7 @@
 """Light tracing and path guiding, beside the path tracer: the same light with and without."""
 
 import dataclasses
+import functools
 from typing import Any
 from unittest.mock import Mock
 
@@ -25,8 +26,7 @@ from pipeline.renders.guide_table import (
     learn,
 )
 from pipeline.renders.renderer import RenderedView, SceneRenderer
-from pipeline.renders.settings import RenderSettings
-from pipeline.renders.tracer import PixelCamera, load_tracer
+from pipeline.renders.tracer import PixelCamera
 from pipeline.renders.vector_tracer import (
     VectorTracer,
     even_numbers,
@@ -37,13 +37,13 @@ from storage.metrics import psnr_log_db
 from storage.records.lights import sum_of_lights
 from storage.records.scene import Scene
 from tests.pipeline.renders.sampling import (
-    Estimate,
     assert_agree,
     assert_honest,
     assert_same_light,
     camera_of,
     render_blocks,
     render_passes,
+    view_settings,
 )
 from tests.pipeline.renders.scene_kit import (
     GUIDED_FLOOR,
@@ -58,6 +58,7 @@ from tests.pipeline.renders.scene_kit import (
     mirrors,
     quad,
     sphere,
+    textured_floor,
 )
 from tests.pipeline.renders.test_renderer import lit_scene
 from tests.sky_maps import smooth
@@ -81,6 +82,15 @@ class CameraPathsLeft(CameraPathsOnly):
 
     _light_paths = _ALMOST_ALL
 
+
+def _tracer(
+    scene: Scene, kind: type[VectorTracer] = VectorTracer, max_depth: int = 10
+) -> VectorTracer:
+    return kind(scene, max_depth=max_depth, rr_depth=2)
+
+
+mean_picture = functools.partial(render_blocks, block=32, passes=12)
+"""The mean of a picture."""
 
 LAMP = [[0.8, 0.3, 1.6], [1.1, 0.3, 1.6], [0.9, 0.6, 1.7]]
 WIDE = [[-2, -2, 0], [2, -2, 0], [2, 2, 0], [-2, 2, 0]]
@@ -123,9 +133,8 @@ def _ball(roughness: float, *, lamp_diffuse: float = 0.0, closed: bool = False) 
 )
 def test_together_they_show_what_the_path_tracer_shows(scene: Scene, max_depth: int) -> None:
     """Weights sum to 1 for every path, whatever it is made of."""
-    alone = render_blocks(scene, tracer=CameraPathsOnly(scene, max_depth=max_depth, rr_depth=2))
-    tracer = load_tracer(scene, max_depth=max_depth, rr_depth=2)
-    together = render_blocks(scene, first_seed=500, tracer=tracer)
+    alone = render_blocks(scene, tracer=_tracer(scene, CameraPathsOnly, max_depth))
+    together = render_blocks(scene, first_seed=500, max_depth=max_depth, rr_depth=2)
     assert_agree(together, alone)
     assert_honest(alone, together, bias=0.5)  # caustics have a tail
 
@@ -133,20 +142,21 @@ def test_together_they_show_what_the_path_tracer_shows(scene: Scene, max_depth: 
 def test_any_number_of_light_paths_gives_the_same_light(monkeypatch: pytest.MonkeyPatch) -> None:
     """However the weights are shared out."""
     scene = _leaning()
-    alone = _means(CameraPathsOnly, scene, passes=12)
+    alone = mean_picture(scene, tracer=_tracer(scene, CameraPathsOnly))
     for light_paths in (1e-3, 4.0):
         monkeypatch.setattr(vector_tracer, "LIGHT_PATHS", light_paths)
         monkeypatch.setattr(VectorTracer, "_light_paths", light_paths)
-        assert_agree(_means(VectorTracer, scene, first_seed=300, passes=12), alone)
+        assert_agree(mean_picture(scene, first_seed=300, tracer=_tracer(scene)), alone)
 
 
 def test_beside_light_paths_without_number_only_direct_light_is_left() -> None:
     """Of a large light, so that as much would be hit as picked."""
     row = material(diffuse=0.3, specular=0.5, roughness=0.4)
     scene = _by_a_large_light([quad(WIDE, row), quad(WALL, row)])
-    left = _means(CameraPathsLeft, scene, first_seed=100, passes=12)
+    left = mean_picture(scene, first_seed=100, tracer=_tracer(scene, CameraPathsLeft))
+    direct = mean_picture(scene, tracer=_tracer(scene, CameraPathsOnly, max_depth=2))
     # Weights leave a millionth, but more where a vertex is close to the next one, in the corner.
-    assert_agree(left, _means(CameraPathsOnly, scene, max_depth=2, passes=12), slack=1e-3)
+    assert_agree(left, direct, slack=1e-3)
 
 
 def test_a_caustic_has_a_fraction_of_the_noise() -> None:
@@ -156,8 +166,7 @@ def test_a_caustic_has_a_fraction_of_the_noise() -> None:
     wall = quad([[-1.5, -1, 0], [-1.5, 1, 0], [-1.5, 1, 1], [-1.5, -1, 1]], mirror)
     lamp = light([[1.2, -0.1, 1.4], [1.2, 0.1, 1.4], [1.2, 0, 1.6]], 40.0)
     scene = join([floor, wall, lamp], eye=(0, -0.2, 2), target=(-0.2, 0, 0), fov_deg=40)
-    camera_paths = CameraPathsOnly(scene, max_depth=3, rr_depth=2)
-    alone = render_blocks(scene, tracer=camera_paths, passes=10)
+    alone = render_blocks(scene, tracer=_tracer(scene, CameraPathsOnly, 3), passes=10)
     together = render_blocks(scene, max_depth=3, rr_depth=2, passes=10)
     assert np.square(together.error).mean() < 0.25 * np.square(alone.error).mean()
     assert_agree(together, alone)
@@ -168,9 +177,7 @@ def test_a_caustic_has_a_fraction_of_the_noise() -> None:
 _SEEDS = ((11, 5), (12, 6), (13, 7))
 """Of the camera paths and of the light paths of three passes."""
 
-SHARED = RenderSettings(
-    resolution=32, noise_floor_db=99.0, min_spp=64, max_spp=64, light_paths="scene"
-)
+SHARED = view_settings(64, light_paths="scene")
 
 
 def _orbit() -> tuple[Scene, list[PixelCamera]]:
@@ -190,8 +197,8 @@ def test_joined_to_all_cameras_at_once_light_paths_show_what_they_show_alone(lob
     scene, cameras = _orbit()
 
     def seen(views: list[int], known: int) -> dict[int, NDArray]:
-        tracer = VectorTracer(scene, max_depth=10, rr_depth=2)
-        tracer = tracer.split_lights(bounces=lobes, lobes=lobes).for_views(cameras[:known])
+        tracer = _tracer(scene).split_lights(bounces=lobes, lobes=lobes)
+        tracer = tracer.for_views(cameras[:known])
         pictures = {}
         for view in views:
             total = tracer.pass_sum(cameras[view])
@@ -208,7 +215,7 @@ def test_joined_to_all_cameras_at_once_light_paths_show_what_they_show_alone(lob
 
 def test_light_paths_of_another_seed_are_those_of_a_pass_of_that_seed() -> None:
     scene, (camera, *_) = _orbit()
-    tracer = VectorTracer(scene, max_depth=10, rr_depth=2)
+    tracer = _tracer(scene)
     same, other, usual = (tracer.pass_sum(camera) for _ in range(3))
     same.add(seed=3, spp=16, light_seed=3)
     other.add(seed=3, spp=16, light_seed=4)
@@ -258,25 +265,12 @@ def test_lamps_apart_share_the_light_paths_of_a_scene() -> None:
     assert psnr_log_db(lamps.radiance_rgb, whole.radiance_rgb) > whole.noise_floor_db
 
 
-def _means(
-    kind: type[VectorTracer],
-    scene: Scene,
-    *,
-    max_depth: int = 10,
-    first_seed: int = 0,
-    passes: int = 32,
-) -> Estimate:
-    """Return the mean of the picture from some passes."""
-    tracer = kind(scene, max_depth=max_depth, rr_depth=2)
-    return render_blocks(scene, block=32, passes=passes, first_seed=first_seed, tracer=tracer)
-
-
 _LAMP = [[-0.1, -0.1, 3], [0, 0.1, 3], [0.1, -0.1, 3]]
-_FLOOR = [[-1, -1, 0], [1, -1, 0], [1, 1, 0], [-1, 1, 0]]
 
 
 def _scene(radiance: float = 5.0) -> Scene:
-    return join([quad(_FLOOR, material(diffuse=0.5)), light(_LAMP, radiance)], eye=(0, -2, 1))
+    floor = textured_floor(material(diffuse=0.5))
+    return join([floor, light(_LAMP, radiance)], eye=(0, -2, 1))
 
 
 def _splatted(resolution: int, values: Any, pixels: Any, active: bool = True) -> NDArray:
@@ -354,10 +348,6 @@ def test_a_point_shows_in_the_pixel_whose_ray_meets_it() -> None:
     assert not np.array(inside).any()
 
 
-def _tracer(scene: Scene) -> VectorTracer:
-    return VectorTracer(scene, max_depth=10, rr_depth=2)
-
-
 def _guided(tracer: VectorTracer) -> VectorTracer:
     guided = tracer.with_guide()
     assert guided._scene.guide is not None, "there is something to learn"
@@ -366,12 +356,10 @@ def _guided(tracer: VectorTracer) -> VectorTracer:
 
 def _below_a_sky() -> Scene:
     """A mirror that throws a lamp's light and the sky's on a rough floor."""
-    floor = quad([[-1, -1, 0], [1, -1, 0], [1, 1, 0], [-1, 1, 0]], material(diffuse=0.8))
-    mirror = quad(
-        [[-1, 1, 0], [1, 1, 0], [1, 1, 1], [-1, 1, 1]], material(specular=1.0, roughness=0.05)
-    )
+    floor, smooth_metal = material(diffuse=0.8), material(specular=1.0, roughness=0.05)
+    mirror = quad([[-1, 1, 0], [1, 1, 0], [1, 1, 1], [-1, 1, 1]], smooth_metal)
     lamp = light([[0, -0.5, 1], [0.2, -0.5, 1], [0, -0.3, 1]], 10.0)
-    return join([floor, mirror, lamp], eye=(0, -2, 1.5), sky=smooth())
+    return join([textured_floor(floor), mirror, lamp], eye=(0, -2, 1.5), sky=smooth())
 
 
 @pytest.mark.usefixtures("unrecorded")
@@ -410,9 +398,8 @@ def test_guided_camera_paths_have_less_noise_where_a_mirror_is_the_lamp() -> Non
 
 
 def test_a_matt_scene_has_nothing_to_learn() -> None:
-    scene = join(
-        [quad(GUIDED_FLOOR, material(diffuse=0.6)), light(GUIDED_LAMP, 30.0)], eye=(0, -2, 1)
-    )
+    floor = quad(GUIDED_FLOOR, material(diffuse=0.6))
+    scene = join([floor, light(GUIDED_LAMP, 30.0)], eye=(0, -2, 1))
     assert _tracer(scene).with_guide()._scene.guide is None
     nothing = np.zeros(0, np.int64)
     cells = GuideCells(np.random.default_rng(5).normal(size=(9, 3, 3)))
@@ -426,11 +413,8 @@ def test_only_views_that_miss_their_floor_are_guided(monkeypatch: pytest.MonkeyP
     scene = mirrors()
     camera = camera_of(scene, 16)
     for floor_db, max_spp, times in ((1.0, 512, 0), (90.0, 256, 0), (90.0, 512, 1)):
-        settings = RenderSettings(
-            resolution=16, noise_floor_db=floor_db, min_spp=8, max_spp=max_spp,
-            min_mean_radiance=0.0,
-            per_light=True,
-        )  # fmt: skip
+        settings = view_settings(8, resolution=16, min_mean_radiance=0.0, per_light=True)
+        settings = dataclasses.replace(settings, noise_floor_db=floor_db, max_spp=max_spp)
         renderer = SceneRenderer(scene, settings)
         for seed in range(2):
             renderer.render_view(camera.c2w, camera.fov_deg, seed)
@@ -478,26 +462,22 @@ def _twin(directions: NDArray[np.float64], peaks: NDArray[np.int64]) -> NDArray[
     return np.asarray(shares[line * SIDE + column] * BINS / 4 / length**3)
 
 
-def test_the_density_is_that_of_a_slow_twin_and_integrates_to_one() -> None:
-    rng = np.random.default_rng(1)
-    peaks = rng.integers(0, 1024, 256)
-    directions = rng.normal(size=(1 << 18, 3))
-    directions /= np.linalg.norm(directions, axis=1, keepdims=True)
-    directions = directions.astype(np.float32)
-    pdf = np.array(_guidance(peaks).pdf(mi.Vector3f(*directions.T.copy()), mi.Bool(True)))
-    expected = _twin(directions.astype(np.float64), peaks)
-    # Directions within roundings of a bin's rim may fall on either side: one in ten thousand.
-    assert np.isclose(pdf, expected, rtol=1e-4).mean() > 0.9999
-    integral = 4 * np.pi * pdf.astype(np.float64)
-    assert abs(integral.mean() - 1) < 5 * integral.std() / np.sqrt(len(integral))
-
-
-def test_directions_are_drawn_by_the_density() -> None:
-    """As many in each bin as the table says, and spread in it: by moments of what is drawn."""
+def test_directions_are_drawn_by_the_density_which_is_that_of_a_slow_twin() -> None:
+    """It integrates to one. As many directions are in each bin as the table says, and spread in it:
+    by moments of what is drawn."""
     rng = np.random.default_rng(2)
     peaks, count = rng.integers(0, 1024, 256), 1 << 18
     u = mi.Point2f(*(rng.random((2, count)).astype(np.float32)))
     guidance = _guidance(peaks)
+    uniform = rng.normal(size=(count, 3))
+    uniform /= np.linalg.norm(uniform, axis=1, keepdims=True)
+    rounded = uniform.astype(np.float32)
+    pdf = np.array(guidance.pdf(mi.Vector3f(*rounded.T.copy()), mi.Bool(True)))
+    twin = _twin(rounded.astype(np.float64), peaks)
+    # Directions within roundings of a bin's rim may fall on either side: one in ten thousand.
+    assert np.isclose(pdf, twin, rtol=1e-4).mean() > 0.9999
+    integral = 4 * np.pi * pdf.astype(np.float64)
+    assert abs(integral.mean() - 1) < 5 * integral.std() / np.sqrt(len(integral))
     drawn = guidance.sample(u, mi.Bool(True))
     found = np.bincount(np.array(bin_of(drawn)[0]), minlength=1024)
     expected = np.bincount(peaks, minlength=1024) / 256 * count
@@ -509,8 +489,6 @@ def test_directions_are_drawn_by_the_density() -> None:
     directions = np.array(drawn).T.astype(np.float64)
     # The mean of g / density is the integral of g over the bins that are there.
     pdf = np.array(guidance.pdf(drawn, mi.Bool(True)), np.float64)
-    uniform = rng.normal(size=(count, 3))
-    uniform /= np.linalg.norm(uniform, axis=1, keepdims=True)
     inside = _twin(uniform, peaks) > 0
     for moment in (np.ones_like, np.square):
         by_drawn = (moment(directions[:, 0]) / pdf)[pdf > 0]

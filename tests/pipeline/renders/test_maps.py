@@ -21,6 +21,7 @@ from pipeline.renders.surface_table import KernelTextures
 from pipeline.renders.tracer import load_tracer
 from pipeline.renders.vector_tracer import VectorTracer
 from scene_templates.rotations import uniform_rotation
+from storage.denoiser import Features
 from storage.errors import TrilightError
 from storage.raycast import first_hits
 from storage.records.environment import Environment, row_solid_angles
@@ -70,9 +71,7 @@ def test_guides_are_the_lookup_of_the_records() -> None:
     maps = noise_map(1, 3, 0, 0.6), Texture(texels=(0.3 * corners).astype(np.float32))
     scene = textured([textured_floor(material(roughness=0.4)), SKY_LAMP], maps, [0, 1, -1])
     scene = _moved(scene, 3.0, np.array([-1.75, -1.75]))
-    albedo = (
-        load_tracer(scene, max_depth=2, rr_depth=5).features(camera_of(scene, 32), spp=1).albedo
-    )
+    albedo = _guides(scene).albedo
     rows = np.nan_to_num(first_hits(scene, resolution=32).material)
     wanted = rows[..., 0:3] + rows[..., 3:6]
     # Float32 places of hits: 1e-6 of a coordinate is 7e-6 texels, whose values differ by up to .6.
@@ -80,9 +79,12 @@ def test_guides_are_the_lookup_of_the_records() -> None:
     assert np.mean(np.abs(albedo - wanted).max(axis=-1) > 2e-5) < 0.01
     assert np.ptp(wanted, axis=(0, 1)).min() > 0.5
     far = _moved(scene, 1.0, np.array([1000.0, -512.0]))
-    moved = load_tracer(far, max_depth=2, rr_depth=5).features(camera_of(far, 32), spp=1).albedo
     # The stored coordinates know 1000 to 3e-5: two ten-thousandths of a texel.
-    assert np.abs(albedo - moved).max() < 5e-4
+    assert np.abs(albedo - _guides(far).albedo).max() < 5e-4
+
+
+def _guides(scene: Scene) -> Features:
+    return load_tracer(scene, max_depth=2, rr_depth=5).features(camera_of(scene, 32), spp=1)
 
 
 def _moved(scene: Scene, scale: float, shift: NDArray[np.float64]) -> Scene:
@@ -347,9 +349,8 @@ def test_a_slope_reflects_what_a_tilted_plane_does(turned: bool) -> None:
     normal = np.array([-slope[1], slope[0], slope[2]]) if turned else slope
     hits = first_hits(scene, resolution=16)
     assert np.allclose(hits.shading_normal[hits.met], normal, atol=1e-6)
-    shown = load_tracer(scene, max_depth=2, rr_depth=5).radiance(
-        camera_of(scene, 16), seed=1, spp=256
-    )
+    tracer = load_tracer(scene, max_depth=2, rr_depth=5)
+    shown = tracer.radiance(camera_of(scene, 16), seed=1, spp=256)
     points = hits.position[hits.met]
     wanted = lambert_irradiance(points, normal, lamp, 30.0)[:, None] * [0.6, 0.5, 0.4] / np.pi
     error = (shown[hits.met] / wanted - 1).mean(axis=0)
@@ -380,8 +381,7 @@ def test_guides_and_passes_are_the_definition_and_turn_with_the_scene() -> None:
     row = material(diffuse=0.5, roughness=0.5)
     for turn in (None, np.diag([-1.0, 1.0]), np.zeros((2, 2))):
         scene = mapped([sphere([0, 0, 0], 0.8, row, 9), SKY_LAMP], bumps(5, 1.0), turn)
-        tracer = load_tracer(scene, max_depth=2, rr_depth=5)
-        guide = tracer.features(camera_of(scene, 32), spp=1).normal
+        guide = _guides(scene).normal
         hits = first_hits(scene, resolution=32)
         off = np.linalg.norm(np.nan_to_num(hits.shading_normal) - guide, axis=-1)
         assert np.mean(off > 1e-3) < 0.02  # texels' borders, and the ball's

@@ -5,7 +5,6 @@ import dataclasses
 import json
 import re
 import subprocess
-from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 from unittest.mock import Mock
@@ -278,15 +277,6 @@ class _Blind:
         return mi.Bool(False)
 
 
-def _with_blind(kernel: Callable[..., Any], name: str) -> Callable[..., Any]:
-    def run(scene: Any, *arguments: Any) -> Any:
-        blinded = copy.copy(scene)
-        setattr(blinded, name, _Blind())
-        return kernel(blinded, *arguments)
-
-    return run
-
-
 def test_the_right_picture_passes() -> None:
     assert wrong_picture() == ""
 
@@ -299,7 +289,13 @@ def test_a_kernel_that_misses_one_scene_is_found(
 ) -> None:
     """Both kernels trace rays against both scenes, and Dr.Jit disables the second one it meets."""
     sighted = getattr(vector_tracer, kernel)
-    monkeypatch.setattr(vector_tracer, kernel, _with_blind(sighted, blind))
+
+    def blinded(scene: Any, *arguments: Any) -> Any:
+        seen = copy.copy(scene)
+        setattr(seen, blind, _Blind())
+        return sighted(seen, *arguments)
+
+    monkeypatch.setattr(vector_tracer, kernel, blinded)
     assert wrong_picture().startswith("a wrong picture: block ")
 
 
@@ -330,19 +326,17 @@ def test_another_integrator_agrees_with_the_stored_picture(monkeypatch: pytest.M
 
 def test_what_rays_of_one_kernel_meet_shares_one_table(monkeypatch: pytest.MonkeyPatch) -> None:
     """A mi.Scene with another one as a child shares its OptiX table; two without have two."""
-    given = list[dict[str, Any]]()
-    made = list[Any]()
+    scenes = list[tuple[dict[str, Any], Any]]()
     load = mi.load_dict
 
     def recorded(described: dict[str, Any]) -> Any:
         found = load(described)
         if described["type"] == "scene":
-            given.append(described)
-            made.append(found)
+            scenes.append((described, found))
         return found
 
     monkeypatch.setattr(mi, "load_dict", recorded)
     vector_tracer.VectorTracer(probe_scene(), max_depth=10, rr_depth=2)
-    assert len(made) == 2
-    assert any(child is made[0] for child in given[1].values())
-    assert [len(scene.shapes()) for scene in made] == [1, 1]  # and has no shape of it
+    (_, first), (given, _) = scenes
+    assert any(child is first for child in given.values())
+    assert [len(scene.shapes()) for _, scene in scenes] == [1, 1]  # and has no shape of it

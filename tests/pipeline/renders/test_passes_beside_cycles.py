@@ -18,13 +18,12 @@ from numpy.typing import NDArray
 
 from infra.bench.workloads.cycles import installed_python, render_with_cycles, run_blender
 from pipeline.exchange.usd.write_usd import write_usd
-from pipeline.renders.settings import RenderSettings
 from pipeline.renders.tracer import load_tracer
 from storage.metrics import psnr_linear_db, psnr_log_db
 from storage.records.exr import decode_exr
 from storage.records.passes.pictures import passes_exr, view_passes
 from storage.records.scene import Scene
-from tests.pipeline.renders.sampling import block_means, camera_of, render_view
+from tests.pipeline.renders.sampling import block_means, camera_of, render_view, view_settings
 from tests.pipeline.renders.scene_kit import (
     SKY_LAMP,
     box,
@@ -169,9 +168,7 @@ def test_both_put_the_same_light_in_the_same_place() -> None:
     assert difference.max() < 0.03
 
 
-DIRECT = RenderSettings(
-    resolution=256, noise_floor_db=99, min_spp=512, max_spp=512, max_depth=2, denoiser="off"
-)
+DIRECT = view_settings(512, resolution=256, max_depth=2, denoiser="off")
 """Direct light alone, without a denoiser."""
 
 
@@ -218,7 +215,7 @@ def test_all_light_agrees_with_cycles(
     Measured: 47.0 and 28.1 by pixels; 57.5 and 33.2 by blocks. The bounds leave 0.5 to 2.5 dB to
     the samples of another processor. With single scattering tree has 17.5.
     """
-    settings = RenderSettings(resolution=256, noise_floor_db=99, min_spp=spp, max_spp=spp)
+    settings = view_settings(spp, resolution=256)
     ours = render_view(example_scene(shared, name), settings, 1).radiance_rgb
     theirs = _reference(shared, f"{name}.exr")
     assert psnr_linear_db(ours, theirs) > least_db

@@ -19,14 +19,14 @@ from pipeline.renders.preview import (
     usual_filter,
 )
 from pipeline.renders.renderer import GrowingPicture, RenderedView, SceneRenderer, run_to_end
-from pipeline.renders.settings import Filtered, RenderSettings
+from pipeline.renders.settings import Filtered
 from pipeline.renders.tracer import PixelCamera
 from storage.denoiser import Features
 from storage.errors import Rejected, TrilightError
 from storage.metrics import psnr_log_db
 from storage.records.scene import Scene
 from storage.renderer import Sampling
-from tests.pipeline.renders.sampling import Estimate, assert_agree, blocks_of
+from tests.pipeline.renders.sampling import Estimate, assert_agree, blocks_of, view_settings
 from tests.pipeline.renders.scene_kit import sampled_like_scene
 from tests.scenes_by_hand import tiny_scene
 
@@ -132,9 +132,7 @@ def test_each_part_is_timed_in_its_order() -> None:
     assert sum(count * found[name] for name, count in parts.items()) == 4
 
 
-GROWING = RenderSettings(
-    resolution=32, noise_floor_db=95.0, min_spp=16, max_spp=256, min_mean_radiance=0.0
-)
+GROWING = view_settings(16, max_spp=256, min_mean_radiance=0.0)
 
 
 def test_the_first_looks_are_previews_and_the_last_picture_is_the_measured_one() -> None:
@@ -146,8 +144,8 @@ def test_the_first_looks_are_previews_and_the_last_picture_is_the_measured_one()
     seen = [step for step in steps if isinstance(step, GrowingPicture)]
     few = len(FIRST_LOOKS_SPP)
     for look, spp in zip(seen[:few], FIRST_LOOKS_SPP, strict=True):
-        settings = PreviewSettings(resolution=32, spp=spp, denoiser=usual_filter(spp))
-        alone = run_to_end(PreviewRenderer(scene, settings).view_steps(scene.c2w[0], 45.0, 7))
+        renderer = loaded(scene, spp, denoiser=usual_filter(spp))
+        alone = run_to_end(renderer.view_steps(scene.c2w[0], 45.0, 7))
         np.testing.assert_array_equal(look.radiance_rgb, alone.radiance_rgb)
         assert (look.spp, look.floor) == (spp, None) and look.core_s > 0
     measured = seen[few:]

@@ -59,13 +59,15 @@ GROWING = dataclasses.replace(CHEAP, min_spp=16, max_spp=256)
 """Its first look is at 64 samples: the picture is narrow."""
 
 
+WIDE = [[-2, -2, 0], [2, -2, 0], [2, 2, 0], [-2, 2, 0]]
+FLOOR = quad(WIDE, material(diffuse=[0.7, 0.5, 0.3]))
+BALL = sphere([0, 0, 0.5], 0.5, material(diffuse=0.4, specular=0.4, roughness=0.5), rings=8)
+LAMPS = np.array([[-0.5, -1.5, 2], [0.5, -1.5, 2], [0, -1, 2.4]])
+VIEW: dict[str, Any] = {"eye": (0, -3, 2), "target": (0, 0, 0.4), "fov_deg": 45}
+
+
 def simple_scene() -> Scene:
-    parts = [
-        quad([[-2, -2, 0], [2, -2, 0], [2, 2, 0], [-2, 2, 0]], material(diffuse=[0.7, 0.5, 0.3])),
-        sphere([0, 0, 0.5], 0.5, material(diffuse=0.4, specular=0.4, roughness=0.5), rings=8),
-        light([[-0.5, -1.5, 2], [0.5, -1.5, 2], [0, -1, 2.4]], 20.0),
-    ]
-    return join(parts, eye=(0, -3, 2), target=(0, 0, 0.4), fov_deg=45)
+    return join([FLOOR, BALL, light(LAMPS, 20.0)], **VIEW)
 
 
 def digest(view: RenderedView) -> str:
@@ -201,7 +203,6 @@ def test_a_camera_that_looks_away_and_a_lamp_of_no_triangles_are_rejected() -> N
 
 SETTINGS = dataclasses.replace(CHEAP, per_light=True)
 RAW = dataclasses.replace(SETTINGS, denoiser="off")
-LAMPS = np.array([[-0.5, -1.5, 2], [0.5, -1.5, 2], [0, -1, 2.4]])
 COLOURS = ([20.0, 2.0, 2.0], [1.0, 10.0, 1.0], [0.5, 0.5, 5.0])
 
 
@@ -211,14 +212,7 @@ def lit_scene(factors: tuple[float, float, float] = (1.0, 1.0, 1.0)) -> Scene:
         light(np.add(LAMPS, [x, 0, 0]), np.multiply(colour, factor))
         for x, colour, factor in zip((-1.2, 0, 1.2), COLOURS, factors, strict=True)
     ]
-    parts = [
-        lamps[0],
-        quad([[-2, -2, 0], [2, -2, 0], [2, 2, 0], [-2, 2, 0]], material(diffuse=[0.7, 0.5, 0.3])),
-        lamps[1],
-        sphere([0, 0, 0.5], 0.5, material(diffuse=0.4, specular=0.4, roughness=0.5), rings=8),
-        lamps[2],
-    ]
-    return join(parts, eye=(0, -3, 2), target=(0, 0, 0.4), fov_deg=45)
+    return join([lamps[0], FLOOR, lamps[1], BALL, lamps[2]], **VIEW)
 
 
 def _lights(view: RenderedView) -> NDArray[np.float32]:
@@ -263,10 +257,9 @@ def test_lights_apart_add_up_to_one_denoised_picture() -> None:
     (pictures,) = means(read_sums(samples), NUMPY, of_both=True)
     raw = np.sum(pictures, axis=0)
     expected = with_mean_of(denoise(raw, features, "high"), raw)
+    shown = render_view(scene, SETTINGS).radiance_rgb
     # rounded to half floats four times, each light and their sum: 2^-11 of each
-    np.testing.assert_allclose(
-        render_view(scene, SETTINGS).radiance_rgb, expected, rtol=2 * 2**-11, atol=1e-6
-    )
+    np.testing.assert_allclose(shown, expected, rtol=2 * 2**-11, atol=1e-6)
 
 
 def test_a_light_that_is_off_still_casts_a_shadow_and_is_still_hidden() -> None:
@@ -282,11 +275,7 @@ def test_a_light_that_is_off_still_casts_a_shadow_and_is_still_hidden() -> None:
 
 def test_one_light_alone_is_the_picture_but_for_its_rounding() -> None:
     """With one emitter, both ways draw the same samples."""
-    parts = [
-        quad([[-2, -2, 0], [2, -2, 0], [2, 2, 0], [-2, 2, 0]], material(diffuse=0.5)),
-        light(LAMPS, 20.0),
-    ]
-    scene = join(parts, eye=(0, -3, 2))
+    scene = join([quad(WIDE, material(diffuse=0.5)), light(LAMPS, 20.0)], eye=(0, -3, 2))
     together = render_view(scene, dataclasses.replace(SETTINGS, per_light=False))
     assert together.lights_rgb is None and together.light_floors is None
     separate = render_view(scene, SETTINGS)
@@ -370,9 +359,8 @@ def test_plain_mitsuba_comes_to_the_same_picture(sampler: str) -> None:
     scene = tiny_scene()
     ours = render_shot(scene, fixed_samples(32, 2048)).radiance_rgb
     levels = render_levels(scene, 32, (16, 64, 1024), 5, sampler)
-    assert [(raw.samples, denoised.samples) for raw, denoised in levels] == [
-        (spp, spp) for spp in (16, 64, 1024)
-    ]
+    samples = [(raw.samples, denoised.samples) for raw, denoised in levels]
+    assert samples == [(spp, spp) for spp in (16, 64, 1024)]
     assert 0 < (levels[0][0].cpu_seconds or 0) < (levels[0][1].cpu_seconds or 0)
     errors = [psnr_log_db(denoised.radiance_rgb, ours) for _, denoised in levels]
     # With three seeds 57 to 59, 60 to 62, and 68 to 69 dB; light off by half a percent is at 60.

@@ -35,7 +35,7 @@ from storage.errors import TrilightError
 from storage.metrics import MAX_DB, psnr_linear_db, psnr_log_db
 from storage.records.scene import Scene
 from tests.oracle.plugin_tracer import HostSum
-from tests.pipeline.renders.sampling import Half, camera_of, floor_of, halves_of
+from tests.pipeline.renders.sampling import Half, camera_of, floor_of, halves_of, view_settings
 from tests.pipeline.renders.scene_kit import lit_by_a_mirror, sampled_like_scene
 
 CAMERA = PixelCamera(c2w=np.eye(4), fov_deg=40.0, resolution=32)
@@ -44,14 +44,18 @@ PASS = 64
 EVERYWHERE = np.ones((PX, PX), bool)
 
 
-class Recorder:
-    """A tracer that writes down what it is asked, and whose light is the number of samples."""
-
-    def __init__(self) -> None:
-        self.asked: list[tuple[int, int]] = []
+class HostTracer:
+    """A stand-in for a tracer, whose passes are in numpy's memory."""
 
     def pass_sum(self, camera: PixelCamera) -> HostSum:
         return HostSum(self, camera)
+
+
+class Recorder(HostTracer):
+    """Writes down what it is asked, and its light is the number of samples."""
+
+    def __init__(self) -> None:
+        self.asked: list[tuple[int, int]] = []
 
     def radiance(
         self, camera: PixelCamera, *, seed: int, spp: int, chosen: Chosen = None
@@ -290,19 +294,14 @@ def test_rare_light_that_one_half_found_is_allowed_for() -> None:
     assert both.log_db < floor.log_db - 3, "light that both found is an error, and still a surprise"
 
 
-def test_raw_halves_state_the_error_of_one() -> None:
+def test_raw_halves_state_the_error_of_one_and_none_or_no_geometry_the_cap() -> None:
     rng = np.random.default_rng(6)
     raw = [truth() + rng.normal(0, 0.02, (PX, PX, 3)).astype(np.float32) for _ in range(2)]
-    halves = [Half(raw_rgb=picture, denoised_rgb=picture) for picture in raw]
+    a, b, calm = (Half(raw_rgb=picture, denoised_rgb=picture) for picture in (*raw, truth()))
     exact = psnr_log_db(raw[0], truth())
     # One standard error of 64 blocks more: 0.2 dB.
-    assert floor_of(halves[0], halves[1], EVERYWHERE).log_db == pytest.approx(exact, abs=0.4)
-
-
-def test_pictures_without_error_or_without_geometry_state_the_cap() -> None:
-    calm = Half(raw_rgb=truth(), denoised_rgb=truth())
+    assert floor_of(a, b, EVERYWHERE).log_db == pytest.approx(exact, abs=0.4)
     assert floor_of(calm, calm, EVERYWHERE).log_db == MAX_DB
-    rng = np.random.default_rng(4)
     a, b = half(rng), half(rng)
     assert floor_of(a, b, ~EVERYWHERE).object_log_db == MAX_DB
     assert floor_of(a, b, EVERYWHERE) == floor_of(b, a, EVERYWHERE)
@@ -322,17 +321,14 @@ def test_an_empty_background_earns_nothing() -> None:
     assert floor.log_db > alone.log_db + 3, "three quarters of the pixels are exact"
 
 
-class RareLight:
-    """A tracer in which a pass finds a flash in a tile now and then; no two tiles are as dim."""
+class RareLight(HostTracer):
+    """A pass finds a flash in a tile now and then; no two tiles are as dim."""
 
     FLASH = 20.0
     ODDS = 0.03
 
     def __init__(self) -> None:
         self.dim = np.repeat(np.linspace(0.1, 1, 32 // TILE_PX), TILE_PX)
-
-    def pass_sum(self, camera: PixelCamera) -> HostSum:
-        return HostSum(self, camera)
 
     def radiance(
         self, camera: PixelCamera, *, seed: int, spp: int, chosen: Chosen = None
@@ -380,14 +376,13 @@ def test_the_mean_stays_unbiased_where_tiles_are_chosen_by_rare_light() -> None:
     assert abs(np.mean(means) - truth) < 4 * error
 
 
-def _noisy() -> Scene:
-    return sampled_like_scene(np.random.default_rng(5), num_views=1)
+NOISY = sampled_like_scene(np.random.default_rng(5), num_views=1)
 
 
 @pytest.mark.parametrize(
     ("scene", "resolution", "max_spp", "num_views", "most"),
-    [(_noisy(), 16, 256, 10, 0.02),
-     pytest.param(_noisy(), 32, 512, 16, 0.01, marks=pytest.mark.slow("statistics")),
+    [(NOISY, 16, 256, 10, 0.02),
+     pytest.param(NOISY, 32, 512, 16, 0.01, marks=pytest.mark.slow("statistics")),
      pytest.param(lit_by_a_mirror(0.3), 32, 512, 24, 0.02, marks=pytest.mark.slow("statistics"))],
     ids=["alike", "tiles", "guided"],
 )  # fmt: skip
@@ -395,10 +390,7 @@ def test_a_scene_keeps_its_light_over_many_views(
     scene: Scene, resolution: int, max_spp: int, num_views: int, most: float
 ) -> None:
     """With the denoiser, which keeps the mean; no tiles are chosen below 512 samples."""
-    settings = RenderSettings(
-        resolution=resolution, noise_floor_db=90.0, min_spp=32, max_spp=max_spp,
-        min_mean_radiance=0.0,
-    )  # fmt: skip
+    settings = view_settings(32, resolution=resolution, max_spp=max_spp, min_mean_radiance=0.0)
     renderer, camera = SceneRenderer(scene, settings), camera_of(scene, resolution)
     adaptive = [
         renderer.render_view(camera.c2w, camera.fov_deg, seed).radiance_rgb.mean(dtype=np.float64)
@@ -470,7 +462,7 @@ def one_pass(
 def test_a_pass_over_some_pixels_agrees_with_passes_over_all() -> None:
     """The slow twin traces the whole picture. Each pixel is off by less than 5.5 of its standard
     errors, and the mean square of the scores is 1: they go by 15 degrees of freedom each."""
-    tracer, camera = load_tracer(_noisy(), max_depth=6, rr_depth=2), camera_of(_noisy(), 16)
+    tracer, camera = load_tracer(NOISY, max_depth=6, rr_depth=2), camera_of(NOISY, 16)
     chosen = np.random.default_rng(0).random((16, 16)) < 0.6
     some, all_ = (
         np.array([one_pass(tracer, camera, seed=seed, spp=64, chosen=pixels) for seed in seeds])
@@ -484,14 +476,12 @@ def test_a_pass_over_some_pixels_agrees_with_passes_over_all() -> None:
     assert lit.sum() > 100
     assert np.abs(score).max() < 5.5
     assert 0.7 < np.sqrt(np.mean(score**2)) < 1.4
-    np.testing.assert_array_equal(
-        one_pass(tracer, camera, seed=3, spp=16, chosen=np.ones_like(chosen)),
-        tracer.radiance(camera, seed=3, spp=16),
-    )
+    all_pixels = one_pass(tracer, camera, seed=3, spp=16, chosen=np.ones_like(chosen))
+    np.testing.assert_array_equal(all_pixels, tracer.radiance(camera, seed=3, spp=16))
 
 
 def test_sums_over_chosen_pixels_are_those_of_the_passes() -> None:
-    tracer, camera = load_tracer(_noisy(), max_depth=6, rr_depth=2), camera_of(_noisy(), 32)
+    tracer, camera = load_tracer(NOISY, max_depth=6, rr_depth=2), camera_of(NOISY, 32)
     rng = np.random.default_rng(2)
     passes = SimpleNamespace(radiance=partial(one_pass, tracer))
     fast, slow = tracer.pass_sum(camera), HostSum(passes, camera)

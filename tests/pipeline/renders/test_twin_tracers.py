@@ -48,6 +48,7 @@ from tests.pipeline.renders.sampling import (
     render_blocks,
     render_view,
     scores,
+    view_settings,
 )
 from tests.pipeline.renders.scene_kit import (
     SKY_LAMP,
@@ -221,15 +222,13 @@ def test_a_faint_emitter_is_a_surface() -> None:
     faint = row + material(roughness=0, emission=1e-6)
     scenes = [_panel_in_a_mirror(flat(PANEL, *kind)) for kind in ((row,), (faint, "emitter"))]
     surface, emitter = (
-        render_blocks(scene, passes=8, first_seed=seed) for seed, scene in enumerate(scenes)
+        render_blocks(each, passes=8, first_seed=k) for k, each in enumerate(scenes)
     )
     assert surface.mean.max() > 0.01
     assert_agree(emitter, surface, slack=2e-3)  # as above
 
 
-SETTINGS = RenderSettings(
-    resolution=32, noise_floor_db=60.0, min_spp=32, max_spp=32, aux_spp=16, split=True
-)
+SETTINGS = view_settings(32, noise_floor_db=60.0, aux_spp=16, split=True)
 
 KINDS = [{"split": True}, {"split_lobes": True}, {"split": True, "split_lobes": True}]
 FLOOR = quad([[-2, -2, 0], [2, -2, 0], [2, 2, 0], [-2, 2, 0]], material(diffuse=0.5))
@@ -346,9 +345,8 @@ def test_a_build_with_the_setting_stores_what_verify_accepts() -> None:
             "smoke", resolution=16, changes={**changes, "scenes.num_views": 2}
         )
         scene = tiny_scene(provenance={"camera_attempts": [0, 0]})
-        sample = render_sample(
-            "000000007", RenderInput(scene=scene), settings, [], ViewProgress(None, 7)
-        )
+        scene_input = RenderInput(scene=scene)
+        sample = render_sample("000000007", scene_input, settings, [], ViewProgress(None, 7))
         manifest = Manifest(
             build="smoke",
             settings=settings_record(settings),
@@ -435,9 +433,8 @@ def test_in_a_furnace_each_lobe_shows_its_albedo_by_direct_light_alone() -> None
         np.testing.assert_array_equal(found[name], 0)
     for name, albedo in (("diffuse_direct", diffuse), ("specular_direct", specular)):
         # so smooth a lobe loses 0.2 % to its own shadows, of which colour keeps a part
-        assert_agree(
-            blocks_of(found[name], 4), exact(np.broadcast_to(albedo, (2, 2, 3))), slack=0.005
-        )
+        albedos = exact(np.broadcast_to(albedo, (2, 2, 3)))
+        assert_agree(blocks_of(found[name], 4), albedos, slack=0.005)
 
 
 def test_kernels_of_other_parts_are_apart() -> None:

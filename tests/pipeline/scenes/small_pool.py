@@ -10,7 +10,7 @@ import trimesh
 from numpy.typing import NDArray
 
 from pipeline.scenes.compose import compose_scene
-from pipeline.scenes.pieces import ScenePiece, shell_piece
+from pipeline.scenes.pieces import ScenePiece, Skin, shell_piece, surface_piece
 from pipeline.scenes.triangle_budget import PooledAsset
 from scene_templates.layout import ShellPart, SurfaceLook
 from scene_templates.rooms import PATCH_FACES, SIDES, patch
@@ -18,7 +18,7 @@ from scene_templates.settings import SceneSettings
 from storage.errors import Rejected
 from storage.records.asset import Asset, Level, LevelQuality, LevelRecord, SourceFacts
 from storage.records.objects import LockedObject
-from storage.records.scene import ARRAY_FIELDS, Scene
+from storage.records.scene import ARRAY_FIELDS, Scene, SceneObject
 from storage.seeds import SceneKey
 from tests.scene_templates.balls import STILL
 
@@ -128,6 +128,18 @@ def floor_piece(look: SurfaceLook, rng: np.random.Generator) -> ScenePiece:
     positions = patch(SIDES["floor"], STILL)
     part = ShellPart(name="floor", positions=positions, faces=PATCH_FACES, surface=look)
     return shell_piece(part, rng, 30.0)
+
+
+def piece_of(
+    positions: NDArray[np.float32],
+    faces: NDArray[np.uint32],
+    look: SurfaceLook = LOOK,
+    skin: Skin | None = None,
+    name: str = "it",
+) -> ScenePiece:
+    """Return a mesh as the piece of an object."""
+    entry = SceneObject(name=name, kind="object", uid=f"made/{name}")
+    return surface_piece(entry, positions, faces, look, np.random.default_rng(0), 30.0, skin)
 
 
 def first_scene(

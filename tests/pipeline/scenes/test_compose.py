@@ -153,11 +153,6 @@ def test_rights_travel_and_names_are_unique(pool: list[PooledAsset]) -> None:
         assert entry.source_url == "https://example.org/made/wall1"
 
 
-def test_an_empty_pool_is_a_users_mistake() -> None:
-    with pytest.raises(TrilightError, match="pool"):
-        compose_scene(SETTINGS, [], SceneKey(0, 0))
-
-
 def test_a_scene_without_objects_is_a_scene(pool: list[PooledAsset]) -> None:
     """The published families have some; a view of one need not show any object."""
     settings = template_settings("open_box", {"families.num_objects": [0, 0]})
@@ -417,11 +412,8 @@ def test_the_worst_error_is_the_least_that_the_budget_allows() -> None:
     for _ in range(400):
         assets, total = _sample_assets(rng, most=3), int(rng.integers(100, 2500))
         enough = float(rng.choice([0.0, 0.01]))
-        fitting = [
-            combination
-            for combination in itertools.product(*(asset.levels for asset in assets))
-            if _count(combination) <= total
-        ]
+        combinations = itertools.product(*(asset.levels for asset in assets))
+        fitting = [levels for levels in combinations if _count(levels) <= total]
         if not fitting:
             with pytest.raises(Rejected):
                 levels_within(assets, total, enough)
@@ -441,7 +433,9 @@ def test_the_worst_error_is_the_least_that_the_budget_allows() -> None:
     assert better > 100  # else any choice would do
 
 
-def test_too_little_room_is_rejected_with_the_numbers() -> None:
+def test_too_little_room_is_rejected_with_the_numbers_and_an_empty_pool_is_a_mistake() -> None:
+    with pytest.raises(TrilightError, match="pool"):
+        compose_scene(SETTINGS, [], SceneKey(0, 0))
     with pytest.raises(Rejected, match="1 objects need 300 triangles at least.*has 200"):
         levels_within([_asset([(300, 0.1), (600, 0.0)])], 200, 0.0)
     with pytest.raises(Rejected, match="^over_budget: 3 objects of at least 50 .* into the 149"):
@@ -483,11 +477,8 @@ def _slow_twin(
     for following in range(count - 1, -1, -1):
         fitting_rows = []
         for row in sorted(allowed):
-            beside = [
-                least[other]
-                for other in allowed
-                if not camps[row] or camps[other] in ("", camps[row])
-            ]
+            camps_beside = ("", camps[row]) if camps[row] else camps
+            beside = [least[other] for other in allowed if camps[other] in camps_beside]
             if least[row] + following * min(beside) <= left:
                 fitting_rows.append(row)
         if not fitting_rows:

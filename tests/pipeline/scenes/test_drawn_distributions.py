@@ -15,15 +15,21 @@ import trimesh
 from numpy.typing import NDArray
 
 from pipeline.presets.registry import preset_settings
-from pipeline.scenes.pieces import surface_piece
 from pipeline.scenes.triangle_budget import PooledAsset
 from scene_templates.layout import SurfaceLook
 from scene_templates.out_of_range import median_settings
 from scene_templates.sample_layout import scene_plan
 from storage.records.material import DIFFUSE, EMISSION, ROUGHNESS
-from storage.records.scene import Scene, SceneObject
+from storage.records.scene import Scene
 from storage.settings.overrides import differences
-from tests.pipeline.scenes.small_pool import LOOK, first_scene, floor_piece, rows_of, triangles_of
+from tests.pipeline.scenes.small_pool import (
+    LOOK,
+    first_scene,
+    floor_piece,
+    piece_of,
+    rows_of,
+    triangles_of,
+)
 from tests.scene_templates.published import DEFAULT, STAGE_1
 from tests.scene_templates.statistics import (
     choices,
@@ -85,11 +91,9 @@ def test_many_colours_are_even_below_the_diffuse_scale() -> None:
 def test_colours_go_by_triangle_by_group_or_are_one() -> None:
     """A rod of two caps and a side has three groups."""
     rod = trimesh.creation.cylinder(0.3, 1.0, sections=64)
-    entry = SceneObject(name="rod", kind="object")
     positions, faces = rod.vertices.astype(np.float32), rod.faces.astype(np.uint32)
     for colours, count in (("one", 1), ("groups", 3), ("triangles", len(faces))):
-        rng = np.random.default_rng(0)
-        piece = surface_piece(entry, positions, faces, _surface(colours), rng, 30.0)
+        piece = piece_of(positions, faces, _surface(colours))
         assert len(piece.materials) == count
         assert sorted(set(piece.material_index.tolist())) == list(range(count))
         assert len(np.unique(piece.materials[:, DIFFUSE], axis=0)) == count
@@ -214,12 +218,10 @@ def _light_size(scene: Scene) -> float:
     corners = _emitters(scene)
     edges = np.linalg.norm(corners - np.roll(corners, 1, axis=1), axis=-1)
     assert np.ptp(edges) < ROUNDING
-    area = np.linalg.norm(
-        np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]), axis=1
-    )
+    area = trimesh.triangles.area(corners)
     factor = float(edges.mean()) / (2.25 * math.sqrt(0.005))
     # The size is that of the edge; the area, and with it the light, goes by its square.
-    assert np.abs(area / (2 * 0.0021651 * 2.25**2) / factor**2 - 1).max() < 1e-3
+    assert np.abs(area / (0.0021651 * 2.25**2) / factor**2 - 1).max() < 1e-3
     return factor
 
 

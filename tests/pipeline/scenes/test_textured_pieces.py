@@ -19,7 +19,6 @@ from pipeline.scenes.pieces import (
     cube_coordinates,
     emitter_piece,
     source_skins,
-    surface_piece,
     with_drawn_textures,
     with_source_emission,
 )
@@ -55,7 +54,14 @@ from tests.pipeline.assets.source_materials.textured_kit import (
     picture_bytes,
     textured_glb,
 )
-from tests.pipeline.scenes.small_pool import LOOK, first_scene, floor_piece, pooled, small_pool
+from tests.pipeline.scenes.small_pool import (
+    LOOK,
+    first_scene,
+    floor_piece,
+    piece_of,
+    pooled,
+    small_pool,
+)
 from tests.scene_templates.balls import DEFAULTS
 from tests.scene_templates.statistics import require_plausible, share
 from tests.textured_by_hand import bumps
@@ -107,11 +113,8 @@ def _pool(every: int = 0, *, mapped: bool = False) -> list[PooledAsset]:
 
 def test_textures_and_own_materials_change_no_other_draw() -> None:
     for index in range(5):
-        plain, drawn, own = (
-            _scene(PLAIN, index),
-            _scene(TEXTURED, index),
-            _scene(OWN, index, _pool()),
-        )
+        plain, drawn = (_scene(settings, index) for settings in (PLAIN, TEXTURED))
+        own = _scene(OWN, index, _pool())
         for scene in (drawn, own):
             for name in ("vertex_positions", "vertex_normals", "faces", "object_index", "c2w"):
                 assert np.array_equal(getattr(plain, name), getattr(scene, name)), name
@@ -133,10 +136,8 @@ def test_as_many_surfaces_and_objects_are_textured_as_stated() -> None:
         scene = _scene(TEXTURED, index)
         for row, entry in enumerate(scene.objects):
             if entry.kind != "emitter":
-                mine, textures = (
-                    scene.material_index[scene.object_index == row],
-                    scene.material_textures,
-                )
+                mine = scene.material_index[scene.object_index == row]
+                textures = scene.material_textures
                 drawn.append(textures is not None and bool((textures[mine] >= 0).any()))
     some = apply_overrides(OWN, {"materials.own_share": 0.3})
     entries = _pool()[1:]
@@ -207,12 +208,9 @@ ROUNDING = 1e-6
 
 
 def _piece(mesh: trimesh.Trimesh, *, smooth: bool) -> ScenePiece:
-    entry = SceneObject(name="it", kind="object", uid="made/it")
-    positions = (0.5 * mesh.vertices).astype(np.float32)
-    faces = mesh.faces.astype(np.uint32)
-    rng = np.random.default_rng(0)
+    positions, faces = (0.5 * mesh.vertices).astype(np.float32), mesh.faces.astype(np.uint32)
     look = dataclasses.replace(LOOK, smooth=smooth, colours="triangles" if smooth else "one")
-    return surface_piece(entry, positions, faces, look, rng, 30.0)
+    return piece_of(positions, faces, look)
 
 
 def _open_and_odd() -> trimesh.Trimesh:
@@ -354,11 +352,8 @@ def test_textures_have_the_rights_and_the_means_of_their_objects() -> None:
     assert scene.textures and scene.material_textures is not None
     for texture in scene.textures:
         owner, source = owners[texture.source.name.rsplit(" ", 1)[0]], texture.source
-        assert (source.licence, source.attribution, source.source_url) == (
-            owner.licence,
-            owner.attribution,
-            owner.source_url,
-        )
+        for name in ("licence", "attribution", "source_url"):
+            assert getattr(source, name) == getattr(owner, name), name
     both = apply_overrides(OWN, {"textures.share": 1.0, "textures.surfaces.size": 8})
     drawn = _scene(both, 1, _pool())
     assert {texture.source.name.startswith("made/") for texture in drawn.textures} == {True, False}
@@ -401,12 +396,10 @@ def test_a_normal_map_comes_with_the_rights_of_its_object_and_changes_nothing_el
 def test_subdivision_moves_no_colour() -> None:
     level = _skinned(small_pool()[1].asset.levels[0])
     assert level.skin is not None
-    positions = level.positions
-    box, rng = SceneObject(name="box", kind="object"), np.random.default_rng(0)
     entries = [pooled("a", [trimesh.creation.box()])]
     (skin,) = source_skins(entries, [level], OWN.materials, SceneKey(0, 0))
     assert skin is not None
-    whole = surface_piece(box, positions, level.faces, LOOK, rng, 30.0, skin)
+    whole = piece_of(level.positions, level.faces, skin=skin)
     more = subdivide(whole, 100)
     assert more.skin is not None and len(more.mesh.faces) > 90
 
@@ -429,9 +422,7 @@ def test_a_picture_has_the_colours_of_a_file_in_their_corners(tmp_path: Path) ->
     level, entry = asset.levels[0], PooledAsset(locked=small_pool()[0].locked, asset=asset)
     (skin,) = source_skins([entry], [level], OWN.materials, SceneKey(0, 0))
     assert skin is not None
-    shape = level.positions, level.faces
-    named, rng = SceneObject(name="square", kind="object"), np.random.default_rng(0)
-    square = surface_piece(named, *shape, LOOK, rng, 30.0, skin)
+    square = piece_of(level.positions, level.faces, skin=skin)
     scene = Scene(
         **concatenate_pieces([square]),
         c2w=look_at_c2w(eye=[0, -2, 0], target=[0, 0, 0], up=[0, 0, 1])[None].astype(np.float32),
@@ -486,19 +477,15 @@ def test_parts_that_emit_give_the_stated_share_of_light() -> None:
     assert found >= 2
 
 
-def _object(emission: list[list[float]], name: str = "screen") -> ScenePiece:
+def _object(emission: list[list[float]]) -> ScenePiece:
     """A square of two triangles that emit so much."""
-    entry = SceneObject(name=name, kind="object", uid=f"made/{name}")
-    rng = np.random.default_rng(0)
-    first, second, third = (
-        Texture(texels=np.full((1, 1, channels), 0.1, np.float32)) for channels in (3, 3, 1)
-    )
+    colour, number = (Texture(texels=np.full((1, 1, k), 0.1, np.float32)) for k in (3, 1))
     skin = Skin(
         uv=np.zeros((6, 2), np.float32),
-        textures=(first, second, third),
+        textures=(colour, colour, number),
         emission=np.array(emission, np.float32),
     )
-    return surface_piece(entry, QUAD, FACES, LOOK, rng, 30.0, skin)
+    return piece_of(QUAD, FACES, skin=skin, name="screen")
 
 
 def _lamp(corners: np.ndarray, radiance: tuple[float, float, float]) -> ScenePiece:
@@ -530,9 +517,7 @@ def test_no_part_outshines_the_brightest_lamp_and_what_emits_stays_in_its_place(
     assert len(pieces[0].materials) == 2 and pieces[0].skin is None
     entry = pieces[0].entry
     assert locked_uids([(entry.kind, entry.uid), ("emitter", "")], {}) == ["made/screen"]
-
-
-def test_without_lamps_or_share_all_stays_dark() -> None:
+    # Without lamps or a share all stays dark.
     for lamps, share_ in (([_lamp(QUAD[FACES[0]], (1.0, 1.0, 1.0))], 0.0), ([], 1.0)):
         (piece,), more = with_source_emission([_object([[1, 1, 1], [0, 0, 0]])], lamps, share_)
         assert not more and len(piece.mesh.faces) == 2

@@ -117,9 +117,8 @@ def test_light_is_seen_from_its_side_past_emitters_and_not_through_roofs() -> No
     assert (below.lit, below.shell_back, below.coverage) == (0.0, 1.0, 0.0)
     # A scene without objects need not show any, and one with objects must.
     assert visibility_problem(above, ViewLaws(), has_objects=False) is None
-    assert (
-        visibility_problem(above, ViewLaws(), has_objects=True) == "sees too little of the objects"
-    )
+    problem = visibility_problem(above, ViewLaws(), has_objects=True)
+    assert problem == "sees too little of the objects"
     assert visibility_problem(below, ViewLaws(), has_objects=False) == "sees the back of the shell"
     assert visibility_problem(below, ViewLaws(max_shell_back=1.0), has_objects=False) is not None
     scene = tiny_scene()
@@ -178,10 +177,8 @@ def test_cameras_of_a_view_need_nothing_but_the_stored_scene_until_they_are_used
             break
     seen = with_cameras(scene, [other, own])
     seen.check()
-    assert seen.provenance == {
-        **scene.provenance,
-        "camera_attempts": [other.attempt, own.attempt],
-    }
+    attempts = [other.attempt, own.attempt]
+    assert seen.provenance == {**scene.provenance, "camera_attempts": attempts}
     for name in set(ARRAY_FIELDS) - {"c2w", "fov_deg"}:
         assert np.array_equal(getattr(seen, name), getattr(scene, name))
     np.testing.assert_array_equal(seen.c2w, [other.c2w, own.c2w])
@@ -231,11 +228,9 @@ def test_new_materials_leave_shape_light_and_the_pattern_of_colours(scene: Scene
 
 def test_draws_are_those_of_composition(scene: Scene) -> None:
     """The means of many draws are those of the stated ranges: albedo sums, specular shares."""
-    drawn = [
-        surface
-        for attempt in range(40)
-        for surface in surfaces(with_new_materials(scene, SMOKE.materials, SceneKey(7, 3, attempt)))
-    ]
+    keys = (SceneKey(7, 3, attempt) for attempt in range(40))
+    new_scenes = (with_new_materials(scene, SMOKE.materials, key) for key in keys)
+    drawn = [surface for new in new_scenes for surface in surfaces(new)]
     share = np.array([one.specular / 0.95 for one in drawn])
     # uniform in [0, 1] times a sum within 5 % of 0.95: mean 0.5, five standard errors
     assert abs(share.mean() - 0.5) < 5 * 0.29 / np.sqrt(len(drawn))
@@ -432,11 +427,7 @@ def encloses(one: NDArray[np.float64], other: NDArray[np.float64]) -> bool:
 def _meeting(scene: Scene) -> int:
     """How many pairs of objects meet, by the slow twin."""
     soups = [triangles_of(scene, row) for row in rows_of(scene, "object")]
-    return sum(
-        cross(one, other) or encloses(one, other)
-        for row, one in enumerate(soups)
-        for other in soups[:row]
-    )
+    return sum(cross(*pair) or encloses(*pair) for pair in itertools.combinations(soups, 2))
 
 
 def test_meshes_meet_only_where_the_plan_lets_them(
@@ -456,9 +447,8 @@ def test_meshes_meet_only_where_the_plan_lets_them(
 
 
 def _pose(rng: np.random.Generator, radius: float) -> Pose:
-    return Pose(
-        centre=rng.uniform(-0.35, 0.35, size=3), radius=radius, rotation=uniform_rotation(rng)
-    )
+    centre = rng.uniform(-0.35, 0.35, size=3)
+    return Pose(centre=centre, radius=radius, rotation=uniform_rotation(rng))
 
 
 def _soup(shape: MeshShape, pose: Pose) -> NDArray[np.float64]:

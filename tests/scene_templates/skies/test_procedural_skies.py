@@ -99,13 +99,11 @@ def test_skies_without_light_and_with_suns_of_a_million_are_finite() -> None:
 def test_the_same_seed_is_the_same_sky_at_every_height(family: str) -> None:
     (coarse, draws), (fine, again) = (_with_draws(family, 1, height=each) for each in (32, 64))
     assert draws == again
-    moments = [
-        SkyTexels(len(sky)).flux(
-            sky.astype(float).mean(axis=-1)[..., None] * SkyTexels(len(sky)).directions
-        )
-        / draws["mean radiance"][0]
-        for sky in (coarse, fine)
-    ]
+    moments = []
+    for sky in (coarse, fine):
+        texels, grey = SkyTexels(len(sky)), sky.astype(float).mean(axis=-1)
+        moment = texels.flux(grey[..., None] * texels.directions)
+        moments.append(moment / draws["mean radiance"][0])
     # the vector irradiance, of at most 4 pi times the mean; spots and edges lie within a texel of
     # 5.6 degrees, and clouds lose octaves
     assert np.abs(moments[0] - moments[1]).max() < 0.1 * 4 * math.pi, family
@@ -213,24 +211,17 @@ def test_texel_centres_are_where_the_convention_shows_them() -> None:
             assert (1 - v) * height == pytest.approx(row + 0.5, abs=1e-9)
 
 
-@for_each("height", [1, 2, 7, 64])
-def test_solid_angles_sum_to_the_sphere(height: int) -> None:
-    texels = SkyTexels(height)
-    ones = np.ones((height, 2 * height))
-    assert float(texels.flux(ones)) == pytest.approx(4 * math.pi, rel=1e-13)
-    assert texels.solid_angle.shape == (height, 1) and (texels.solid_angle > 0).all()
-
-
-def test_a_sky_cannot_write_into_the_arrays_of_the_next_one() -> None:
-    texels = SkyTexels(4)
-    shared = (texels.directions, texels.z, texels.solid_angle)
-    assert not any(array.flags.writeable for array in shared)
-
-
-def test_a_white_sky_sends_pi_onto_the_ground() -> None:
-    found = SkyTexels(64).irradiance(np.ones((64, 128, 3)))
+def test_solid_angles_sum_to_the_sphere_and_no_sky_can_write_into_those_of_the_next_one() -> None:
+    """And a white one sends pi onto the ground."""
+    for height in (1, 2, 7, 64):
+        texels = SkyTexels(height)
+        white = np.ones((height, 2 * height, 3))
+        np.testing.assert_allclose(texels.flux(white), 4 * math.pi, rtol=1e-13)
+        assert texels.solid_angle.shape == (height, 1) and (texels.solid_angle > 0).all()
+        shared = (texels.directions, texels.z, texels.solid_angle)
+        assert not any(array.flags.writeable for array in shared)
     # the midpoint rule on 64 rows errs by (pi / 64)^2 / 6
-    np.testing.assert_allclose(found, math.pi, rtol=5e-4)
+    np.testing.assert_allclose(texels.irradiance(white), math.pi, rtol=5e-4)
 
 
 @for_each("height", [1, 2, 8, 33, 64, 256])
@@ -267,9 +258,8 @@ def test_panes_have_the_solid_angle_of_rectangles_and_stand_upright() -> None:
     texels = SkyTexels(256)
     for seed in range(3):
         towards, half = _unit(seed), (0.4, 0.25)
-        expected = 4 * math.asin(
-            half[0] * half[1] / math.sqrt((1 + half[0] ** 2) * (1 + half[1] ** 2))
-        )
+        across, up = (side / math.sqrt(1 + side**2) for side in half)
+        expected = 4 * math.asin(across * up)
         found = float(texels.flux(texels.pane(towards, half, roll_rad=seed / 2)))
         # edges are ramps of about a texel whose width grows off the middle
         assert found == pytest.approx(expected, rel=0.03)
@@ -335,16 +325,14 @@ OBSERVER = np.stack(
 """The fit of Wyman et al. (2013), table 1."""
 
 
-@for_each("mired", [40, 80, 153.8, 249, 251, 300, 400, 449, 451, 499])
-def test_a_black_body_has_the_colour_of_plancks_law(mired: float) -> None:
+def test_a_black_body_has_the_colour_of_plancks_law() -> None:
+    """Colours are positive with a mean of 1, and there is no jump."""
     metres = WAVELENGTHS_NM * 1e-9
-    spectrum = metres**-5 / np.expm1(0.014387769 / metres / (1e6 / mired))
-    rgb = _XYZ_TO_REC709 @ (OBSERVER @ spectrum)
-    # both fits are good to about 0.003 of a chromaticity, up to 2 % of a channel's mean of 1
-    np.testing.assert_allclose(planckian_rgb(mired), rgb / rgb.mean(), atol=0.04)
-
-
-def test_colours_are_positive_with_a_mean_of_1_and_no_jump() -> None:
+    for mired in (40, 80, 153.8, 249, 251, 300, 400, 449, 451, 499):
+        spectrum = metres**-5 / np.expm1(0.014387769 / metres / (1e6 / mired))
+        rgb = _XYZ_TO_REC709 @ (OBSERVER @ spectrum)
+        # both fits are good to about 0.003 of a chromaticity, up to 2 % of a channel's mean of 1
+        np.testing.assert_allclose(planckian_rgb(mired), rgb / rgb.mean(), atol=0.04)
     found = np.array([planckian_rgb(m) for m in np.linspace(40, 500, 2000)])
     assert (found >= 0).all()
     np.testing.assert_allclose(found.mean(axis=1), 1, rtol=1e-14)
@@ -416,9 +404,8 @@ def test_only_the_sky_is_new() -> None:
     plain = preset_settings("pretrain-256").scenes
     skies = preset_settings("sky-256").scenes
     assert dataclasses.replace(skies, skies=SkySettings()) == plain
-    always = dataclasses.replace(
-        skies, skies=dataclasses.replace(skies.skies, share=1.0, maps=SMALL)
-    )
+    every = dataclasses.replace(skies.skies, share=1.0, maps=SMALL)
+    always = dataclasses.replace(skies, skies=every)
     before, after = (
         first_scene(settings, small_pool(), seed=1, scene_index=2) for settings in (plain, always)
     )

@@ -231,9 +231,8 @@ def test_finishes_are_grey_but_for_metal_mixed_by_area_and_toned() -> None:
     half = RED.covered(GOLD, np.array([[0.0, 1.0], [0.5, 0.5]]))
     np.testing.assert_array_equal(half.diffuse_rgb[0, 0], RED.diffuse_rgb)
     np.testing.assert_allclose(half.specular_rgb[0, 1], GOLD.specular_rgb, rtol=1e-15)
-    np.testing.assert_allclose(
-        half.diffuse_rgb[1, 0], (RED.diffuse_rgb + GOLD.diffuse_rgb) / 2, rtol=1e-15
-    )
+    mean_rgb = (RED.diffuse_rgb + GOLD.diffuse_rgb) / 2
+    np.testing.assert_allclose(half.diffuse_rgb[1, 0], mean_rgb, rtol=1e-15)
     # GGX widths 0.36 and 0.04 have the mean 0.2
     assert half.roughness[1, 1] == pytest.approx(0.2**0.5, rel=1e-15)
     toned, dimmed = RED.toned(0.5), RED.dimmed(0.5)
@@ -261,9 +260,8 @@ def _shares(family: str, seed: int, first: str, second: str) -> float:
 def test_checkers_are_half_and_half_and_bands_have_their_share() -> None:
     for seed in range(5):
         # edges fall on texel borders or are split evenly between both sides
-        assert _shares("checker", seed, "light square", "dark square") == pytest.approx(
-            0.5, abs=0.002
-        )
+        dark_share = _shares("checker", seed, "light square", "dark square")
+        assert dark_share == pytest.approx(0.5, abs=0.002)
     for seed in range(8):
         settings = SurfaceMapSettings(families=("stripes",), size=256, natural_share=0.0)
         _, draws = with_draws(draw_surface, rng_for(seed, "laid"), settings)
@@ -299,12 +297,8 @@ def test_ours_are_drawn_equally_often_and_natural_ones_as_often_as_stated() -> N
     found = [with_draws(draw_surface, rng_for(seed, "surface"), settings) for seed in range(400)]
     natural = [draws["natural colours"] == (True,) for _, draws in found]
     families = [maps.family for maps, _ in found]
-    require_plausible(
-        {
-            "families": choices(families, dict.fromkeys(OUR_SURFACES, 1.0)),
-            "natural": share(natural, 0.4),
-        }
-    )
+    even = dict.fromkeys(OUR_SURFACES, 1.0)
+    require_plausible({"families": choices(families, even), "natural": share(natural, 0.4)})
     assert SurfaceMapSettings().families == OUR_SURFACES == tuple(SURFACES)
     assert len(OUR_SURFACES) >= 10
 
