@@ -30,7 +30,11 @@ from pipeline.exchange.from_description import (
     PrintableText,
     SceneDescription,
 )
-from pipeline.exchange.textured_triangles import group_triangles, unique_name
+from pipeline.exchange.textured_triangles import (
+    group_triangles,
+    require_at_most,
+    unique_name,
+)
 from pipeline.foreign.numbers import Malformed
 from pipeline.scenes.shading_normals import face_normals, has_area, smooth_shaded
 from storage.atomic import write_atomically
@@ -241,6 +245,7 @@ def write_renderformer_json(path: Path, scene: Scene) -> tuple[str, ...]:
             "cameras": list(map(camera_entry, scene.c2w, scene.fov_deg)),
         }
     ).encode()
+    require_at_most({"objects of one material": (len(objects), MAX_OBJECTS)})
     read_renderformer_json(data, path.name)  # raises for anything that readers would refuse
     for mesh_path, mesh in meshes.items():
         write_atomically(path.parent / mesh_path, mesh)

@@ -25,7 +25,6 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
-from pxr import Sdf
 
 from pipeline.documents.png import encode_png
 from pipeline.exchange.pictures import MAX_PIXELS
@@ -96,28 +95,17 @@ _MOST_REFLECTING = 0.98
 def add_materials(layer: Any, folder: str, scene: Scene) -> None:
     """Write a prim for each material row below `folder`.
 
-    Rows without textures are copies of the first such prim with other values, which takes half the
-    time of writing each prim.
+    No row is a copy of another: Sdf.CopySpec orders fields by the addresses of their names, so that
+    the bytes of a file would differ between processes.
     """
     layout.add_prim(layer, folder, "Scope")
-    first = None
     columns = stored_columns(scene.materials)
     for row, values in enumerate(scene.materials):
         path = f"{folder}/{layout.material_name(row)}"
-        used = used_textures(scene, row)
-        copied = first is not None and not used
-        if copied:
-            Sdf.CopySpec(layer, first, layer, path)
-        for below, attributes in material_tables(values, columns, used).items():
-            if not copied:
-                prim = layout.add_prim(layer, path + below, "Shader" if below else "Material")
-                layout.add_attributes(prim, attributes, path)
-                continue
-            prim = layer.GetPrimAtPath(path + below)
-            for name, (kind, value, *_) in attributes.items():
-                if kind in ("color3f", "float", "float[]"):
-                    prim.attributes[name].default = layout.usd_converter(kind)(value)
-        first = first if used else first or path
+        tables = material_tables(values, columns, used_textures(scene, row))
+        for below, attributes in tables.items():
+            prim = layout.add_prim(layer, path + below, "Shader" if below else "Material")
+            layout.add_attributes(prim, attributes, path)
 
 
 def material_tables(

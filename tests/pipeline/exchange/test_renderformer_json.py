@@ -213,7 +213,7 @@ def test_too_much_light_and_too_many_objects(
     bright.materials[LIGHT, 7:] = 65505
     assert any("cuts off" in text for text in write_renderformer_json(tmp_path / "a.json", bright))
     monkeypatch.setattr("pipeline.exchange.renderformer_json.MAX_OBJECTS", 1)
-    with pytest.raises(TrilightError, match=r"a\.json: 2 objects; expected 1 to 1"):
+    with pytest.raises(TrilightError, match="2 objects of one material; expected at most 1"):
         write_renderformer_json(tmp_path / "a.json", tiny_scene())
 
 

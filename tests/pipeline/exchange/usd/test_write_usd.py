@@ -16,8 +16,14 @@ from pxr import Gf, Sdf, Usd, UsdGeom, UsdLux, UsdShade
 
 from pipeline.exchange.formats import FORMATS, drop_uncarried_maps, list_lost_members
 from pipeline.exchange.textured_triangles import LoadedScene
+from pipeline.exchange.usd import layout
 from pipeline.exchange.usd.read_usd import read_usd, usd_keys
-from pipeline.exchange.usd.write_usd import write_usd, write_usd_shard
+from pipeline.exchange.usd.write_usd import (
+    author_scene,
+    new_layer,
+    write_usd,
+    write_usd_shard,
+)
 from pipeline.foreign.limits import WRITTEN_USD_SUFFIXES
 from scene_templates.rotations import uniform_rotation
 from storage.conventions import linear_from_srgb8
@@ -131,6 +137,20 @@ def test_any_scene_comes_back(tmp_path_factory: Any, scene: Scene, suffix: str) 
     write_usd(path, scene)
     back = read_usd(path)
     assert back.notes == () and encode_scene(back.scene) == encode_scene(scene)
+
+
+def test_rows_of_materials_are_written_in_one_order() -> None:
+    """Specs that Sdf copies are ordered by addresses, so that bytes differed between processes."""
+    layer = new_layer(layout.ROOT)
+    scene = tiny_scene()
+    author_scene(layer, layout.ROOT, scene)
+    orders = []
+    for row in range(len(scene.materials)):
+        order = list[str]()
+        path = f"{layout.ROOT}/Materials/{layout.material_name(row)}"
+        layer.Traverse(path, lambda spec, order=order: order.append(str(spec)))
+        orders.append([spec.replace(path, "") for spec in order])
+    assert len(orders) > 1 and all(order == orders[0] for order in orders)
 
 
 def test_stage_says_units_and_holds_no_path(tmp_path: Path) -> None:
