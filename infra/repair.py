@@ -12,8 +12,7 @@ from pipeline.generation.pipeline import make_dataset, prepare_dataset
 from pipeline.objects.licences import BY_USER
 from pipeline.presets.registry import preset_settings
 from storage.dataset.dataset import Dataset, open_dataset
-from storage.dataset.manifest import Manifest
-from storage.dataset.planned import derivation_of
+from storage.dataset.manifest import Manifest, derivation_of
 from storage.dataset.progress import read_asked, value_of
 from storage.errors import TrilightError
 from storage.extensions import extension_digests, require_same_extensions

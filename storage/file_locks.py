@@ -19,7 +19,7 @@ from collections.abc import Iterator
 from pathlib import Path
 
 from storage.atomic import write_error
-from storage.remote.safe_url import printable
+from storage.remote.url import printable
 
 log = logging.getLogger("trilight.file_locks")
 

@@ -25,7 +25,7 @@ from storage.dataset.splits import shards_for, split_of_object, split_of_shard
 from storage.errors import TrilightError
 from storage.machine import available_cores
 from storage.records.objects import count_by_reason
-from storage.remote.safe_url import safe_url
+from storage.remote.url import safe_url
 from storage.settings.described import checked
 from storage.settings.fields import describe_fields
 from storage.settings.ranges import Within

@@ -16,7 +16,7 @@ from infra.cli.console import (
 from infra.cli.options import command
 from pipeline.exchange.exports.export import ExportForm
 from pipeline.exchange.from_description import AlbedoOverOne
-from storage.remote.safe_url import safe_url
+from storage.remote.url import safe_url
 from storage.settings.described import checked
 from storage.settings.ranges import Within
 

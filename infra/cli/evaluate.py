@@ -18,7 +18,7 @@ from infra.cli.console import (
 )
 from infra.cli.options import command
 from infra.torch_library import require_torch
-from storage.remote.safe_url import safe_url
+from storage.remote.url import safe_url
 from train.evaluation.options import EvaluationOptions, LeaderboardOptions
 
 _JUDGED_BY = (

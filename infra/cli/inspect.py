@@ -25,7 +25,7 @@ from storage.dataset.layout import DatasetFolder
 from storage.dataset.statistics import Statistics, dataset_statistics, described_shards
 from storage.errors import TrilightError
 from storage.records.objects import count_by_reason
-from storage.remote.safe_url import safe_url
+from storage.remote.url import safe_url
 from storage.settings.described import checked
 from storage.settings.ranges import Within
 

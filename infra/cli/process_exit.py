@@ -11,7 +11,7 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import NoReturn
 
-from storage.remote.safe_url import escape_lines
+from storage.remote.url import escape_lines
 
 _SHOW_CURSOR = "\x1b[?25h"
 _temporary: set[Path] = set()

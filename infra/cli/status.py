@@ -21,7 +21,7 @@ from infra.cli.options import command
 from pipeline.generation.generate_options import CorePrice
 from storage.aliases import PRESET_ALIASES, name_for_people
 from storage.dataset.dataset import open_dataset
-from storage.dataset.planned import derivation_of, num_planned
+from storage.dataset.manifest import derivation_of, num_planned
 from storage.dataset.progress import (
     DatasetStatus,
     missing_shards,
@@ -32,8 +32,7 @@ from storage.dataset.progress import (
 from storage.dataset.verify import Verification, verify_dataset
 from storage.errors import TrilightError
 from storage.number_ranges import number_ranges
-from storage.remote.safe_url import safe_url
-from storage.remote.url import RemoteUrl, parse_url
+from storage.remote.url import RemoteUrl, parse_url, safe_url
 from storage.settings.described import checked
 from storage.settings.ranges import Within
 

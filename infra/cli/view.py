@@ -11,7 +11,7 @@ from typing import Annotated
 from infra.cli.console import console, first_words, suggest_look
 from infra.cli.options import command
 from infra.torch_library import require_torch
-from storage.remote.safe_url import safe_url
+from storage.remote.url import safe_url
 from storage.settings.described import checked
 from storage.settings.ranges import Within
 

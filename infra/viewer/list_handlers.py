@@ -50,7 +50,7 @@ from storage.records.exr import decode_exr
 from storage.records.lights import num_lights
 from storage.records.profiles import PACKED, PLAIN
 from storage.records.safe_read import safetensors_header, unpack_gzip
-from storage.remote.safe_url import safe_url
+from storage.remote.url import safe_url
 from storage.renderer import Camera
 from storage.settings.overrides import option_words
 

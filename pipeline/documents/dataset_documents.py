@@ -19,8 +19,13 @@ from storage.atomic import write_atomically
 from storage.conventions import SPLITS
 from storage.dataset.dataset import Dataset
 from storage.dataset.layout import DatasetFolder
-from storage.dataset.manifest import Manifest, ShardEntry, read_manifest, write_manifest
-from storage.dataset.planned import derivation_of
+from storage.dataset.manifest import (
+    Manifest,
+    ShardEntry,
+    derivation_of,
+    read_manifest,
+    write_manifest,
+)
 from storage.dataset.statistics import Statistics, dataset_statistics
 from storage.digests import sha256_hex, sha256_of_file
 from storage.licences import licence_url

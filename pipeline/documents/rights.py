@@ -10,7 +10,7 @@ from collections.abc import Collection, Iterable, Mapping
 from types import MappingProxyType
 from typing import Any
 
-from storage.dataset.planned import derivation_of
+from storage.dataset.manifest import derivation_of
 from storage.markdown import inert
 from storage.records.asset import AssetRow
 from storage.records.objects import OBJECT, SKY, TEXTURE, LockedObject

@@ -41,7 +41,7 @@ from pipeline.isolation import (
 )
 from storage.dataset.shard_set import expand_pattern
 from storage.errors import TrilightError
-from storage.remote.safe_url import safe_url
+from storage.remote.url import safe_url
 from storage.renderer import Camera
 
 log = logging.getLogger("trilight.exchange")

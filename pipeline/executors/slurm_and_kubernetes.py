@@ -31,8 +31,8 @@ from storage.digests import sha256_hex
 from storage.errors import TrilightError
 from storage.extensions import is_reference
 from storage.number_ranges import number_ranges
-from storage.remote.safe_url import safe_url
 from storage.remote.store import WRITABLE
+from storage.remote.url import safe_url
 from storage.settings.described import checked, from_record
 from storage.settings.ranges import Within
 

@@ -47,7 +47,7 @@ from storage.dataset.progress import DatasetStatus, read_status
 from storage.dataset.splits import scenes_of_shard
 from storage.dataset.statistics import Statistics
 from storage.errors import EnvironmentFailure, TrilightError
-from storage.remote.safe_url import safe_text
+from storage.remote.url import safe_text
 
 
 def is_retryable(task_: Task[..., Any], run: TaskRun, state: State[Any]) -> bool:

@@ -26,7 +26,7 @@ from storage.cache import cache_folder, open_private, private_folder
 from storage.errors import TrilightError
 from storage.file_locks import hold_lock
 from storage.installation import IMPORT_ROOT, child_environment
-from storage.remote.safe_url import safe_text
+from storage.remote.url import safe_text
 
 DISK_LIMIT = "trilight-disk"
 """Limit of runs that write documents at the same time."""

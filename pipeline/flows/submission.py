@@ -25,7 +25,7 @@ from prefect.states import Pending
 
 from pipeline.flows.prefect_server import prefect_client
 from storage.errors import TrilightError
-from storage.remote.safe_url import safe_text
+from storage.remote.url import safe_text
 from storage.settings.fields import describe_fields
 
 POLL_S = 1.0

@@ -24,12 +24,12 @@ from storage.dataset.layout import DatasetFolder, in_parts, parts_of, place_of_p
 from storage.dataset.manifest import (
     Manifest,
     ShardEntry,
+    derivation_of,
     number_of_shard,
     read_head,
     read_manifest,
     write_manifest,
 )
-from storage.dataset.planned import derivation_of
 from storage.dataset.settings import SplitSettings
 from storage.dataset.shard_notes import ShardNote, noted_names, rejections_of_shard
 from storage.dataset.splits import (

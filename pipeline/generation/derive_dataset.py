@@ -28,13 +28,16 @@ from storage.atomic import write_error
 from storage.conventions import MANIFEST_VERSION, SPLITS
 from storage.dataset.dataset import open_dataset
 from storage.dataset.layout import DatasetFolder
-from storage.dataset.manifest import Manifest, ShardEntry, index_shard, write_manifest
-from storage.dataset.planned import (
+from storage.dataset.manifest import (
     Derivation,
+    Manifest,
+    ShardEntry,
     common,
     derivation_of,
     derived_settings,
+    index_shard,
     source_record,
+    write_manifest,
 )
 from storage.dataset.shard import write_shard
 from storage.dataset.splits import named_shard

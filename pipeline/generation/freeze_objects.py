@@ -55,7 +55,7 @@ from storage.records.objects import (
     failure_of,
 )
 from storage.records.safe_read import open_plain
-from storage.remote.safe_url import printable, safe_url
+from storage.remote.url import printable, safe_url
 
 log = logging.getLogger("trilight.objects")
 

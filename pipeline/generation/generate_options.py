@@ -23,7 +23,7 @@ from storage.dataset.settings import MOST_SCENES
 from storage.errors import TrilightError
 from storage.extensions import function_name
 from storage.records.objects import SKY, TEXTURE
-from storage.remote.safe_url import safe_url
+from storage.remote.url import safe_url
 from storage.settings.described import checked, settings_record
 from storage.settings.fields import option_of
 from storage.settings.overrides import option_words

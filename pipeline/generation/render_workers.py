@@ -28,7 +28,7 @@ from storage.extensions import extension_digests, require_same_extensions
 from storage.machine import available_cores
 from storage.records.objects import LockRows, ObjectRecord
 from storage.records.scene import Scene
-from storage.remote.safe_url import safe_url
+from storage.remote.url import safe_url
 from storage.settings.overrides import differences
 
 _RENDER_LIMITS = ChildLimits(memory_bytes=16 << 30, wall_s=3600, calls_per_child=200)

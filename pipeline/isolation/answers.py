@@ -29,7 +29,7 @@ from numpy.typing import NDArray
 
 from pipeline.isolation.call_failures import ENDS, ChildFailed
 from storage.errors import EnvironmentFailure, Rejected, TrilightError
-from storage.remote.safe_url import escape_lines
+from storage.remote.url import escape_lines
 
 CLASS = ""
 """Key of a dataclass's name among its fields: two classes of a union may have the same fields."""

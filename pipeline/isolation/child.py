@@ -41,7 +41,7 @@ from pipeline.isolation.confinement import Reach, code_of, confine, should_confi
 from storage.errors import EnvironmentFailure, Rejected, TrilightError
 from storage.extensions import load_same, loaded_files, mistake_in_extension
 from storage.installation import child_environment, order_installed_first
-from storage.remote.safe_url import escape_lines
+from storage.remote.url import escape_lines
 
 _START_UP_S = 180.0
 _LAUNCHES = 3

@@ -15,7 +15,7 @@ from posixpath import dirname
 
 from pipeline.foreign.limits import USD_SUFFIXES
 from storage.conventions import SPLITS
-from storage.remote.safe_url import printable
+from storage.remote.url import printable
 
 _OUTPUTS = (
     ("assets.json", "objects.jsonl"),

@@ -6,7 +6,7 @@ from collections.abc import Sequence
 from pipeline.objects.listing import failure
 from storage.errors import TrilightError
 from storage.records.objects import Failure, ObjectRecord
-from storage.remote.safe_url import printable
+from storage.remote.url import printable
 
 USER_PROVIDED = "LicenseRef-user-provided"
 """Licence of files that a user names without a catalogue; their use is assumed to be allowed."""

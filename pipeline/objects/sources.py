@@ -29,8 +29,7 @@ from storage.cache import cache_folder
 from storage.errors import TrilightError
 from storage.records.objects import Failure, ObjectRecord
 from storage.registry import Registry
-from storage.remote.safe_url import printable, safe_url
-from storage.remote.url import PACKAGES, parse_url
+from storage.remote.url import PACKAGES, parse_url, printable, safe_url
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -7,8 +7,7 @@ from functools import cached_property
 from typing import Any
 
 from storage.dataset.dataset import Dataset, open_listed, reading
-from storage.dataset.manifest import ShardEntry
-from storage.dataset.planned import is_whole, num_planned
+from storage.dataset.manifest import ShardEntry, is_whole, num_planned
 from storage.digests import sha256_hex
 from storage.errors import TrilightError
 from storage.records.objects import LockedObject, locked_uids
@@ -16,7 +15,7 @@ from storage.records.profiles import PACKED, PLAIN, unpack_arrays
 from storage.records.quantities import QUANTITIES
 from storage.records.sample import SceneRecord, decode_scene
 from storage.records.scene_facts import scene_values
-from storage.remote.safe_url import safe_url
+from storage.remote.url import safe_url
 
 
 class FinishedDataset(Dataset):

@@ -43,11 +43,11 @@ from storage.dataset.manifest import (
     decode_head,
     index_shard,
     index_stream,
+    planned_scenes_of,
     read_head,
     read_manifest,
     write_manifest,
 )
-from storage.dataset.planned import planned_scenes_of
 from storage.dataset.progress import count_given_up, log_name, log_scene
 from storage.dataset.settings import MOST_SCENES, SplitSettings
 from storage.dataset.shard import ShardReader, write_shard

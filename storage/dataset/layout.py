@@ -24,9 +24,8 @@ from storage.cache import cache_folder
 from storage.digests import sha256_hex
 from storage.errors import TrilightError
 from storage.file_locks import hold_lock, is_locked, open_lock, take_lock
-from storage.remote.safe_url import printable, safe_url
 from storage.remote.store import WRITABLE, LocalStore, RemoteStore, Store
-from storage.remote.url import RemoteUrl, parse_url
+from storage.remote.url import RemoteUrl, parse_url, printable, safe_url
 
 _LEFT_S = 3600.0
 """Age at which a temporary file counts as left by a kill. Not all file systems carry locks between

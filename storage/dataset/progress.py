@@ -22,8 +22,14 @@ from typing import Annotated
 from storage.atomic import append_line, write_atomically, write_error
 from storage.dataset.dataset import Dataset, open_listed
 from storage.dataset.layout import DatasetFolder, numbered_path, shard_names_in
-from storage.dataset.manifest import Manifest, read_manifest
-from storage.dataset.planned import expected_scenes, is_whole, listed_scenes, planned_shards
+from storage.dataset.manifest import (
+    Manifest,
+    expected_scenes,
+    is_whole,
+    listed_scenes,
+    planned_shards,
+    read_manifest,
+)
 from storage.dataset.shard_notes import name_of_note, noted_names, noted_shard
 from storage.errors import TrilightError
 from storage.extensions import is_reference

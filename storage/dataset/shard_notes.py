@@ -20,10 +20,10 @@ from storage.dataset.manifest import (
     Scenes,
     ShardEntry,
     index_shard,
+    num_planned,
     number_of_shard,
     shard_row,
 )
-from storage.dataset.planned import num_planned
 from storage.digests import canonical_json
 from storage.errors import TrilightError
 from storage.records.objects import Failure, decode_failures, encode_failures, read_failures

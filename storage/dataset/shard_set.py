@@ -24,9 +24,8 @@ from storage.digests import sha256_hex
 from storage.errors import TrilightError
 from storage.records.packed_maps import HeldMaps
 from storage.records.safe_read import open_plain
-from storage.remote.safe_url import printable, safe_text
 from storage.remote.shard_cache import shard_cache
-from storage.remote.url import RemoteUrl, parse_local_path, parse_url
+from storage.remote.url import RemoteUrl, parse_local_path, parse_url, printable, safe_text
 
 MAX_SHARDS = 100_000
 """Maximum number of shards in a list, and of names that one brace pattern expands to."""

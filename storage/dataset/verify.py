@@ -14,8 +14,7 @@ from numpy.typing import NDArray
 
 from storage.dataset.dataset import Dataset, open_dataset, published_manifest
 from storage.dataset.layout import shard_names_in
-from storage.dataset.manifest import Manifest, ShardEntry, Totals, decode_manifest
-from storage.dataset.planned import is_whole
+from storage.dataset.manifest import Manifest, ShardEntry, Totals, decode_manifest, is_whole
 from storage.dataset.shard import ShardReader
 from storage.digests import seal_of, sha256_hex, sha256_of_stream
 from storage.errors import EnvironmentFailure, ShardMissing, TrilightError, Unreadable

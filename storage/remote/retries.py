@@ -7,7 +7,7 @@ from collections.abc import Callable
 from typing import Any, TypeVar
 
 from storage.errors import EnvironmentFailure, TrilightError
-from storage.remote.safe_url import printable, safe_text
+from storage.remote.url import printable, safe_text
 
 Result = TypeVar("Result")
 

@@ -26,7 +26,7 @@ from storage.errors import Rejected, TrilightError
 from storage.records.objects import ObjectRecord
 from storage.records.safe_read import read_plain
 from storage.remote.retries import TransferFailed
-from storage.remote.safe_url import printable, public_text
+from storage.remote.url import printable, public_text
 
 CATALOGUE_NAMES = ("objects.jsonl", "objects.csv")
 

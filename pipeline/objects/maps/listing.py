@@ -24,7 +24,7 @@ from pipeline.objects.local.folder import (
 from pipeline.objects.maps.texture_names import PICTURES, group_textures
 from storage.errors import TrilightError
 from storage.records.objects import SKY, TEXTURE, Failure, ObjectRecord
-from storage.remote.safe_url import printable
+from storage.remote.url import printable
 
 SUFFIXES = {TEXTURE: PICTURES, SKY: (".exr", ".hdr", ".pic")}
 """Suffixes of the files of each kind, compared in lower case."""

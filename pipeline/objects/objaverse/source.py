@@ -23,8 +23,7 @@ from storage.errors import TrilightError
 from storage.records.objects import Failure, ObjectRecord
 from storage.remote.fetch import download
 from storage.remote.retries import TransferFailed
-from storage.remote.safe_url import printable
-from storage.remote.url import RemoteUrl
+from storage.remote.url import RemoteUrl, printable
 
 PREFIX = "objaverse:"
 _CATEGORY = "category/"

@@ -34,8 +34,7 @@ from storage.errors import TrilightError
 from storage.records.objects import ObjectRecord
 from storage.remote.fetch import download, version_of
 from storage.remote.retries import TransferFailed, is_absent, with_tries
-from storage.remote.safe_url import printable, safe_url
-from storage.remote.url import RemoteUrl, shared_driver
+from storage.remote.url import RemoteUrl, printable, safe_url, shared_driver
 from storage.typed_json import read_json
 
 _MAX_NAME_BYTES = 220

@@ -27,8 +27,7 @@ from pipeline.shards.pack_shards import PublishedShards, pack_shard
 from storage.dataset import layout
 from storage.dataset.dataset import Dataset, open_dataset
 from storage.dataset.layout import DatasetFolder
-from storage.dataset.manifest import index_shard, write_manifest
-from storage.dataset.planned import derivation_of
+from storage.dataset.manifest import derivation_of, index_shard, write_manifest
 from storage.dataset.shard import open_shard, write_shard
 from storage.dataset.staging import read_staged_scene
 from storage.dataset.verify import verify_dataset

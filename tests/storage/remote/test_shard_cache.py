@@ -22,9 +22,8 @@ from storage.dataset.verify import verify_dataset
 from storage.errors import TrilightError
 from storage.remote import retries
 from storage.remote.retries import TRIES, Pace, TransferFailed, with_tries
-from storage.remote.safe_url import public_text, safe_text, safe_url
 from storage.remote.shard_cache import ShardCache, shard_cache
-from storage.remote.url import RemoteUrl
+from storage.remote.url import RemoteUrl, public_text, safe_text, safe_url
 from tests.for_each import for_each
 from tests.http_server import Fault, Site
 from tests.storage.remote.cache_readers import BYTES, digest, fetch, read_all, read_one, remote
