@@ -76,7 +76,7 @@ def test_a_claim_that_its_holder_deleted_is_not_shared(tmp_path: Path) -> None:
     with hold_lock(path):
         waiter = threading.Thread(target=wait)
         waiter.start()
-        shutil.rmtree(path.parent)
+        shutil.rmtree(path.parent, ignore_errors=True)  # the waiter may be quicker to write anew
     assert waited.wait(20)  # far more than the milliseconds that it takes; a hang fails
     assert held_together == [False]
 
