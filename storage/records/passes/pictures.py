@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 from storage.conventions import camera_rays
 from storage.errors import TrilightError
 from storage.raycast import FirstHitCaster, SeenFrom, require_row
-from storage.records.exr import channel_names, decode_channels, encode_channels
+from storage.records.exr import decode_channels, encode_channels, read_header
 from storage.records.passes.declared import (
     MOTION,
     UV,
@@ -234,13 +234,14 @@ def decode_passes_exr(data: bytes, resolution: int) -> dict[str, NDArray]:
         TrilightError: not an EXR file, truncated, of another size, or with channels that are no
             whole passes.
     """
-    stored_channels = set(channel_names(data))
+    header = read_header(data)
+    stored_channels = {channel.name for channel in header["channels"]}
     passes = [each for each in declared_passes() if stored_channels >= set(each.exr_channels)]
     names = [channel for each in passes for channel in each.exr_channels]
     if COVERAGE not in {each.name for each in passes}:
         raise TrilightError("passes: channel A (coverage) is missing.")
     size = (resolution, resolution)
-    channels = decode_channels(data, names, size=size, what="passes", separate=True)
+    channels = decode_channels(data, names, header, size=size, what="passes", separate=True)
     nowhere = channels["A"] == 0
     return {each.name: _restore(each, channels, nowhere) for each in passes}
 
