@@ -132,14 +132,6 @@ def count_given_up(folder: DatasetFolder, scene_index: int) -> None:
         stream.write(f"{scene_index}\n")
 
 
-def _scenes_given_up(folder: DatasetFolder, manifest: Manifest) -> int:
-    """Return how many scenes are given up of shards that are not listed, or that grow."""
-    with contextlib.suppress(OSError, ValueError):
-        scenes = set(map(int, folder.staged_given_up.read_text().split()))
-        return len(scenes - listed_scenes(manifest))
-    return 0
-
-
 def tell_views(folder: DatasetFolder, scene_index: int, views: float | None) -> None:
     """Record how many views of an unfinished scene are done; the current one counts in part.
 
@@ -259,8 +251,13 @@ def _count_scenes(
     folder: DatasetFolder | None,
 ) -> _Counts:
     """Return counts with those of scenes; without a folder here, what waits is not known."""
-    given_up = 0 if folder is None else _scenes_given_up(folder, manifest)
-    waiting = 0 if folder is None else _num_waiting(folder)
+    waiting = given_up = 0
+    if folder is not None:
+        walked = os.walk(folder.staged_samples)  # passes over a folder that is removed meanwhile
+        waiting = sum(name.endswith(".tar") for _, _, names in walked for name in names)
+        with contextlib.suppress(OSError, ValueError):  # of shards that are not listed, or grow
+            scenes = set(map(int, folder.staged_given_up.read_text().split()))
+            given_up = len(scenes - listed_scenes(manifest))
     return dataclasses.replace(
         counts,
         scenes_done=sum(expected[name] for name in finished) + waiting - given_up,
@@ -268,11 +265,6 @@ def _count_scenes(
         scenes_planned=manifest.num_scenes,
         num_views=manifest.num_views,
     )
-
-
-def _num_waiting(folder: DatasetFolder) -> int:
-    walked = os.walk(folder.staged_samples)  # passes over a folder that a worker removes meanwhile
-    return sum(name.endswith(".tar") for _, _, names in walked for name in names)
 
 
 LAST_SCENES = 200
