@@ -16,8 +16,7 @@ from storage.cache import cache_folder
 from storage.digests import canonical_json, sha256_hex, sha256_of_file
 from storage.errors import TrilightError
 from storage.file_locks import hold_lock, take_lock
-from storage.remote.fetch import download, facts_of, unreadable, version_of
-from storage.remote.retries import TransferFailed
+from storage.remote.transfers import TransferFailed, download, facts_of, unreadable, version_of
 from storage.remote.url import RemoteUrl
 
 LIMIT_VARIABLE = "TRILIGHT_SHARD_CACHE_GB"

@@ -26,9 +26,17 @@ from storage.atomic import atomic_writer, write_atomically
 from storage.digests import sha256_of_stream
 from storage.errors import EnvironmentFailure, ShardMissing, TrilightError, Unreadable
 from storage.file_locks import hold_lock
-from storage.remote.fetch import download, facts_of, unreadable
-from storage.remote.retries import TransferFailed, is_missing, is_taken, may_pass, with_tries
 from storage.remote.shard_cache import shard_cache
+from storage.remote.transfers import (
+    TransferFailed,
+    download,
+    facts_of,
+    is_missing,
+    is_taken,
+    may_pass,
+    unreadable,
+    with_tries,
+)
 from storage.remote.url import RemoteUrl, shared_driver
 
 WRITABLE = ("s3", "gs")
