@@ -50,7 +50,7 @@ from storage.records.objects import (
     read_objects_lock,
     write_failures,
 )
-from storage.remote.store import Store
+from storage.remote.store import RemoteStore, Store
 from storage.settings.described import from_record, settings_record
 from storage.settings.overrides import differences
 
@@ -453,7 +453,8 @@ def begin_or_resume_dataset(
     with folder.mutex("manifest"):
         if is_new := store.get(folder.manifest.name, 1) is None:
             _require_free(folder, store)
-            store.require_create()
+            if isinstance(store, RemoteStore):
+                store.require_create()
         if not folder.manifest.exists():
             manifest = Manifest(
                 build=settings.build,

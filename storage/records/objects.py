@@ -110,9 +110,8 @@ class Failure:
 
 def failure_of(stage: str, item: str, rejection: Rejected, attempt: int = 0) -> Failure:
     """Return the row of a rejection."""
-    reason = rejection.reason
     return Failure(
-        stage=stage, item=item, reason=reason, message=rejection.message, attempt=attempt
+        stage=stage, item=item, reason=rejection.reason, message=rejection.message, attempt=attempt
     )
 
 

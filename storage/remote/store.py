@@ -122,12 +122,6 @@ class LocalStore:
         """Hold the claim on a file for the block; yield whether it is ours; as `put` raises."""
         return hold_lock(claim_of(self.root / name))
 
-    def require_create(self) -> None:
-        """Raise TrilightError if the store writes a file again that it was to create once.
-
-        A folder does not: storage.atomic sees to it.
-        """
-
     def num_bytes(self, name: str) -> int | None:
         """Return the size of a shard, or None where the server does not state it.
 
@@ -305,6 +299,7 @@ class RemoteStore:
         return path.read_bytes()
 
     def require_create(self) -> None:
+        """Raise TrilightError if the server writes a file again that it was to create once."""
         if self.create_if_absent(_PROBE, b"\n") and self.create_if_absent(_PROBE, b"\n"):
             raise TrilightError(
                 f"{self.url.what} {self.url.display_url!r}: the server does not know conditional "

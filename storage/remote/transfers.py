@@ -8,6 +8,7 @@ import errno
 import secrets
 import time
 from collections.abc import Callable, Mapping
+from dataclasses import dataclass
 from typing import Any, BinaryIO, TypeVar
 
 from storage.errors import EnvironmentFailure, TrilightError, Unreadable
@@ -250,14 +251,14 @@ def download(url: RemoteUrl, stream: BinaryIO, *, num_bytes: int | None, max_byt
     with_tries(lambda: fill(driver, url, stream, expected), pace=pace)
 
 
+@dataclass
 class _Expected:
     """Limits of a download: size, version and pace."""
 
-    def __init__(self, exact: int | None, most: int, pace: Pace) -> None:
-        self.exact = exact
-        self.most = most
-        self.pace = pace
-        self.version: dict[str, str] | None = None
+    exact: int | None
+    most: int
+    pace: Pace
+    version: dict[str, str] | None = None
 
     def require(self, num_bytes: int, *, is_all: bool = True) -> None:
         """Refuse a file that is announced with another size, or is longer than it may be."""

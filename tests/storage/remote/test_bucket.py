@@ -175,8 +175,9 @@ def create_once(made: Store, folder: Path) -> None:
     assert made.list("elsewhere") == set()
     with made.hold_lock("small") as ours:
         assert ours
-    made.require_create()
-    made.require_create()  # what is left of the first time says nothing
+    if isinstance(made, RemoteStore):
+        made.require_create()
+        made.require_create()  # what is left of the first time says nothing
 
 
 def test_a_file_is_created_once(moto: int, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
