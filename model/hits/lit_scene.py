@@ -26,9 +26,9 @@ from storage.optics.multiscatter import (
     scattered_again,
 )
 from storage.raycast import RayCaster, RayHits, Triangles
-from storage.records.environment import Environment, row_solid_angles, texel_means
 from storage.records.lookup import environment_values
 from storage.records.material import EMISSION, ROUGHNESS
+from storage.records.texture import Environment, row_solid_angles, texel_means
 
 if TYPE_CHECKING:
     from model.hits.radiosity import SceneLight

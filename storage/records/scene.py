@@ -18,7 +18,6 @@ from typing import Annotated, Any, Literal
 import numpy as np
 from numpy.typing import NDArray
 
-from storage.records.environment import Environment
 from storage.records.lookup import texture_values
 from storage.records.material import (
     DIFFUSE,
@@ -29,7 +28,7 @@ from storage.records.material import (
     material_width,
 )
 from storage.records.scene_laws import broken_law, require_array, require_law, require_rotations
-from storage.records.texture import CONSTANT, MAX_MAPS_BYTES, TEXTURED, Texture
+from storage.records.texture import CONSTANT, MAX_MAPS_BYTES, TEXTURED, Environment, Texture
 from storage.settings.fields import describe_fields
 from storage.settings.ranges import FLOAT32_MAX, Within
 

@@ -22,9 +22,9 @@ from scene_templates.settings import SceneSettings
 from storage.conventions import alpha_ggx
 from storage.optics.bsdf import MIN_ALPHA, bsdf_lobes
 from storage.optics.multiscatter import scattered_again
-from storage.records.environment import Environment
 from storage.records.material import DIFFUSE, EMISSION, SPECULAR
 from storage.records.scene import Scene
+from storage.records.texture import Environment
 from tests.model.hits.kit import corner, direct, traced
 from tests.oracle.plugin_scene import scaled_albedos
 from tests.pipeline.renders.sampling import (

@@ -27,10 +27,9 @@ from numpy.typing import NDArray
 
 from storage.optics.bsdf import MIN_ALPHA
 from storage.optics.multiscatter import ROUGHNESS_STEPS, X_STEPS, Smith, albedo_table, mean_albedo
-from storage.records.environment import Environment
 from storage.records.material import laid_out
 from storage.records.scene import Scene
-from storage.records.texture import CONSTANT, TEXTURED
+from storage.records.texture import CONSTANT, TEXTURED, Environment
 
 PLUGIN = "compensated_specular"
 """Name in scene dictionaries; it has the textures specular, again (Fms) and alpha."""

@@ -30,10 +30,9 @@ from storage.conventions import linear_from_srgb
 from storage.digests import canonical_json, sha256_hex
 from storage.errors import Rejected
 from storage.optics.bsdf import constant_albedos
-from storage.records.environment import MAX_RADIANCE
 from storage.records.objects import SKY
 from storage.records.safe_read import read_safetensors
-from storage.records.texture import MAX_SIDE, content_digest
+from storage.records.texture import MAX_RADIANCE, MAX_SIDE, content_digest
 
 
 def area_means(values: NDArray, height: int, width: int) -> NDArray[np.float64]:
