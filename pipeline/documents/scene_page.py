@@ -20,8 +20,7 @@ from storage.conventions import preview_gain, preview_srgb8, srgb8
 from storage.raycast import MISS
 from storage.records.material import DIFFUSE
 from storage.records.objects import Failure
-from storage.records.passes.declared import pass_names
-from storage.records.passes.pictures import view_passes
+from storage.records.passes import pass_names, view_passes
 from storage.records.sample import PartFloor, Sample, error_text
 from storage.records.scene import Scene
 from storage.records.scene_facts import cameras, lights, sky_facts, surfaces

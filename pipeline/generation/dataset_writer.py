@@ -31,7 +31,6 @@ from storage.dataset.manifest import (
     write_manifest,
 )
 from storage.dataset.settings import SplitSettings
-from storage.dataset.shard_notes import ShardNote, noted_names, rejections_of_shard
 from storage.dataset.splits import (
     cut_splits,
     planned_scenes,
@@ -39,6 +38,7 @@ from storage.dataset.splits import (
     shard_name,
     shards_for,
 )
+from storage.dataset.staging import ShardNote, noted_names, rejections_of_shard
 from storage.digests import sha256_hex
 from storage.errors import TrilightError
 from storage.extensions import extension_digests, require_same_extensions

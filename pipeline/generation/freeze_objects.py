@@ -355,7 +355,7 @@ class ObjectLock:
             folder.staged_index,
             folder.objects_lock,
             ((each.asset_name, each.least_triangles) for each in by_uid),
-            asked=self._digest,
+            query_sha256=self._digest,
             num_found=num_found,
         )
         self.writer.publish(folder.staged_index)

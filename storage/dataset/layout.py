@@ -127,7 +127,7 @@ class DatasetFolder:
     staged_failures = Below(".staging/failures")
     """Rejections of shards that are packed and not yet noted."""
     staged_entries = Below(".staging/entries")
-    """Notes on shards that the manifest does not list yet (storage.dataset.shard_notes)."""
+    """Notes on shards that the manifest does not list yet (storage.dataset.staging)."""
     staged_samples = Below(".staging/samples")
     """Finished samples of unfinished shards, in a folder for each shard."""
     staged_sent = Below(".staging/sent")

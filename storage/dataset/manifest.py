@@ -6,7 +6,7 @@ The dataset digest is taken over the shards, the object lock and the settings; "
 always means this digest.
 
 While a dataset is made, its manifest is the head alone, a few kilobytes, and each finished shard
-has a note (storage.dataset.shard_notes): no maker reads or writes what the others have made. Who
+has a note (storage.dataset.staging): no maker reads or writes what the others have made. Who
 finds all shards there lists them, once.
 
 The settings of a dataset that is made of finished ones are those that all of its sources agree on,

@@ -30,7 +30,7 @@ from storage.dataset.manifest import (
     planned_shards,
     read_manifest,
 )
-from storage.dataset.shard_notes import name_of_note, noted_names, noted_shard
+from storage.dataset.staging import name_of_note, noted_names, noted_shard
 from storage.errors import TrilightError
 from storage.extensions import is_reference
 from storage.records.objects import Failure, count_by_reason

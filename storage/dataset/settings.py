@@ -8,7 +8,7 @@ import itertools
 from typing import Annotated, ClassVar
 
 from storage.dataset.splits import TEST_SLOT, Split
-from storage.records.passes.declared import pass_names
+from storage.records.passes import pass_names
 from storage.records.profiles import Profile
 from storage.settings.described import checked, leaves_out
 from storage.settings.ranges import Within

@@ -79,7 +79,7 @@ class IndexFacts:
 
 
 def write_object_index(
-    path: Path, lock: Path, assets: Iterable[tuple[str, int]], *, asked: str, num_found: int
+    path: Path, lock: Path, assets: Iterable[tuple[str, int]], *, query_sha256: str, num_found: int
 ) -> None:
     """Write the index of a lock atomically.
 
@@ -88,7 +88,8 @@ def write_object_index(
         lock: the file of the lock.
         assets: of each object of the lock, in its order, the name of the prepared file (32
             hexadecimal digits) and the triangles of the coarsest level.
-        asked, num_found: as in `IndexFacts`.
+        query_sha256: digest of the query to the source.
+        num_found: objects in the source, refused ones included.
 
     Raises:
         TrilightError: the lock cannot be read, or the index cannot be written.
@@ -118,7 +119,7 @@ def write_object_index(
     facts = IndexFacts(
         lock_sha256=sha256_of_file(lock),
         lock_bytes=lock.stat().st_size,
-        asked=asked,
+        asked=query_sha256,
         num_found=num_found,
         num_maps=len(lines) - len(rows),
         camps=tuple(camps),

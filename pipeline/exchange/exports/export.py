@@ -52,7 +52,7 @@ from storage.dataset.shard import ShardReader
 from storage.errors import TrilightError
 from storage.raycast import FirstHitCaster, Surfaces, require_row
 from storage.records.exr import encode_exr
-from storage.records.passes.pictures import passes_exr
+from storage.records.passes import passes_exr
 from storage.records.sample import Sample, sample_key
 from storage.records.scene import Scene
 

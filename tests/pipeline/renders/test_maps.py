@@ -33,7 +33,7 @@ from storage.records.lookup import (
     texture_values,
     u_directions,
 )
-from storage.records.passes.pictures import view_passes
+from storage.records.passes import view_passes
 from storage.records.scene import Scene
 from storage.records.texture import MAX_SIDE, Environment, Texture, row_solid_angles
 from tests.pipeline.renders.sampling import (

@@ -73,7 +73,7 @@ def test_columns_say_what_the_rows_say(tmp_path: Path) -> None:
     path, lock = tmp_path / "index", LockRows(tmp_path / "lock")
     assets = {row.uid: (f"{number:032x}", 7 * number) for number, row in enumerate(rows)}
     by_uid = [assets[uid] for uid in sorted(assets)]
-    write_object_index(path, tmp_path / "lock", by_uid, asked="a", num_found=120)
+    write_object_index(path, tmp_path / "lock", by_uid, query_sha256="a", num_found=120)
     index = ObjectIndex(path)
     facts = index.facts
     assert (facts.num_objects, facts.num_found, facts.num_maps) == (100, 120, 0)
@@ -104,7 +104,7 @@ def test_an_index_that_is_cut_off_says_so(tmp_path: Path) -> None:
     (row,) = _rows(1)
     write_objects_lock(tmp_path / "lock", [row])
     path = tmp_path / "index"
-    write_object_index(path, tmp_path / "lock", [("0" * 32, 1)], asked="", num_found=1)
+    write_object_index(path, tmp_path / "lock", [("0" * 32, 1)], query_sha256="", num_found=1)
     whole = path.read_bytes()
     path.write_bytes(whole[:-24])
     with pytest.raises(TrilightError, match="no index of objects .*delete it"):
