@@ -14,6 +14,7 @@ import json
 from collections import Counter
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
+from operator import itemgetter
 from pathlib import Path
 from typing import Any
 
@@ -22,7 +23,7 @@ from numpy.typing import NDArray
 from safetensors.numpy import save
 
 from storage.atomic import write_atomically
-from storage.digests import sha256_of_file
+from storage.digests import sha256_hex
 from storage.errors import TrilightError
 from storage.licences import share_alike_camp
 from storage.records.objects import OBJECT, LockRows
@@ -94,15 +95,16 @@ def write_object_index(
     Raises:
         TrilightError: the lock cannot be read, or the index cannot be written.
     """
-    lines = list(LockRows(lock))
-    objects = [line for line in lines if line[1].kind == OBJECT]
-    rows = [(row, offset, *asset) for (offset, row), asset in zip(objects, assets, strict=True)]
-    rows.sort(key=lambda line: line[0].split)
-    locked, offsets, names, least_triangles = zip(*rows, strict=True)
+    objects = ((offset, row) for offset, row in LockRows(lock) if row.kind == OBJECT)
+    rows = [
+        (row.split, share_alike_camp(row.licence), offset, *asset)
+        for (offset, row), asset in zip(objects, assets, strict=True)
+    ]
+    rows.sort(key=itemgetter(0))
+    split_names, camp_names, offsets, names, least_triangles = zip(*rows, strict=True)
     least = np.array(least_triangles, "<u4")
-    of_object = [share_alike_camp(row.licence) for row in locked]
-    camps = sorted(set(of_object))
-    camp = np.array([camps.index(name) for name in of_object], "<u2")
+    camps = sorted(set(camp_names))
+    camp = np.array([camps.index(name) for name in camp_names], "<u2")
     arrays: dict[str, NDArray[Any]] = {
         "offset": np.array(offsets, "<u8"),
         "least": least,
@@ -111,17 +113,18 @@ def write_object_index(
     }
     splits = {}
     start = 0
-    for split, count in Counter(row.split for row in locked).items():
+    for split, count in Counter(split_names).items():
         stop = start + count
         sizes = camp_sizes(least[start:stop], camp[start:stop], camps)
         splits[split] = SplitRows(start=start, stop=stop, camps=sizes)
         start = stop
+    data = lock.read_bytes()
     facts = IndexFacts(
-        lock_sha256=sha256_of_file(lock),
-        lock_bytes=lock.stat().st_size,
+        lock_sha256=sha256_hex(data),
+        lock_bytes=len(data),
         asked=query_sha256,
         num_found=num_found,
-        num_maps=len(lines) - len(rows),
+        num_maps=data.count(b"\n") - len(rows),
         camps=tuple(camps),
         splits=splits,
     )

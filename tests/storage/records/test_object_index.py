@@ -69,14 +69,15 @@ def test_a_lock_that_is_none_is_refused(tmp_path: Path) -> None:
 
 def test_columns_say_what_the_rows_say(tmp_path: Path) -> None:
     rows = _rows(100)
-    write_objects_lock(tmp_path / "lock", rows)
+    sky = dataclasses.replace(rows[0], uid="sky", kind="sky")
+    write_objects_lock(tmp_path / "lock", [*rows, sky])
     path, lock = tmp_path / "index", LockRows(tmp_path / "lock")
     assets = {row.uid: (f"{number:032x}", 7 * number) for number, row in enumerate(rows)}
     by_uid = [assets[uid] for uid in sorted(assets)]
     write_object_index(path, tmp_path / "lock", by_uid, query_sha256="a", num_found=120)
     index = ObjectIndex(path)
     facts = index.facts
-    assert (facts.num_objects, facts.num_found, facts.num_maps) == (100, 120, 0)
+    assert (facts.num_objects, facts.num_found, facts.num_maps) == (100, 120, 1)
     data = (tmp_path / "lock").read_bytes()
     assert (facts.lock_sha256, facts.lock_bytes) == (sha256_hex(data), len(data))
     for split in ("train", "validation", "test"):
