@@ -39,7 +39,7 @@ from storage.dataset.training_data import TrainingData, open_training_data
 from storage.digests import sha256_hex
 from storage.errors import TrilightError
 from storage.machine import processor
-from storage.records.safe_read import read_plain
+from storage.records.safe_read import name_unreadable, read_plain
 from storage.records.sample import Sample
 from storage.renderer import Renderer
 from storage.typed_json import read_json
@@ -534,12 +534,10 @@ def picture_folder(folder: Path, views: Views, widths: Sequence[int]) -> Picture
 
 def _read_picture(path: Path, widths: Sequence[int]) -> tuple[bytes, NDArray[np.float32]]:
     """Return a file, and the radiance [R, R, 3] in it, whose width is one of `widths`."""
-    try:
+    with name_unreadable(path.name):
         if path.stat().st_size > MAX_BYTES:
             raise TrilightError(f"{path.name}: expected a picture of at most {MAX_BYTES} bytes.")
         data = read_plain(path)
-    except OSError as error:
-        raise TrilightError(f"{path.name}: cannot be read ({error.strerror}).") from error
     pixels = decode_pixels(data, path.name, [])
     if pixels is None or pixels.dtype != np.float32 or pixels.shape[2] < 3:
         raise TrilightError(

@@ -25,9 +25,9 @@ from model.hits.textures import SurfaceTextures, surface_textures
 from model.hits.traced import Traced, stack_traced
 from storage.conventions import log10_radiance
 from storage.errors import TrilightError
-from storage.records.environment import Environment
 from storage.records.material import PUBLISHED_COLUMNS, chosen_columns, column_places, laid_out
 from storage.records.scene import Scene
+from storage.records.texture import Environment
 
 if TYPE_CHECKING:  # it loads pydantic
     from model.config import ModelConfig

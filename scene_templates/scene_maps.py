@@ -23,8 +23,7 @@ from scene_templates.skies.procedural_skies import SkySettings, draw_sky
 from scene_templates.surfaces.maps import SurfaceMaps
 from scene_templates.surfaces.procedural_textures import SurfaceMapSettings, draw_surface
 from storage.licences import mixed_share_alike
-from storage.records.environment import Environment
-from storage.records.texture import MapSource
+from storage.records.texture import Environment, MapSource
 from storage.seeds import SceneKey, rng_for
 from storage.settings.described import checked
 from storage.settings.ranges import Share, Within

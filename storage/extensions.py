@@ -39,7 +39,7 @@ class Extension:
     module: ModuleType
     decides: set[Decided] = field(default_factory=set)
     """Results that depend on the tables to which it added entries."""
-    undo: list[Callable[[], None]] = field(default_factory=list)
+    undo: list[Callable[[], object]] = field(default_factory=list)
     """Takes back each entry that it has registered."""
 
     @property

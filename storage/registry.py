@@ -79,7 +79,7 @@ class Registry(Mapping[str, Entry], Generic[Entry]):
         if extension:
             self._origins[name] = extension
             extension.decides.update(self._decides)
-            extension.undo.append(lambda: self._remove(name))
+            extension.undo.append(lambda: (self._entries.pop(name), self._origins.pop(name)))
 
     def resolve(self, reference: str, as_entry: Callable[[Any], Entry]) -> str:
         """Return the name of an entry that was typed on a command line.
@@ -115,9 +115,6 @@ class Registry(Mapping[str, Entry], Generic[Entry]):
     def is_ours(self, name: str) -> bool:
         """Return whether an entry comes with Trilight, and from no extension."""
         return name in self and name not in self._origins
-
-    def _remove(self, name: str) -> None:
-        del self._entries[name], self._origins[name]
 
     def __getitem__(self, name: str) -> Entry:
         return self._entries[self._aliases.get(name, name)]

@@ -5,7 +5,7 @@ from typing import Any
 import numpy as np
 
 from storage.conventions import latlong_direction
-from storage.records.environment import Environment
+from storage.records.texture import Environment
 
 POLES = {"+X": (1, 0, 0), "-X": (-1, 0, 0), "+Y": (0, 1, 0), "-Y": (0, -1, 0), "+Z": (0, 0, 1),
          "-Z": (0, 0, -1)}  # fmt: skip

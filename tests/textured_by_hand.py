@@ -6,10 +6,9 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from storage.records.environment import Environment
 from storage.records.sample import Sample
 from storage.records.scene import Scene
-from storage.records.texture import MapSource, Texture
+from storage.records.texture import Environment, MapSource, Texture
 from tests.scenes_by_hand import FLOOR, tiny_sample, tiny_scene
 
 

@@ -18,7 +18,7 @@ from model.renderformer import RenderFormer, count_parameters
 from model.scene_tensors import lit_sky, require_known_sky
 from model.weights import TrainedRange, decode_config, encode_weights
 from storage.atomic import write_atomically
-from storage.dataset.training_data import TrainingData, open_mixture
+from storage.dataset.training_data import TrainingData, open_training_data
 from storage.digests import sha256_hex
 from storage.errors import TrilightError
 from storage.extensions import extension_digests
@@ -198,7 +198,7 @@ def _train(
 ) -> TrainResult | None:
     """Train and evaluate in a folder that is locked; arguments as in `run_training`."""
     began = time.monotonic()
-    dataset = open_mixture(data)
+    dataset = open_training_data(data, may_mix=True)
     notes: list[str] = []
 
     def note(text: str) -> None:

@@ -35,9 +35,9 @@ if TYPE_CHECKING:
     from storage.errors import TrilightError as TrilightError
     from storage.raycast import FirstHits as FirstHits
     from storage.raycast import first_hits as first_hits
-    from storage.records.passes.declared import Pass as Pass
-    from storage.records.passes.declared import declared_passes as declared_passes
-    from storage.records.passes.pictures import view_passes as view_passes
+    from storage.records.passes import Pass as Pass
+    from storage.records.passes import declared_passes as declared_passes
+    from storage.records.passes import view_passes as view_passes
     from storage.records.sample import Sample as Sample
     from storage.records.scene import Scene as Scene
     from storage.records.scene import SceneObject as SceneObject

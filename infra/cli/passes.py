@@ -10,8 +10,7 @@ from infra.cli.options import command
 from pipeline.renders.mitsuba_variant import Device, activate, choose_gpu
 from storage.raycast import FirstHitCaster, Surfaces
 from storage.records.exr import MAX_RESOLUTION
-from storage.records.passes.declared import pass_names
-from storage.records.passes.pictures import MOST_A_SIDE
+from storage.records.passes import MOST_A_SIDE, pass_names
 from storage.records.scene import Scene
 from storage.settings.described import checked
 from storage.settings.ranges import Within

@@ -32,7 +32,7 @@ from scene_templates.surfaces.procedural_textures import OUR_SURFACES, SURFACES,
 from scene_templates.surfaces.texels import Texels
 from storage.markdown import table
 from storage.records.material import PUBLISHED_COLUMNS, laid_out
-from storage.records.passes.declared import MOTION, declared_passes
+from storage.records.passes import MOTION, declared_passes
 from storage.records.quantities import QUANTITIES
 from storage.records.scene import Scene
 from storage.seeds import rng_for
@@ -219,7 +219,7 @@ def _first_sentence(doc: str) -> str:
 
 _PASSES = """# Passes: what a pixel sees
 
-Made from the table in `storage/records/passes/declared.py`. Passes are functions
+Made from the table in `storage/records/passes.py`. Passes are functions
 of a stored scene and a camera, so that they need not be stored: `trilight.view_passes(scene)`
 returns them as arrays, with row 0 on top, in the conventions of [Formats](formats.md).
 

@@ -29,8 +29,7 @@ from pipeline.renders.preview import PreviewSettings, usual_filter
 from pipeline.renders.settings import RenderSettings
 from storage.errors import TrilightError, Unrenderable
 from storage.metrics import psnr_log_db
-from storage.records.passes.declared import pass_names
-from storage.records.passes.pictures import view_passes
+from storage.records.passes import pass_names, view_passes
 from storage.records.scene import Scene
 from storage.renderer import Camera, Image, ReadyScene, Renderer, Sampling
 

@@ -18,17 +18,11 @@ from model.hits.device_rays import DeviceTriangles, compiled_kernel
 from model.hits.textures import DeviceTextures, SurfaceTextures
 from model.hits.vectors import Floats, as_rows, at_rows, brightest, dot, tangents, unit
 from storage.conventions import latlong_uv
-from storage.optics.bsdf import bsdf_lobes
-from storage.optics.multiscatter import (
-    ROUGHNESS_STEPS,
-    X_STEPS,
-    albedo_table,
-    scattered_again,
-)
+from storage.optics import ROUGHNESS_STEPS, X_STEPS, albedo_table, bsdf_lobes, scattered_again
 from storage.raycast import RayCaster, RayHits, Triangles
-from storage.records.environment import Environment, row_solid_angles, texel_means
 from storage.records.lookup import environment_values
 from storage.records.material import EMISSION, ROUGHNESS
+from storage.records.texture import Environment, row_solid_angles, texel_means
 
 if TYPE_CHECKING:
     from model.hits.radiosity import SceneLight
@@ -80,7 +74,7 @@ class Reflectance(PerPoint):
     alpha: Floats
     """[N] GGX width, above 0 and at most 1."""
     multiscatter: Floats
-    """[3, N] Fms of storage.optics.multiscatter."""
+    """[3, N] Fms of storage.optics."""
     roughness: Floats
     """[N] roughness of the material, 0 to 1."""
 

@@ -18,15 +18,13 @@ from PIL import Image
 from pipeline.documents.pages import Figure, png_uri, render_page
 from storage.conventions import preview_gain, preview_srgb8, srgb8
 from storage.raycast import MISS
-from storage.records.environment import Environment
 from storage.records.material import DIFFUSE
 from storage.records.objects import Failure
-from storage.records.passes.declared import pass_names
-from storage.records.passes.pictures import view_passes
+from storage.records.passes import pass_names, view_passes
 from storage.records.sample import PartFloor, Sample, error_text
 from storage.records.scene import Scene
 from storage.records.scene_facts import cameras, lights, sky_facts, surfaces
-from storage.records.texture import NORMAL, TEXTURED, MapSource, Texture
+from storage.records.texture import NORMAL, TEXTURED, Environment, MapSource, Texture
 
 PREVIEW_PX = 96
 

@@ -63,7 +63,6 @@ from pipeline.exchange.textured_triangles import (
 from pipeline.objects.licences import UNKNOWN
 from storage.atomic import write_atomically
 from storage.errors import TrilightError
-from storage.records.environment import Environment
 from storage.records.exr import MAX_RESOLUTION, to_half
 from storage.records.lookup import texture_values
 from storage.records.material import (
@@ -83,7 +82,7 @@ from storage.records.scene import (
     Scene,
     SceneObject,
 )
-from storage.records.texture import CONSTANT, MapSource, Texture
+from storage.records.texture import CONSTANT, Environment, MapSource, Texture
 
 CHANNELS = 13
 CELLS = 32

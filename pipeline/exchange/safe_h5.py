@@ -18,7 +18,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from storage.errors import TrilightError
-from storage.records.safe_read import open_plain
+from storage.records.safe_read import name_unreadable, open_plain
 
 MAX_BLOCK_BYTES = 64 << 20
 """Maximum bytes of one block of an array."""
@@ -40,10 +40,8 @@ def open_h5(path: Path) -> Iterator[Any]:
     """
     import h5py  # slow to import, and rarely needed
 
-    try:
+    with name_unreadable(path.name):
         open_plain(path).close()
-    except OSError as error:
-        raise TrilightError(f"{path.name}: cannot be read ({error.strerror}).") from error
     try:
         with h5py.File(path, "r", locking=False) as file:
             yield file

@@ -25,7 +25,7 @@ from pipeline.exchange.renderformer_json import MAX_BYTES, read_cameras, read_re
 from pipeline.foreign.material_files import find_in_any_case
 from storage.digests import sha256_hex
 from storage.errors import EnvironmentFailure, Rejected, TrilightError
-from storage.records.safe_read import open_plain
+from storage.records.safe_read import name_unreadable, open_plain
 from storage.records.scene import Scene
 
 TEMPLATE = "renderformer-json"
@@ -233,11 +233,8 @@ def load_mesh_file(
 
 def _read_scene_file(root: Path, name: str) -> bytes:
     """Return the bytes of a scene file, as many as its reader accepts and one more."""
-    try:
-        with open_plain(_below(root, name, name)) as stream:
-            return stream.read(MAX_BYTES + 1)
-    except OSError as error:
-        raise TrilightError(f"{name}: cannot be read ({error.strerror}).") from error
+    with name_unreadable(name), open_plain(_below(root, name, name)) as stream:
+        return stream.read(MAX_BYTES + 1)
 
 
 def _below(root: Path, relative: str, where: str) -> Path:

@@ -19,12 +19,11 @@ from pipeline.scenes.pieces import ScenePiece, concatenate_pieces
 from pipeline.scenes.shading_normals import ShadedMesh, flat_shaded
 from storage.conventions import linear_from_srgb8, look_at_c2w, srgb8
 from storage.errors import TrilightError, prefix_errors
-from storage.records.environment import Environment
 from storage.records.lookup import texture_values
 from storage.records.material import EMISSION, ROUGHNESS, default_rows, distinct_rows
 from storage.records.retextured import with_textures, without_constant_textures
 from storage.records.scene import ObjectKind, Scene, SceneObject
-from storage.records.texture import CONSTANT, NORMAL, TEXTURED, MapSource, Texture
+from storage.records.texture import CONSTANT, NORMAL, TEXTURED, Environment, MapSource, Texture
 
 Map = NDArray[np.float32]
 """Linear values [H, W, C] of a texture, the bottom row first; a constant is one texel.

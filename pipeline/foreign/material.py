@@ -1,6 +1,6 @@
 """`SourceMaterial`: a material as its file states it, and its conversion to Trilight's columns.
 
-The Fresnel term becomes albedos that are the same at every angle (storage.optics.bsdf).
+The Fresnel term becomes albedos that are the same at every angle (storage.optics).
 """
 
 from collections.abc import Mapping, Sequence
@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from pipeline.foreign.mesh import TriangleMesh
 from pipeline.foreign.picture import Picture
-from storage.optics.bsdf import constant_albedos
+from storage.optics import constant_albedos
 
 RGB = tuple[float, float, float]
 

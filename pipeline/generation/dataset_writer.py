@@ -31,7 +31,6 @@ from storage.dataset.manifest import (
     write_manifest,
 )
 from storage.dataset.settings import SplitSettings
-from storage.dataset.shard_notes import ShardNote, noted_names, rejections_of_shard
 from storage.dataset.splits import (
     cut_splits,
     planned_scenes,
@@ -39,6 +38,7 @@ from storage.dataset.splits import (
     shard_name,
     shards_for,
 )
+from storage.dataset.staging import ShardNote, noted_names, rejections_of_shard
 from storage.digests import sha256_hex
 from storage.errors import TrilightError
 from storage.extensions import extension_digests, require_same_extensions
@@ -50,7 +50,7 @@ from storage.records.objects import (
     read_objects_lock,
     write_failures,
 )
-from storage.remote.store import Store
+from storage.remote.store import RemoteStore, Store
 from storage.settings.described import from_record, settings_record
 from storage.settings.overrides import differences
 
@@ -453,7 +453,8 @@ def begin_or_resume_dataset(
     with folder.mutex("manifest"):
         if is_new := store.get(folder.manifest.name, 1) is None:
             _require_free(folder, store)
-            store.require_create()
+            if isinstance(store, RemoteStore):
+                store.require_create()
         if not folder.manifest.exists():
             manifest = Manifest(
                 build=settings.build,

@@ -43,7 +43,7 @@ from storage.dataset.splits import require_objects, split_of_object, split_of_sh
 from storage.digests import canonical_json, sha256_hex
 from storage.errors import EnvironmentFailure, Rejected, TrilightError
 from storage.machine import available_cores
-from storage.records.object_index import IndexedObject, IndexFacts, ObjectIndex, write_object_index
+from storage.records.object_index import ObjectIndex, write_object_index
 from storage.records.objects import (
     OBJECT,
     TEXTURE,
@@ -54,7 +54,6 @@ from storage.records.objects import (
     count_by_reason,
     failure_of,
 )
-from storage.records.safe_read import open_plain
 from storage.remote.url import printable, safe_url
 
 log = logging.getLogger("trilight.objects")
@@ -219,7 +218,7 @@ class ObjectLock:
             writer.lock_objects(locked)
         else:
             require_same(display_name, frozen, locked)
-        self._write_index(locked, prepared, num_found)
+        self._write_index(prepared, num_found)
         return self._frozen_inputs(len(objects), num_found, maps.rows)
 
     def _warn(self, prepared: list[PreparedObject], transient: list[Failure]) -> None:
@@ -348,35 +347,17 @@ class ObjectLock:
             retry_transient=retry_transient,
         )
 
-    def _write_index(
-        self, locked: list[LockedObject], prepared: list[PreparedObject], num_found: int
-    ) -> None:
+    def _write_index(self, prepared: list[PreparedObject], num_found: int) -> None:
         """Write the index of the lock, by which later workers load it without opening objects."""
-        assets = {asset.record.uid: asset for asset in prepared}
         folder = self.writer.folder
-        objects = list[IndexedObject]()
-        offset = 0
-        with open_plain(folder.objects_lock) as lines:
-            for line, entry in zip(lines, sorted(locked, key=attrgetter("uid")), strict=True):
-                if entry.kind == OBJECT:
-                    asset = assets[entry.uid]
-                    objects.append(
-                        IndexedObject(
-                            locked=entry,
-                            offset=offset,
-                            asset_name=asset.asset_name,
-                            least_triangles=asset.least_triangles,
-                        )
-                    )
-                offset += len(line)
-        facts = IndexFacts(
-            lock_sha256=self.writer.manifest.objects_lock_sha256,
-            lock_bytes=offset,
-            asked=self._digest,
+        by_uid = sorted(prepared, key=attrgetter("record.uid"))
+        write_object_index(
+            folder.staged_index,
+            folder.objects_lock,
+            ((each.asset_name, each.least_triangles) for each in by_uid),
+            query_sha256=self._digest,
             num_found=num_found,
-            num_maps=len(locked) - len(objects),
         )
-        write_object_index(folder.staged_index, objects, facts)
         self.writer.publish(folder.staged_index)
 
 

@@ -45,7 +45,7 @@ from storage.errors import Rejected, TrilightError
 from storage.records.asset import decode_asset
 from storage.records.object_index import ObjectIndex
 from storage.records.objects import SKY, TEXTURE, Failure, LockedObject, LockRows, failure_of
-from storage.records.passes.pictures import passes_exr
+from storage.records.passes import passes_exr
 from storage.records.sample import PartFloor, Sample, ViewRecord, sample_key
 from storage.records.scene import Scene
 from storage.records.texture import MapSource

@@ -8,7 +8,7 @@ from pathlib import Path
 
 from pipeline.foreign.limits import SUFFIXES
 from storage.records.objects import Failure, ObjectRecord
-from storage.remote.retries import TransferFailed
+from storage.remote.transfers import TransferFailed
 from storage.remote.url import printable
 
 Fetched = tuple[list[ObjectRecord], list[Failure]]

@@ -3,7 +3,7 @@
     f = diffuse / pi + scale * specular * D * G2 / (4 cos_i cos_o)
 
 D is that of GGX and G2 the height-correlated Smith term (Heitz 2014), alpha = roughness^2; the
-scale gives back what single scattering loses (storage.optics.multiscatter). This is the material
+scale gives back what single scattering loses (storage.optics). This is the material
 of Cycles with its "Multiscatter GGX" and a constant colour, and Mitsuba's `diffuse` and
 `roughconductor` together, but for Fresnel. The diffuse lobe is reciprocal, the
 specular one is not, because its scale depends on the viewer's side alone: a path from a light must
@@ -18,7 +18,7 @@ import mitsuba as mi
 import numpy as np
 
 from pipeline.renders.device_memory import own_floats
-from storage.optics.multiscatter import ROUGHNESS_STEPS, X_STEPS, albedo_table
+from storage.optics import ROUGHNESS_STEPS, X_STEPS, albedo_table
 
 INV_PI = 0.3183098861837907
 
@@ -36,11 +36,11 @@ class KernelLobes:
     weight: Any
     """Probability of the specular lobe in a sample, Float."""
     multiscatter: Any
-    """Multiple-scattering factor Fms (storage.optics.multiscatter), Color3f."""
+    """Multiple-scattering factor Fms (storage.optics), Color3f."""
 
 
 class AlbedoLookup:
-    """The table of storage.optics.multiscatter, for kernels.
+    """The table of storage.optics, for kernels.
 
     An entry holds its three upper neighbours too, so that a lane loads all four at once.
     """

@@ -23,9 +23,9 @@ from numpy.typing import NDArray
 from pipeline.renders.device_memory import opaque_vector, own_floats
 from pipeline.renders.surface_table import SurfacePoint
 from storage.errors import Rejected
-from storage.records.environment import Environment, row_solid_angles, texel_means
 from storage.records.material import EMISSION
 from storage.records.scene import Scene
+from storage.records.texture import Environment, row_solid_angles, texel_means
 
 ONE_MINUS_EPSILON = 0.99999994
 

@@ -15,8 +15,7 @@ from numpy.typing import NDArray
 
 from pipeline.renders.device_memory import own_floats, own_integers
 from pipeline.renders.ggx import KernelLobes
-from storage.optics.bsdf import MIN_ALPHA, bsdf_lobes
-from storage.optics.multiscatter import ROUGHNESS_STEPS, mean_albedo, scattered_again
+from storage.optics import MIN_ALPHA, ROUGHNESS_STEPS, bsdf_lobes, mean_albedo, scattered_again
 from storage.records.lookup import LEAST_TANGENT_SQ, LEAST_Z, u_directions
 from storage.records.scene import Scene
 from storage.records.texture import TEXTURED, Texture
@@ -231,7 +230,7 @@ class KernelTextures:
         )
 
     def _scattered_again(self, specular: Any, alpha: Any, active: Any) -> Any:
-        """Return Fms (Color3f) of storage.optics.multiscatter."""
+        """Return Fms (Color3f) of storage.optics."""
         place = dr.sqrt(alpha) * (ROUGHNESS_STEPS - 1)
         row = dr.minimum(mi.UInt32(place), ROUGHNESS_STEPS - 2)
         low = dr.gather(mi.Float, self._mean_albedo, row, active)

@@ -51,18 +51,20 @@ from storage.dataset.manifest import (
 from storage.dataset.progress import count_given_up, log_name, log_scene
 from storage.dataset.settings import MOST_SCENES, SplitSettings
 from storage.dataset.shard import ShardReader, write_shard
-from storage.dataset.shard_notes import (
+from storage.dataset.splits import cut_splits, scenes_of_shard, shard_name, split_of_shard
+from storage.dataset.staging import (
     ShardNote,
     encode_note,
     fetch_notes,
+    is_staged,
     name_of_note,
     note_of,
     note_shard,
     noted_shard,
+    read_staged_scene,
     rejections_of_shard,
+    stage_members,
 )
-from storage.dataset.splits import cut_splits, scenes_of_shard, shard_name, split_of_shard
-from storage.dataset.staging import is_staged, read_staged_scene, stage_members
 from storage.digests import sha256_hex, sha256_of_file
 from storage.errors import EnvironmentFailure, ShardMissing, TrilightError
 from storage.file_locks import hold_lock, is_locked

@@ -227,7 +227,7 @@ def open_dataset(url: str) -> Dataset:
     if not may_be_growing:
         return dataset
     # slow, and not needed to stream a whole set
-    from storage.dataset.shard_notes import with_unlisted
+    from storage.dataset.staging import with_unlisted
 
     return with_unlisted(dataset)
 

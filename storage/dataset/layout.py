@@ -50,8 +50,10 @@ def shard_names_in(root: Path, suffix: str = "") -> Iterator[str]:
         root: the folder.
         suffix: what such files have after the name of their shard.
     """
-    for part in _parts_in(root):
-        yield from shard_names_in_part(root, part, suffix)
+    with contextlib.suppress(FileNotFoundError):
+        matches = (_PART.fullmatch(name) for name in os.listdir(root))
+        for part in (0, *sorted(int(match[1]) for match in matches if match)):
+            yield from shard_names_in_part(root, part, suffix)
 
 
 def shard_names_in_part(root: Path, part: int, suffix: str = "") -> Iterator[str]:
@@ -80,13 +82,6 @@ def in_parts(numbers: range) -> Iterator[range]:
 def place_of_part(part: int) -> str:
     """Return the relative path of a part of a folder, with its slash; empty for the first."""
     return numbered_path(part * FILES_PER_FOLDER, "")
-
-
-def _parts_in(root: Path) -> list[int]:
-    with contextlib.suppress(FileNotFoundError):
-        matches = (_PART.fullmatch(name) for name in os.listdir(root))
-        return [0, *sorted(int(match[1]) for match in matches if match)]
-    return []
 
 
 class Below:
@@ -132,7 +127,7 @@ class DatasetFolder:
     staged_failures = Below(".staging/failures")
     """Rejections of shards that are packed and not yet noted."""
     staged_entries = Below(".staging/entries")
-    """Notes on shards that the manifest does not list yet (storage.dataset.shard_notes)."""
+    """Notes on shards that the manifest does not list yet (storage.dataset.staging)."""
     staged_samples = Below(".staging/samples")
     """Finished samples of unfinished shards, in a folder for each shard."""
     staged_sent = Below(".staging/sent")

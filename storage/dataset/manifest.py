@@ -6,7 +6,7 @@ The dataset digest is taken over the shards, the object lock and the settings; "
 always means this digest.
 
 While a dataset is made, its manifest is the head alone, a few kilobytes, and each finished shard
-has a note (storage.dataset.shard_notes): no maker reads or writes what the others have made. Who
+has a note (storage.dataset.staging): no maker reads or writes what the others have made. Who
 finds all shards there lists them, once.
 
 The settings of a dataset that is made of finished ones are those that all of its sources agree on,
@@ -29,7 +29,7 @@ from storage.atomic import atomic_writer
 from storage.conventions import MANIFEST_VERSION, READABLE_MANIFESTS, SPLITS
 from storage.dataset.layout import numbered_path
 from storage.dataset.shard import scan_samples
-from storage.dataset.splits import cut_splits, scenes_of_shard, shard_name, shards_for
+from storage.dataset.splits import Split, cut_splits, scenes_of_shard, shard_name, shards_for
 from storage.digests import canonical_json, sha256_hex, sha256_of_stream
 from storage.errors import TrilightError, prefix_errors
 from storage.records.safe_read import open_plain
@@ -64,7 +64,7 @@ class ShardEntry:
     name: ShardName
     """File name next to the manifest, or in one of the parts of its folder
     (storage.dataset.layout)."""
-    split: Annotated[str, Spelled("|".join(SPLITS), "train, validation or test")]
+    split: Split
     """train, validation or test."""
     num_samples: Scenes
     num_bytes: Bytes

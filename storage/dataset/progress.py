@@ -30,7 +30,7 @@ from storage.dataset.manifest import (
     planned_shards,
     read_manifest,
 )
-from storage.dataset.shard_notes import name_of_note, noted_names, noted_shard
+from storage.dataset.staging import name_of_note, noted_names, noted_shard
 from storage.errors import TrilightError
 from storage.extensions import is_reference
 from storage.records.objects import Failure, count_by_reason
@@ -130,14 +130,6 @@ def count_given_up(folder: DatasetFolder, scene_index: int) -> None:
     """Record that a scene is given up; it only shows progress, so failing to write is no error."""
     with contextlib.suppress(OSError), folder.staged_given_up.open("a") as stream:
         stream.write(f"{scene_index}\n")
-
-
-def _scenes_given_up(folder: DatasetFolder, manifest: Manifest) -> int:
-    """Return how many scenes are given up of shards that are not listed, or that grow."""
-    with contextlib.suppress(OSError, ValueError):
-        scenes = set(map(int, folder.staged_given_up.read_text().split()))
-        return len(scenes - listed_scenes(manifest))
-    return 0
 
 
 def tell_views(folder: DatasetFolder, scene_index: int, views: float | None) -> None:
@@ -259,8 +251,13 @@ def _count_scenes(
     folder: DatasetFolder | None,
 ) -> _Counts:
     """Return counts with those of scenes; without a folder here, what waits is not known."""
-    given_up = 0 if folder is None else _scenes_given_up(folder, manifest)
-    waiting = 0 if folder is None else _num_waiting(folder)
+    waiting = given_up = 0
+    if folder is not None:
+        walked = os.walk(folder.staged_samples)  # passes over a folder that is removed meanwhile
+        waiting = sum(name.endswith(".tar") for _, _, names in walked for name in names)
+        with contextlib.suppress(OSError, ValueError):  # of shards that are not listed, or grow
+            scenes = set(map(int, folder.staged_given_up.read_text().split()))
+            given_up = len(scenes - listed_scenes(manifest))
     return dataclasses.replace(
         counts,
         scenes_done=sum(expected[name] for name in finished) + waiting - given_up,
@@ -268,11 +265,6 @@ def _count_scenes(
         scenes_planned=manifest.num_scenes,
         num_views=manifest.num_views,
     )
-
-
-def _num_waiting(folder: DatasetFolder) -> int:
-    walked = os.walk(folder.staged_samples)  # passes over a folder that a worker removes meanwhile
-    return sum(name.endswith(".tar") for _, _, names in walked for name in names)
 
 
 LAST_SCENES = 200

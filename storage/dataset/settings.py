@@ -7,10 +7,8 @@ import functools
 import itertools
 from typing import Annotated, ClassVar
 
-from storage.conventions import SPLITS
-from storage.dataset.splits import TEST_SLOT
-from storage.errors import TrilightError, expected_one_of
-from storage.records.passes.declared import pass_names
+from storage.dataset.splits import TEST_SLOT, Split
+from storage.records.passes import pass_names
 from storage.records.profiles import Profile
 from storage.settings.described import checked, leaves_out
 from storage.settings.ranges import Within
@@ -23,14 +21,10 @@ MOST_SCENES = 1_000_000_000
 class ListedShard:
     """One shard of a dataset whose shards are those of another."""
 
-    split: str
+    split: Split
     """Its split: train, validation or test."""
     scenes: Annotated[int, Within(1, MOST_SCENES, unit="scenes")]
     """Number of its scenes."""
-
-    def __post_init__(self) -> None:
-        if self.split not in SPLITS:
-            raise TrilightError(f"split is {self.split!r}; {expected_one_of(self.split, SPLITS)}.")
 
 
 @checked()

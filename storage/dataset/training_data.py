@@ -75,26 +75,39 @@ class TrainingData:
         return self.splits[name]
 
 
-def open_training_data(data: Sequence[str]) -> TrainingData:
+def open_training_data(data: Sequence[str], *, may_mix: bool = False) -> TrainingData:
     """Open what `--data` names.
 
     Args:
         data: one root of a dataset, or any number of paths, URLs and brace patterns that end in
             `.tar`.
+        may_mix: several roots are allowed too, each of them with a train split.
 
     Raises:
-        TrilightError: nothing is named, roots and shards are mixed, a URL is refused, or there is
-            no readable manifest. That no key is in two shards of a dataset, `trilight verify` says.
+        TrilightError: nothing is named, roots and shards are mixed, a dataset is there twice, a URL
+            is refused, or there is no readable manifest. That no key is in two shards of a dataset,
+            `trilight verify` says.
     """
     shards = [text for text in data if is_shards(text)]
     if shards and len(shards) == len(data):
         return _of_list(shards)
-    if len(data) != 1:
+    is_mixed = may_mix and len(data) > 1 and not shards
+    if len(data) != 1 and not is_mixed:
         raise TrilightError(
             f"data: {len(data)} places of which {len(shards)} are shards; expected one dataset, or "
             "shards only (each ends in .tar)."
         )
-    return _of_datasets([open_dataset(data[0])])
+    datasets: dict[str, Dataset] = {}
+    for dataset in map(open_dataset, data):
+        before = datasets.setdefault(dataset.digest, dataset)
+        if before is not dataset:
+            raise TrilightError(
+                f"data: {dataset.display_name} holds the same dataset as {before.display_name}; "
+                "expected each once. How often its scenes are drawn, data_weights says."
+            )
+        if is_mixed:
+            _of_datasets([dataset]).split("train")
+    return _of_datasets([*datasets.values()])
 
 
 def is_shards(text: str) -> bool:
@@ -105,29 +118,6 @@ def is_shards(text: str) -> bool:
 
 MIXED = "mix:"
 """Begins the digest of several datasets."""
-
-
-def open_mixture(data: Sequence[str]) -> TrainingData:
-    """Open what `--data` names where it may be more than one dataset.
-
-    Args:
-        data: roots of datasets, or any number of shards as `open_training_data` takes them.
-
-    Raises:
-        TrilightError: as `open_training_data`; a dataset is there twice, or shards beside datasets.
-    """
-    if len(data) < 2 or any(is_shards(text) for text in data):
-        return open_training_data(data)
-    datasets: dict[str, Dataset] = {}
-    for dataset in map(open_dataset, data):
-        before = datasets.setdefault(dataset.digest, dataset)
-        if before is not dataset:
-            raise TrilightError(
-                f"data: {dataset.display_name} holds the same dataset as {before.display_name}; "
-                "expected each once. How often its scenes are drawn, data_weights says."
-            )
-        _of_datasets([dataset]).split("train")
-    return _of_datasets([*datasets.values()])
 
 
 def _of_datasets(datasets: Sequence[Dataset]) -> TrainingData:

@@ -23,12 +23,11 @@ from storage.machine import available_cores
 from storage.records.lights import part_names, sum_of_lights, sum_of_parts
 from storage.records.objects import LockedObject, locked_uids
 from storage.records.packed_maps import HeldMaps
-from storage.records.passes.pictures import decode_passes_exr, passes_in_file, picture_passes
+from storage.records.passes import decode_passes_exr, passes_in_file, picture_passes
 from storage.records.sample import Sample, decode_sample
 from storage.records.scene import Scene
-from storage.remote.fetch import download
-from storage.remote.retries import TransferFailed
 from storage.remote.store import RemoteStore
+from storage.remote.transfers import TransferFailed, download
 from storage.typed_json import read_json_lines
 
 REMOTE_THREADS = 8

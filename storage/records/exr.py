@@ -123,15 +123,6 @@ def encode_channels(
     return stream.getvalue()
 
 
-def channel_names(data: bytes) -> list[str]:
-    """Return the names of the channels of an OpenEXR file of one part; reads no pixel.
-
-    Raises:
-        TrilightError: not an EXR file, truncated, or of several parts.
-    """
-    return [str(channel.name) for channel in read_header(data)["channels"]]
-
-
 def decode_exr(data: bytes) -> NDArray[np.float32]:
     """Return the picture of an OpenEXR file as float32 [H, W, 3]; raises as `decode_channels`.
 
@@ -205,7 +196,11 @@ def decode_channels(
 
 
 def read_header(data: bytes) -> Header:
-    """Return the header of an OpenEXR file of one part; raises TrilightError as `channel_names`."""
+    """Return the header of an OpenEXR file of one part; reads no pixel.
+
+    Raises:
+        TrilightError: not an EXR file, truncated, or of several parts.
+    """
     with _readable():
         find_header_end(data)
         parts = OpenEXR.File(io.BytesIO(data), header_only=True, num_threads=0).parts

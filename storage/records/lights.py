@@ -19,9 +19,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from storage.errors import TrilightError
-from storage.records.environment import Environment
 from storage.records.exr import decode_layers, encode_layers, to_half
 from storage.records.scene import Scene
+from storage.records.texture import Environment
 
 MAX_LIGHTS = 64
 """Most pictures of one view that are kept apart, parts times lights: each takes as much room as the

@@ -16,9 +16,8 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from storage.conventions import latlong_uv
-from storage.records.environment import Environment
 from storage.records.material import column_places
-from storage.records.texture import CONSTANT, TEXTURED, Texture
+from storage.records.texture import CONSTANT, TEXTURED, Environment, Texture
 
 FLAT = (0.5, 0.5, 1.0)
 """Texel that leaves the normal as it is."""

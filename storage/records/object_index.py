@@ -11,10 +11,10 @@ The file is a safetensors file of which columns are read in parts: its arrays ar
 
 import dataclasses
 import json
+from collections import Counter
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
-from itertools import groupby
-from operator import attrgetter
+from operator import itemgetter
 from pathlib import Path
 from typing import Any
 
@@ -23,28 +23,16 @@ from numpy.typing import NDArray
 from safetensors.numpy import save
 
 from storage.atomic import write_atomically
+from storage.digests import sha256_hex
 from storage.errors import TrilightError
 from storage.licences import share_alike_camp
-from storage.records.objects import LockedObject
+from storage.records.objects import OBJECT, LockRows
 from storage.records.safe_read import MAX_HEADER_BYTES, open_plain, safetensors_header
 from storage.typed_json import read_json
 
 _FORMAT = 1
 _TYPES = {"U8": "<u1", "U16": "<u2", "U32": "<u4", "U64": "<u8"}
 _NAME_BYTES = 16
-
-
-@dataclass(frozen=True, kw_only=True)
-class IndexedObject:
-    """An object of a lock, as it is indexed."""
-
-    locked: LockedObject
-    offset: int
-    """Byte of the lock at which the row begins."""
-    asset_name: str
-    """32 hexadecimal digits, by which the asset store knows the prepared file."""
-    least_triangles: int
-    """Triangles of the coarsest level of detail."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -78,11 +66,11 @@ class IndexFacts:
     """Digest of the query to the source; a change of it lists the source again."""
     num_found: int
     """Objects in the source, refused ones included."""
-    num_maps: int = 0
+    num_maps: int
     """Rows of the lock that are textures and skies; they are not in the index."""
-    camps: tuple[str, ...] = ()
+    camps: tuple[str, ...]
     """Camps by their number in the column."""
-    splits: Mapping[str, SplitRows] = dataclasses.field(default_factory=dict)
+    splits: Mapping[str, SplitRows]
     format: int = _FORMAT
 
     @property
@@ -92,36 +80,56 @@ class IndexFacts:
 
 
 def write_object_index(
-    path: Path, objects: Iterable[IndexedObject], facts: IndexFacts
-) -> IndexFacts:
-    """Write the index of a lock atomically, and return the facts with camps and splits.
+    path: Path, lock: Path, assets: Iterable[tuple[str, int]], *, query_sha256: str, num_found: int
+) -> None:
+    """Write the index of a lock atomically.
+
+    Args:
+        path: the index.
+        lock: the file of the lock.
+        assets: of each object of the lock, in its order, the name of the prepared file (32
+            hexadecimal digits) and the triangles of the coarsest level.
+        query_sha256: digest of the query to the source.
+        num_found: objects in the source, refused ones included.
 
     Raises:
-        TrilightError: the file cannot be written.
+        TrilightError: the lock cannot be read, or the index cannot be written.
     """
-    rows = sorted(objects, key=lambda row: (row.locked.split, row.locked.uid))
-    camps = sorted({share_alike_camp(row.locked.licence) for row in rows})
-    number = {camp: index for index, camp in enumerate(camps)}
-    camp = np.array([number[share_alike_camp(row.locked.licence)] for row in rows], "<u2")
-    least = np.array([row.least_triangles for row in rows], "<u4")
-    names = bytes.fromhex("".join(row.asset_name for row in rows))
+    objects = ((offset, row) for offset, row in LockRows(lock) if row.kind == OBJECT)
+    rows = [
+        (row.split, share_alike_camp(row.licence), offset, *asset)
+        for (offset, row), asset in zip(objects, assets, strict=True)
+    ]
+    rows.sort(key=itemgetter(0))
+    split_names, camp_names, offsets, names, least_triangles = zip(*rows, strict=True)
+    least = np.array(least_triangles, "<u4")
+    camps = sorted(set(camp_names))
+    camp = np.array([camps.index(name) for name in camp_names], "<u2")
     arrays: dict[str, NDArray[Any]] = {
-        "offset": np.array([row.offset for row in rows], "<u8"),
+        "offset": np.array(offsets, "<u8"),
         "least": least,
         "camp": camp,
-        "name": np.frombuffer(names, "<u1").reshape(-1, _NAME_BYTES),
+        "name": np.frombuffer(bytes.fromhex("".join(names)), "<u1").reshape(-1, _NAME_BYTES),
     }
     splits = {}
     start = 0
-    for split, group in groupby(rows, key=attrgetter("locked.split")):
-        stop = start + sum(1 for _ in group)
+    for split, count in Counter(split_names).items():
+        stop = start + count
         sizes = camp_sizes(least[start:stop], camp[start:stop], camps)
         splits[split] = SplitRows(start=start, stop=stop, camps=sizes)
         start = stop
-    facts = dataclasses.replace(facts, camps=tuple(camps), splits=splits)
+    data = lock.read_bytes()
+    facts = IndexFacts(
+        lock_sha256=sha256_hex(data),
+        lock_bytes=len(data),
+        asked=query_sha256,
+        num_found=num_found,
+        num_maps=data.count(b"\n") - len(rows),
+        camps=tuple(camps),
+        splits=splits,
+    )
     header = json.dumps(dataclasses.asdict(facts), sort_keys=True)
     write_atomically(path, save(arrays, metadata={"objects": header}))
-    return facts
 
 
 def camp_sizes(

@@ -110,9 +110,8 @@ class Failure:
 
 def failure_of(stage: str, item: str, rejection: Rejected, attempt: int = 0) -> Failure:
     """Return the row of a rejection."""
-    reason = rejection.reason
     return Failure(
-        stage=stage, item=item, reason=reason, message=rejection.message, attempt=attempt
+        stage=stage, item=item, reason=rejection.reason, message=rejection.message, attempt=attempt
     )
 
 
@@ -221,11 +220,11 @@ class LockRows:
         row = row_at(start) if start < self.num_bytes else None
         return row if row and row.uid == uid else None
 
-    def __iter__(self) -> Iterator[LockedObject]:
-        """Yield all rows, sorted by uid."""
+    def __iter__(self) -> Iterator[tuple[int, LockedObject]]:
+        """Yield the first byte of each row and the row, sorted by uid."""
         offset = 0
         while offset < self.num_bytes:
-            yield self.at(offset)
+            yield offset, self.at(offset)
             offset = self._end(offset)
 
     def _end(self, offset: int) -> int:

@@ -23,7 +23,6 @@ from safetensors.numpy import save
 
 from storage.digests import canonical_json, sha256_hex
 from storage.errors import TrilightError
-from storage.records.environment import Environment
 from storage.records.safe_read import (
     pack_gzip,
     read_safetensors,
@@ -32,7 +31,7 @@ from storage.records.safe_read import (
 )
 from storage.records.scene import Scene
 from storage.records.scene_laws import wrong_value
-from storage.records.texture import MAX_MAPS_BYTES, MapSource, Texture
+from storage.records.texture import MAX_MAPS_BYTES, Environment, MapSource, Texture
 from storage.settings.ranges import Within
 from storage.typed_json import Sha256
 

@@ -58,13 +58,6 @@ def summary(values: ArrayLike) -> dict[str, float]:
     finite = array[np.isfinite(array)]
     if not finite.size:
         return {"count": 0}
-    low, median, high = (float(value) for value in np.percentile(finite, [5, 50, 95]))
-    return {
-        "count": int(finite.size),
-        "min": float(finite.min()),
-        "p5": low,
-        "median": median,
-        "mean": float(finite.mean()),
-        "p95": high,
-        "max": float(finite.max()),
-    }
+    low, median, high = np.percentile(finite, [5, 50, 95])
+    values = (finite.min(), low, median, finite.mean(), high, finite.max())
+    return {"count": finite.size, **dict(zip(STATISTICS[1:], map(float, values), strict=True))}

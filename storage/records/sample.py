@@ -5,7 +5,7 @@
     000000123.0.exr ...           linear radiance of each view, half-float RGB OpenEXR
     000000123.0.lights.exr ...    optional: each light's part of it (storage.records.lights)
     000000123.0.parts.exr ...     optional: direct, indirect, ... light (storage.records.lights)
-    000000123.0.passes.exr ...    optional: what its pixels see (storage.records.passes.pictures)
+    000000123.0.passes.exr ...    optional: what its pixels see (storage.records.passes)
     __map-<sha256>__ ...          textures and environment map, where the scene has any: once in a
                                   shard, before the first sample (storage.records.packed_maps)
 
@@ -36,7 +36,7 @@ from storage.records.lights import (
     num_light_pictures,
 )
 from storage.records.packed_maps import HeldMaps, packed_maps, unpacked_maps
-from storage.records.passes.pictures import picture_passes
+from storage.records.passes import picture_passes
 from storage.records.profiles import Profile, pack_arrays, pack_picture, unpack_arrays
 from storage.records.retextured import without_constant_textures
 from storage.records.scene import Scene
@@ -153,7 +153,7 @@ class Sample(SceneRecord):
         """Return passes of one view by name, at the resolution of its picture, one ray a pixel.
 
         Those that are stored are read, others are computed; the numbers are the same. Names are
-        those of storage.records.passes.declared, other than `motion_px`.
+        those of storage.records.passes, other than `motion_px`.
 
         Returns:
             for each name a picture [R, R], or [R, R, K] where the pass has K channels, row 0 on

@@ -18,7 +18,6 @@ from typing import Annotated, Any, Literal
 import numpy as np
 from numpy.typing import NDArray
 
-from storage.records.environment import Environment
 from storage.records.lookup import texture_values
 from storage.records.material import (
     DIFFUSE,
@@ -29,7 +28,7 @@ from storage.records.material import (
     material_width,
 )
 from storage.records.scene_laws import broken_law, require_array, require_law, require_rotations
-from storage.records.texture import CONSTANT, MAX_MAPS_BYTES, TEXTURED, Texture
+from storage.records.texture import CONSTANT, MAX_MAPS_BYTES, TEXTURED, Environment, Texture
 from storage.settings.fields import describe_fields
 from storage.settings.ranges import FLOAT32_MAX, Within
 
@@ -335,10 +334,6 @@ def _check_textures(scene: Scene) -> None:
             broken_law(f"textures[{row}] has {got}", "3 linear channels, as a normal map has")
 
 
-Albedo = Texture | NDArray[np.float32]
-"""An albedo: its texture, or the constant [3]."""
-
-
 def _check_albedo_sums(scene: Scene) -> None:
     """Raise TrilightError where textured albedos add up to more than 1 at any place."""
     assert scene.material_textures is not None
@@ -346,19 +341,16 @@ def _check_albedo_sums(scene: Scene) -> None:
     bound = 1 + ALBEDO_SUM_TOLERANCE
     for row in np.flatnonzero((index != CONSTANT).any(axis=1)):
         diffuse, specular = (
-            scene.materials[row, part] if texture == CONSTANT else scene.textures[texture]
+            scene.textures[texture]
+            if texture != CONSTANT
+            else Texture(texels=scene.materials[row : row + 1, None, part])
             for part, texture in zip((DIFFUSE, SPECULAR), index[row], strict=True)
         )
-        albedo_sum = _greatest(diffuse) + _greatest(specular)  # whatever meets what
-        if isinstance(diffuse, Texture) and isinstance(specular, Texture):
-            if not (albedo_sum <= bound).all():
-                albedo_sum = _greatest_sum(diffuse, specular)
+        albedo_sum = diffuse.greatest + specular.greatest  # whatever meets what
+        if CONSTANT not in index[row] and not (albedo_sum <= bound).all():
+            albedo_sum = _greatest_sum(diffuse, specular)
         name = f"materials[{row}] with its textures: diffuse + specular"
         require_law(albedo_sum <= bound, name, albedo_sum, "at most 1 at every texture coordinate")
-
-
-def _greatest(albedo: Albedo) -> NDArray[np.float32]:
-    return albedo.greatest if isinstance(albedo, Texture) else albedo
 
 
 def _greatest_sum(one: Texture, other: Texture) -> NDArray[np.float64]:

@@ -6,11 +6,10 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from storage.records.environment import Environment, row_solid_angles
 from storage.records.material import DIFFUSE, EMISSION, ROUGHNESS, SPECULAR
 from storage.records.sample import SceneRecord
 from storage.records.scene import Scene
-from storage.records.texture import CONSTANT, NORMAL, TEXTURED
+from storage.records.texture import CONSTANT, NORMAL, TEXTURED, Environment, row_solid_angles
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -8,6 +8,7 @@ process fetches a shard while the others wait for it. Locks die with the process
 import contextlib
 import os
 import time
+from dataclasses import dataclass
 from pathlib import Path
 from typing import BinaryIO
 
@@ -16,8 +17,7 @@ from storage.cache import cache_folder
 from storage.digests import canonical_json, sha256_hex, sha256_of_file
 from storage.errors import TrilightError
 from storage.file_locks import hold_lock, take_lock
-from storage.remote.fetch import download, facts_of, unreadable, version_of
-from storage.remote.retries import TransferFailed
+from storage.remote.transfers import TransferFailed, download, facts_of, unreadable, version_of
 from storage.remote.url import RemoteUrl
 
 LIMIT_VARIABLE = "TRILIGHT_SHARD_CACHE_GB"
@@ -31,18 +31,14 @@ _LOCKS = 64
 _STALE_S = 24 * 3600.0
 
 
+@dataclass(frozen=True)
 class ShardCache:
     """A folder of shards by URL and hash."""
 
-    def __init__(self, root: Path, max_bytes: int) -> None:
-        """Remember the folder.
-
-        Args:
-            root: the folder; belongs to the cache alone.
-            max_bytes: what all shards together may take. What is being read stays even beyond it.
-        """
-        self.root = root
-        self.max_bytes = max_bytes
+    root: Path
+    """The folder; it belongs to the cache alone."""
+    max_bytes: int
+    """Limit of all shards together. What is being read stays even beyond it."""
 
     def open(self, url: RemoteUrl, *, num_bytes: int | None, sha256: str | None) -> BinaryIO:
         """Return a shard, open for reading and safe from removal until it is closed.

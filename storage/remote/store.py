@@ -26,9 +26,17 @@ from storage.atomic import atomic_writer, write_atomically
 from storage.digests import sha256_of_stream
 from storage.errors import EnvironmentFailure, ShardMissing, TrilightError, Unreadable
 from storage.file_locks import hold_lock
-from storage.remote.fetch import download, facts_of, unreadable
-from storage.remote.retries import TransferFailed, is_missing, is_taken, may_pass, with_tries
 from storage.remote.shard_cache import shard_cache
+from storage.remote.transfers import (
+    TransferFailed,
+    download,
+    facts_of,
+    is_missing,
+    is_taken,
+    may_pass,
+    unreadable,
+    with_tries,
+)
 from storage.remote.url import RemoteUrl, shared_driver
 
 WRITABLE = ("s3", "gs")
@@ -113,12 +121,6 @@ class LocalStore:
     def hold_lock(self, name: str) -> contextlib.AbstractContextManager[bool]:
         """Hold the claim on a file for the block; yield whether it is ours; as `put` raises."""
         return hold_lock(claim_of(self.root / name))
-
-    def require_create(self) -> None:
-        """Raise TrilightError if the store writes a file again that it was to create once.
-
-        A folder does not: storage.atomic sees to it.
-        """
 
     def num_bytes(self, name: str) -> int | None:
         """Return the size of a shard, or None where the server does not state it.
@@ -297,6 +299,7 @@ class RemoteStore:
         return path.read_bytes()
 
     def require_create(self) -> None:
+        """Raise TrilightError if the server writes a file again that it was to create once."""
         if self.create_if_absent(_PROBE, b"\n") and self.create_if_absent(_PROBE, b"\n"):
             raise TrilightError(
                 f"{self.url.what} {self.url.display_url!r}: the server does not know conditional "

@@ -172,7 +172,7 @@ def _driver_of(access: RemoteUrl, process: int) -> Any:
 
 
 def transfer_timeout(total_s: float | None = None) -> Any:
-    """Return the limits of a request; storage.remote.retries bounds one for a file as a whole."""
+    """Return the limits of a request; storage.remote.transfers bounds one for a file as a whole."""
     import aiohttp
 
     return aiohttp.ClientTimeout(

@@ -20,7 +20,7 @@ from storage.errors import TrilightError
 from storage.records.exr import decode_exr, encode_channels, encode_exr
 from storage.records.lights import decode_parts_exr, encode_parts_exr
 from storage.records.packed_maps import MAP_NAME
-from storage.records.passes.pictures import passes_exr
+from storage.records.passes import passes_exr
 from storage.records.sample import PartFloor, Sample, decode_sample, decode_scene, encode_sample
 from storage.records.scene_facts import scene_values
 from storage.records.texture import MapSource

@@ -17,7 +17,7 @@ from storage.dataset.dataset import open_dataset
 from storage.dataset.layout import DatasetFolder
 from storage.records.lights import num_light_pictures, sum_of_lights
 from storage.records.objects import read_failures
-from storage.records.passes.pictures import view_passes
+from storage.records.passes import view_passes
 from tests.command_line import expect_output, run_program
 from tests.conftest import ROOT
 from tests.end_to_end.conftest import Trilight

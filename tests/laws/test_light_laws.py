@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 from pipeline.renders.tracer import load_tracer
 from storage.conventions import camera_rays
 from storage.records.lookup import environment_values
-from storage.records.passes.pictures import view_passes
+from storage.records.passes import view_passes
 from storage.records.scene import Scene
 from tests.pipeline.renders.sampling import (
     SIGMAS,

@@ -20,11 +20,10 @@ from scene_templates.families import DEFAULT_FAMILIES
 from scene_templates.rotations import uniform_rotation
 from scene_templates.settings import SceneSettings
 from storage.conventions import alpha_ggx
-from storage.optics.bsdf import MIN_ALPHA, bsdf_lobes
-from storage.optics.multiscatter import scattered_again
-from storage.records.environment import Environment
+from storage.optics import MIN_ALPHA, bsdf_lobes, scattered_again
 from storage.records.material import DIFFUSE, EMISSION, SPECULAR
 from storage.records.scene import Scene
+from storage.records.texture import Environment
 from tests.model.hits.kit import corner, direct, traced
 from tests.oracle.plugin_scene import scaled_albedos
 from tests.pipeline.renders.sampling import (
@@ -50,13 +49,13 @@ from tests.pipeline.renders.scene_kit import (
 from tests.pipeline.scenes.small_pool import first_scene, small_pool
 from tests.rigid_motion import moved
 from tests.sky_maps import night, one_sun, smooth
-from tests.storage.optics.test_multiscatter import slow_albedo
+from tests.storage.test_optics import slow_albedo
 
 PLATE = [[-1, -1, 0], [1, -1, 0], [1, 1, 0], [-1, 1, 0]]
 
 
 def _albedo(row: NDArray, cos_in: float) -> NDArray[np.float64]:
-    """Directional albedo [3] by brute force and by the formula of storage.optics.multiscatter."""
+    """Directional albedo [3] by brute force and by the formula of storage.optics."""
     alpha = max(float(alpha_ggx(row[6])), MIN_ALPHA)
     single = slow_albedo(cos_in, alpha, "correlated")
     again = scattered_again(row[None, 3:6], np.array([alpha]), "correlated")[0]

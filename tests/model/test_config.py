@@ -25,9 +25,9 @@ from model.renderformer import RenderFormer, count_parameters
 from model.scene_tensors import SceneBatch, batch_scenes, map_tensors, scene_tensors
 from model.width_scales import WidthScale, scale_start, width_scales
 from storage.errors import TrilightError
-from storage.records.environment import Environment
 from storage.records.material import EMISSION, material_width
 from storage.records.scene import ARRAY_FIELDS
+from storage.records.texture import Environment
 from tests.for_each import for_each
 from tests.model.kit import (
     FAMILIES,

@@ -16,8 +16,7 @@ from numpy.typing import NDArray
 
 from pipeline.renders.light_tables import lamp_power, sky_share
 from pipeline.renders.tracer import split_triangles
-from storage.optics.bsdf import Lobes, bsdf_lobes
-from storage.optics.multiscatter import Smith, scattered_again
+from storage.optics import Lobes, Smith, bsdf_lobes, scattered_again
 from storage.records.lights import shining_sky
 from storage.records.material import EMISSION
 from storage.records.scene import Scene
@@ -42,7 +41,7 @@ _SMITH: Smith = "separable"
 
 
 def _blend(textures: dict[str, Any]) -> dict[str, Any]:
-    """Return diffuse and specular lobe as the blend of storage.optics.bsdf."""
+    """Return diffuse and specular lobe as the blend of storage.optics."""
     specular = {name: textures[name] for name in ("specular", "again", "alpha")}
     return {
         "type": "blendbsdf",

@@ -5,7 +5,7 @@ of arrays is given, which is the bottom row here. Values are linear, hence `raw`
 of the lobes are no bilinear functions of the textures: the share is a constant here (any will do),
 the GGX width is squared after the lookup, and multiple scattering is found from both.
 
-The scale of storage.optics.multiscatter depends on the direction of the viewer, which no stock
+The scale of storage.optics depends on the direction of the viewer, which no stock
 texture reads; one of our own may. `roughconductor` has the separable Smith term, so the table is
 that one's: from every direction the surface returns as much light as in the kernel, but the shape
 of a rough lobe differs (0.6 % of direct light at roughness 0.6, 4.5 % at 1, root mean square).
@@ -25,12 +25,10 @@ import mitsuba as mi
 import numpy as np
 from numpy.typing import NDArray
 
-from storage.optics.bsdf import MIN_ALPHA
-from storage.optics.multiscatter import ROUGHNESS_STEPS, X_STEPS, Smith, albedo_table, mean_albedo
-from storage.records.environment import Environment
+from storage.optics import MIN_ALPHA, ROUGHNESS_STEPS, X_STEPS, Smith, albedo_table, mean_albedo
 from storage.records.material import laid_out
 from storage.records.scene import Scene
-from storage.records.texture import CONSTANT, TEXTURED
+from storage.records.texture import CONSTANT, TEXTURED, Environment
 
 PLUGIN = "compensated_specular"
 """Name in scene dictionaries; it has the textures specular, again (Fms) and alpha."""

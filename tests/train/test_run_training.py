@@ -28,7 +28,7 @@ from storage.dataset.dataset import Dataset
 from storage.dataset.training_data import NO_MANIFEST
 from storage.errors import TrilightError
 from storage.records.safe_read import safetensors_header
-from storage.remote import retries
+from storage.remote import transfers
 from tests.command_line import expect_output
 from tests.for_each import for_each
 from tests.http_server import Fault, Site, serve
@@ -395,7 +395,7 @@ def server(dataset: Dataset, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) ->
     pytest.importorskip("aiohttp", reason="http needs the package aiohttp")
     monkeypatch.setenv("TRILIGHT_CACHE", str(tmp_path / "cache"))
     monkeypatch.setenv("NO_PROXY", "127.0.0.1")
-    monkeypatch.setattr(retries, "PAUSE_S", 0.0)
+    monkeypatch.setattr(transfers, "PAUSE_S", 0.0)
     with serve(dataset.folder.root) as running:
         yield running
 

@@ -21,8 +21,8 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from model.scene_tensors import SceneTensors
-from storage.records.environment import Environment
 from storage.records.material import laid_out
+from storage.records.texture import Environment
 from train.data.scenes import TrainingScene
 
 if TYPE_CHECKING:

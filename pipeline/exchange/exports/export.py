@@ -46,14 +46,13 @@ from pipeline.exchange.exports.pictures import (
 from pipeline.exchange.reader import SceneReader, scene_source
 from pipeline.exchange.textured_triangles import LoadedScene
 from storage.atomic import atomic_writer, write_atomically
-from storage.conventions import SPLITS
 from storage.dataset.dataset import Dataset, open_dataset
 from storage.dataset.manifest import ShardEntry
 from storage.dataset.shard import ShardReader
 from storage.errors import TrilightError
 from storage.raycast import FirstHitCaster, Surfaces, require_row
 from storage.records.exr import encode_exr
-from storage.records.passes.pictures import passes_exr
+from storage.records.passes import passes_exr
 from storage.records.sample import Sample, sample_key
 from storage.records.scene import Scene
 
@@ -327,13 +326,9 @@ def select_samples(
     Raises:
         TrilightError: the split or scene does not exist, or the dataset is empty or damaged.
     """
-    if split is not None and split not in SPLITS:
-        raise TrilightError(f"split is {split!r}; expected one of {', '.join(SPLITS)}.")
     scene_key = sample_key(int(scene)) if scene is not None and scene.isdecimal() else scene
     has_samples = False
-    for shard in dataset.manifest.shards:
-        if split not in (None, shard.split):
-            continue
+    for shard in dataset.shards_of(split):
         keys = [key for key in dataset.keys(shard) if scene_key in (None, key)]
         has_samples = has_samples or bool(keys)
         for sample in dataset.read_samples(shard, keys):

@@ -58,7 +58,7 @@ from pipeline.documents.png import encode_png
 from storage.atomic import write_atomically
 from storage.conventions import focal_px, preview_srgb8, srgb8
 from storage.errors import TrilightError
-from storage.records.passes.pictures import view_passes
+from storage.records.passes import view_passes
 from storage.records.sample import Sample
 from storage.records.scene import Scene, SceneObject
 

@@ -36,9 +36,8 @@ from pipeline.foreign.source_file import read_source
 from pipeline.objects.licences import USER_PROVIDED
 from storage.conventions import latlong_direction, latlong_uv
 from storage.errors import Rejected, TrilightError
-from storage.records.environment import Environment
 from storage.records.scene import SceneObject
-from storage.records.texture import MapSource
+from storage.records.texture import Environment, MapSource
 
 SUFFIXES = (".glb", ".gltf")
 _LIMITS = ReadLimits(max_bytes=1 << 30, with_materials=True)

@@ -25,8 +25,7 @@ from pipeline.foreign.usd.stage import OpenedStage
 from pipeline.foreign.usd.texture_nodes import asset_bytes, convert_to_rec709
 from pipeline.objects.licences import USER_PROVIDED
 from storage.errors import TrilightError
-from storage.records.environment import Environment
-from storage.records.texture import MapSource
+from storage.records.texture import Environment, MapSource
 from storage.settings.ranges import Within
 
 _DISK_CORNERS = 24

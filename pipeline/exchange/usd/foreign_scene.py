@@ -41,10 +41,9 @@ from pipeline.foreign.usd.stage import OpenedStage
 from pipeline.objects.licences import USER_PROVIDED
 from pipeline.scenes.shading_normals import smooth_shaded
 from storage.errors import TrilightError
-from storage.records.environment import Environment
 from storage.records.material import EMISSION, column_places
 from storage.records.scene import Scene, SceneObject
-from storage.records.texture import MapSource, Texture
+from storage.records.texture import Environment, MapSource, Texture
 
 _MESHES = ("Mesh", *SOLIDS)
 

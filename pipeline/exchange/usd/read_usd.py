@@ -43,7 +43,6 @@ from pipeline.foreign.usd.stage import OpenedStage, read_quietly
 from pipeline.foreign.usd.texture_nodes import asset_bytes
 from storage.conventions import require_readable
 from storage.errors import Rejected, TrilightError
-from storage.records.environment import Environment
 from storage.records.exr import decode_exr
 from storage.records.material import (
     PUBLISHED_COLUMNS,
@@ -55,7 +54,7 @@ from storage.records.material import (
 )
 from storage.records.scene import OBJECT_KINDS, Scene, SceneObject
 from storage.records.scene_file import scene_digest, scene_provenance
-from storage.records.texture import CONSTANT, TEXTURED, MapSource, Texture
+from storage.records.texture import CONSTANT, TEXTURED, Environment, MapSource, Texture
 
 MAX_FRAMES = 10_000
 """Maximum number of scenes in a stage with time samples."""

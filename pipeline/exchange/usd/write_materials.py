@@ -33,11 +33,10 @@ from pipeline.exchange.usd import layout
 from pipeline.foreign.picture import decode_image
 from pipeline.foreign.usd.shaders import IOR_OF_CONSTANT_ALBEDOS
 from storage.errors import Rejected, TrilightError
-from storage.records.environment import Environment
 from storage.records.exr import MAGIC, MAX_RESOLUTION, decode_channels, encode_channels
 from storage.records.material import column_places, laid_out, stored_columns
 from storage.records.scene import Scene
-from storage.records.texture import NORMAL, TEXTURED, MapSource, Texture
+from storage.records.texture import NORMAL, TEXTURED, Environment, MapSource, Texture
 
 PREVIEW = "Preview"
 OPENPBR = "OpenPBR"

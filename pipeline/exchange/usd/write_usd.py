@@ -34,10 +34,10 @@ from storage.atomic import write_atomically
 from storage.conventions import SCHEMA_VERSION
 from storage.digests import canonical_json
 from storage.errors import TrilightError
-from storage.records.environment import Environment
 from storage.records.retextured import without_constant_textures
 from storage.records.scene import Scene
 from storage.records.scene_file import scene_digest
+from storage.records.texture import Environment
 
 ENVIRONMENT = "Environment"
 """Name of the prim of an environment."""

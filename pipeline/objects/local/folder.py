@@ -25,7 +25,7 @@ from pipeline.objects.listing import Listing, assign_uids, failure, is_object_fi
 from storage.errors import Rejected, TrilightError
 from storage.records.objects import ObjectRecord
 from storage.records.safe_read import read_plain
-from storage.remote.retries import TransferFailed
+from storage.remote.transfers import TransferFailed
 from storage.remote.url import printable, public_text
 
 CATALOGUE_NAMES = ("objects.jsonl", "objects.csv")

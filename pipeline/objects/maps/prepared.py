@@ -2,7 +2,7 @@
 
 The base color of a texture is sRGB-encoded, all else is linear. Means are of linear values; the
 mean of roughness is that of the GGX width, its square. There is no Fresnel term here: a surface
-with a metallic map, or with a base color alone, gets its albedos from storage.optics.bsdf.
+with a metallic map, or with a base color alone, gets its albedos from storage.optics.
 
 A NaN or infinite value rejects a map: half floats end at 65,504, so that a brighter sun was written
 as infinite and is lost. Small negative values, which color conversions leave, become 0 where
@@ -29,11 +29,10 @@ from pipeline.objects.maps.texture_names import PACKED, TEXTURE_PARTS
 from storage.conventions import linear_from_srgb
 from storage.digests import canonical_json, sha256_hex
 from storage.errors import Rejected
-from storage.optics.bsdf import constant_albedos
-from storage.records.environment import MAX_RADIANCE
+from storage.optics import constant_albedos
 from storage.records.objects import SKY
 from storage.records.safe_read import read_safetensors
-from storage.records.texture import MAX_SIDE, content_digest
+from storage.records.texture import MAX_RADIANCE, MAX_SIDE, content_digest
 
 
 def area_means(values: NDArray, height: int, width: int) -> NDArray[np.float64]:

@@ -21,8 +21,7 @@ from pipeline.objects.local.folder import file_text
 from storage.atomic import atomic_writer
 from storage.errors import TrilightError
 from storage.records.objects import Failure, ObjectRecord
-from storage.remote.fetch import download
-from storage.remote.retries import TransferFailed
+from storage.remote.transfers import TransferFailed, download
 from storage.remote.url import RemoteUrl, printable
 
 PREFIX = "objaverse:"

@@ -32,8 +32,7 @@ from storage.cache import cache_folder
 from storage.digests import sha256_hex
 from storage.errors import TrilightError
 from storage.records.objects import ObjectRecord
-from storage.remote.fetch import download, version_of
-from storage.remote.retries import TransferFailed, is_absent, with_tries
+from storage.remote.transfers import TransferFailed, download, is_absent, version_of, with_tries
 from storage.remote.url import RemoteUrl, printable, safe_url, shared_driver
 from storage.typed_json import read_json
 

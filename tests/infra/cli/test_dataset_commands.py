@@ -30,7 +30,7 @@ from storage.dataset.progress import announce_objects, log_scene, write_asked
 from storage.dataset.shard import write_shard
 from storage.digests import sha256_hex
 from storage.errors import TrilightError
-from storage.records.passes.pictures import decode_passes_exr, passes_exr
+from storage.records.passes import decode_passes_exr, passes_exr
 from storage.records.sample import PartFloor, encode_sample
 from storage.records.scene import Scene
 from storage.records.scene_file import encode_scene

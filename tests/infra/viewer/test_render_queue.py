@@ -27,9 +27,9 @@ from infra.viewer.picture_options import PictureOptions, apply_edits, parse_pict
 from infra.viewer.scene_handlers import SceneHandlers, scene_bytes, sky_bytes, texture_png
 from pipeline.exchange.formats import LoadedScene
 from storage.errors import TrilightError
-from storage.records.environment import Environment
 from storage.records.material import DIFFUSE, EMISSION, ROUGHNESS
 from storage.records.scene import Scene
+from storage.records.texture import Environment
 from storage.renderer import Camera, Image, OnProgress, Renderer, Sampling, ignore_progress
 from tests.for_each import case
 from tests.infra.viewer.served_kit import served

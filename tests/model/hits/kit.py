@@ -8,10 +8,9 @@ import numpy as np
 from model.hits.lit_scene import LitScene
 from model.hits.textures import surface_textures
 from model.hits.view_inputs import Channel, ViewInputs, view_inputs
-from storage.records.environment import Environment
 from storage.records.retextured import with_textures
 from storage.records.scene import Scene
-from storage.records.texture import Texture
+from storage.records.texture import Environment, Texture
 from tests.pipeline.renders.scene_kit import box, join, light, material, quad, sphere
 
 FLOOR = [[-2, -2, 0], [2, -2, 0], [2, 2, 0], [-2, 2, 0]]

@@ -18,7 +18,7 @@ from model.hits.lit_scene import Gloss, LitScene, Points, gloss_at, lobe, sample
 from model.hits.radiosity import BOUNCES, scene_light
 from model.hits.vectors import dot, unit
 from model.hits.view_inputs import Channel
-from storage.optics.multiscatter import directional_albedo
+from storage.optics import directional_albedo
 from tests.for_each import for_each
 from tests.model.hits.kit import FLOOR, LAMP, corner, lit_scene, traced
 from tests.pipeline.renders.sampling import lambert_irradiance

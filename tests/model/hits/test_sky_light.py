@@ -21,9 +21,9 @@ from model.renderformer import radiance
 from model.scene_tensors import scene_tensors
 from scene_templates.rotations import uniform_rotation
 from storage.errors import TrilightError
-from storage.records.environment import Environment, row_solid_angles, texel_means
 from storage.records.lookup import environment_values
 from storage.records.scene import Scene
+from storage.records.texture import Environment, row_solid_angles, texel_means
 from tests.for_each import for_each
 from tests.model.hits.kit import FLOOR, corner, direct, lit_scene, traced
 from tests.model.kit import awake, hits_config, render, tiny_config

@@ -41,7 +41,7 @@ from storage.digests import sha256_of_file
 from storage.errors import TrilightError
 from storage.records.asset import AssetRow, OwnMaterials
 from storage.records.objects import Failure
-from storage.records.passes.pictures import decode_passes_exr, view_passes
+from storage.records.passes import decode_passes_exr, view_passes
 from storage.records.sample import Sample
 from tests.command_line import trilight
 from tests.pipeline.documents.dataset_by_hand import (

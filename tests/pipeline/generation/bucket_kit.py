@@ -16,7 +16,7 @@ from pipeline.shards.pack_shards import PublishedShards, pack_shard
 from storage.dataset.layout import dataset_folder
 from storage.records.objects import Failure
 from storage.records.sample import sample_key
-from storage.remote import retries, store
+from storage.remote import store, transfers
 from storage.remote import url as remote_url
 from tests.pipeline.generation.test_dataset_writer import ENVIRONMENT, _build, _sample
 from tests.s3_server import CREDENTIALS, control
@@ -38,7 +38,7 @@ def empty_bucket(
     """
     for name, value in {**CREDENTIALS, "AWS_ENDPOINT_URL": f"http://127.0.0.1:{port}"}.items():
         monkeypatch.setenv(name, value)
-    monkeypatch.setattr(retries, "PAUSE_S", 0.0)
+    monkeypatch.setattr(transfers, "PAUSE_S", 0.0)
     monkeypatch.setattr(dataset_writer, "_PATIENCE_S", 0.0)
     control(port, "reset")
     if not keep_driver:

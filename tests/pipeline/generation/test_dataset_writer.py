@@ -21,9 +21,8 @@ from storage.dataset.manifest import index_shard, read_manifest
 from storage.dataset.progress import read_progress
 from storage.dataset.settings import SplitSettings
 from storage.dataset.shard import scan_members
-from storage.dataset.shard_notes import note_of
 from storage.dataset.splits import scenes_of_shard, shard_name
-from storage.dataset.staging import is_staged
+from storage.dataset.staging import is_staged, note_of
 from storage.dataset.verify import verify_dataset
 from storage.errors import TrilightError
 from storage.records.objects import Failure

@@ -31,7 +31,7 @@ from storage.dataset.layout import DatasetFolder
 from storage.dataset.shard import write_shard
 from storage.errors import Rejected, TrilightError
 from storage.records.objects import Failure
-from storage.records.passes.pictures import passes_exr
+from storage.records.passes import passes_exr
 from storage.records.profiles import PROFILES
 from storage.records.sample import decode_sample, encode_sample, sample_key
 from storage.records.scene import Scene, SceneObject

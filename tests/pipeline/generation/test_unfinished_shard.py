@@ -26,8 +26,7 @@ from storage.dataset.layout import DatasetFolder
 from storage.dataset.manifest import ShardEntry, index_shard
 from storage.dataset.progress import read_progress, read_status
 from storage.dataset.shard import write_shard
-from storage.dataset.shard_notes import ShardNote, note_shard, noted_shard
-from storage.dataset.staging import is_staged, read_staged_scene
+from storage.dataset.staging import ShardNote, is_staged, note_shard, noted_shard, read_staged_scene
 from storage.dataset.statistics import Statistics
 from storage.errors import TrilightError
 from storage.file_locks import hold_lock

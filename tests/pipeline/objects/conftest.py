@@ -5,7 +5,7 @@ from pathlib import Path
 
 import pytest
 
-from storage.remote import retries
+from storage.remote import transfers
 from tests.http_server import Site, serve
 
 
@@ -14,7 +14,7 @@ def cache(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     folder = tmp_path / "cache"
     monkeypatch.setenv("TRILIGHT_CACHE", str(folder))
     monkeypatch.setenv("NO_PROXY", "127.0.0.1")
-    monkeypatch.setattr(retries, "PAUSE_S", 0.0)
+    monkeypatch.setattr(transfers, "PAUSE_S", 0.0)
     return folder
 
 

@@ -18,7 +18,7 @@ from pipeline.objects.local.folder import list_folder
 from pipeline.objects.maps.listing import find_maps
 from storage.errors import TrilightError
 from storage.records.objects import TEXTURE, ObjectRecord
-from storage.remote import retries
+from storage.remote import transfers
 from tests.for_each import case, for_each, with_folders
 from tests.pipeline.objects.find_kit import find, reasons, refusal, touch
 from tests.scenes_by_hand import tiny_scene
@@ -364,7 +364,7 @@ VALUES = (
 
 def test_no_message_shows_what_it_says(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
     monkeypatch.chdir(tmp_path)
-    monkeypatch.setattr(retries, "PAUSE_S", 0.0)
+    monkeypatch.setattr(transfers, "PAUSE_S", 0.0)
     monkeypatch.setenv("TRILIGHT_CACHE", str(tmp_path / "cache"))
     for value in VALUES:
         monkeypatch.setenv("TRILIGHT_SOURCE_MINE", value)

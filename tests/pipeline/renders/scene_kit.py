@@ -12,10 +12,9 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from storage.conventions import look_at_c2w
-from storage.records.environment import Environment
 from storage.records.retextured import with_textures
 from storage.records.scene import ObjectKind, Scene, SceneObject
-from storage.records.texture import Texture
+from storage.records.texture import Environment, Texture
 from tests.textured_by_hand import bumps
 
 

@@ -26,8 +26,7 @@ from pipeline.renders.renderer import RenderedView, SceneRenderer
 from pipeline.renders.settings import RenderSettings
 from pipeline.renders.tracer import load_tracer
 from pipeline.renders.vector_tracer import VectorTracer
-from storage.optics.bsdf import bsdf_lobes
-from storage.optics.multiscatter import directional_albedo, scattered_again
+from storage.optics import bsdf_lobes, directional_albedo, scattered_again
 from storage.records.scene import Scene
 from tests.for_each import for_each
 from tests.pipeline.renders.sampling import camera_of, render_view, view_settings
@@ -42,7 +41,7 @@ from tests.pipeline.renders.scene_kit import (
     textured_floor,
 )
 from tests.pipeline.renders.test_renderer import lit_scene
-from tests.storage.optics.test_multiscatter import stretched
+from tests.storage.test_optics import stretched
 
 pytestmark = pytest.mark.usefixtures("llvm")
 

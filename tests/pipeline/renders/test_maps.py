@@ -24,7 +24,6 @@ from scene_templates.rotations import uniform_rotation
 from storage.denoiser import Features
 from storage.errors import TrilightError
 from storage.raycast import first_hits
-from storage.records.environment import Environment, row_solid_angles
 from storage.records.lights import light_rows
 from storage.records.lookup import (
     FLAT,
@@ -34,9 +33,9 @@ from storage.records.lookup import (
     texture_values,
     u_directions,
 )
-from storage.records.passes.pictures import view_passes
+from storage.records.passes import view_passes
 from storage.records.scene import Scene
-from storage.records.texture import MAX_SIDE, Texture
+from storage.records.texture import MAX_SIDE, Environment, Texture, row_solid_angles
 from tests.pipeline.renders.sampling import (
     assert_same_light,
     camera_of,

@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from pipeline.renders.kernel_scene import CameraRays
 from pipeline.renders.tracer import load_tracer
 from storage.raycast import Surfaces
-from storage.records.passes.pictures import view_passes
+from storage.records.passes import view_passes
 from storage.records.scene import Scene
 from tests.oracle import plugin_scene, plugin_tracer
 from tests.oracle.plugin_tracer import _NEAR_CLIP

@@ -21,7 +21,7 @@ from pipeline.exchange.usd.write_usd import write_usd
 from pipeline.renders.tracer import load_tracer
 from storage.metrics import psnr_linear_db, psnr_log_db
 from storage.records.exr import decode_exr
-from storage.records.passes.pictures import passes_exr, view_passes
+from storage.records.passes import passes_exr, view_passes
 from storage.records.scene import Scene
 from tests.pipeline.renders.sampling import block_means, camera_of, render_view, view_settings
 from tests.pipeline.renders.scene_kit import (

@@ -37,7 +37,7 @@ from storage.records.lookup import texture_values
 from storage.records.material import EMISSION, default_rows
 from storage.records.objects import locked_uids
 from storage.records.packed_maps import pack_map
-from storage.records.passes.pictures import view_passes
+from storage.records.passes import view_passes
 from storage.records.retextured import without_constant_textures, without_normal_maps
 from storage.records.scene import Scene, SceneObject
 from storage.records.scene_facts import texture_families

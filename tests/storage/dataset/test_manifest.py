@@ -43,7 +43,6 @@ from storage.dataset.progress import (
     write_asked,
 )
 from storage.dataset.settings import SplitSettings
-from storage.dataset.shard_notes import note_of
 from storage.dataset.splits import (
     named_shard,
     require_objects,
@@ -53,6 +52,7 @@ from storage.dataset.splits import (
     split_of_object,
     split_of_shard,
 )
+from storage.dataset.staging import note_of
 from storage.digests import sha256_hex
 from storage.errors import TrilightError
 from storage.remote.store import RemoteStore

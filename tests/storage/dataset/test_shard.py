@@ -28,7 +28,7 @@ from storage.dataset.settings import SplitSettings
 from storage.dataset.shard import open_shard, scan_members, write_shard
 from storage.dataset.shard_set import expand_pattern, listed_shards
 from storage.dataset.splits import shard_name
-from storage.dataset.training_data import open_mixture, open_training_data
+from storage.dataset.training_data import open_training_data
 from storage.digests import sha256_of_file
 from storage.errors import TrilightError
 from storage.records.packed_maps import MAP_NAME, map_member
@@ -351,7 +351,7 @@ def test_a_folder_is_a_dataset_whatever_its_name(
             assert value_of(name, Path) == root == parse_local_path(str(root))
             for text in (name, str(root), str(value_of(name, str))):
                 assert os.path.samefile(open_dataset(text).folder.root, root)
-                assert open_mixture([text]).digest == open_dataset(text).digest
+                assert open_training_data([text], may_mix=True).digest == open_dataset(text).digest
     assert sorted(os.listdir()) == [
         "$HOME",
         "home",

@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 
 from pipeline.objects.licences import DEFAULT_ALLOWED, UNKNOWN, USER_PROVIDED
+from storage.digests import sha256_hex
 from storage.errors import TrilightError
 from storage.licences import (
     DUTIES,
@@ -16,7 +17,7 @@ from storage.licences import (
     share_alike_camp,
     union_of_duties,
 )
-from storage.records.object_index import IndexedObject, IndexFacts, ObjectIndex, write_object_index
+from storage.records.object_index import ObjectIndex, write_object_index
 from storage.records.objects import LockedObject, LockRows, write_objects_lock
 from tests.for_each import for_each
 
@@ -49,7 +50,8 @@ def test_every_row_is_found_by_its_uid(tmp_path: Path, count: int) -> None:
     rows = _rows(count)
     write_objects_lock(tmp_path / "lock", rows)
     lock = LockRows(tmp_path / "lock")
-    assert list(lock) == rows
+    assert [row for _, row in lock] == rows
+    assert [lock.at(offset) for offset, _ in lock] == rows
     assert [lock.find(row.uid) for row in rows] == rows
     for row in rows[::7]:
         assert lock.find(row.uid + "\0") is None
@@ -66,49 +68,44 @@ def test_a_lock_that_is_none_is_refused(tmp_path: Path) -> None:
 
 
 def test_columns_say_what_the_rows_say(tmp_path: Path) -> None:
-    rows, offset, objects = _rows(100), 0, []
-    write_objects_lock(tmp_path / "lock", rows)
-    lines = (tmp_path / "lock").read_bytes().splitlines(keepends=True)
-    for number, (row, line) in enumerate(zip(rows, lines, strict=True)):
-        objects.append(
-            IndexedObject(
-                locked=row, offset=offset, asset_name=f"{number:032x}", least_triangles=7 * number
-            )
-        )
-        offset += len(line)
+    rows = _rows(100)
+    sky = dataclasses.replace(rows[0], uid="sky", kind="sky")
+    write_objects_lock(tmp_path / "lock", [*rows, sky])
     path, lock = tmp_path / "index", LockRows(tmp_path / "lock")
-    stated = IndexFacts(lock_sha256="s", lock_bytes=offset, asked="a", num_found=120)
-    facts = write_object_index(path, reversed(objects), stated)
+    assets = {row.uid: (f"{number:032x}", 7 * number) for number, row in enumerate(rows)}
+    by_uid = [assets[uid] for uid in sorted(assets)]
+    write_object_index(path, tmp_path / "lock", by_uid, query_sha256="a", num_found=120)
     index = ObjectIndex(path)
-    assert index.facts == facts
-    assert (facts.num_objects, facts.num_found, facts.num_maps) == (100, 120, 0)
+    facts = index.facts
+    assert (facts.num_objects, facts.num_found, facts.num_maps) == (100, 120, 1)
+    data = (tmp_path / "lock").read_bytes()
+    assert (facts.lock_sha256, facts.lock_bytes) == (sha256_hex(data), len(data))
     for split in ("train", "validation", "test"):
-        here, at = facts.splits[split], index.facts.splits[split].start
-        wanted = [one for one in objects if one.locked.split == split]
+        here, at = facts.splits[split], facts.splits[split].start
+        wanted = [row for row in rows if row.split == split]
         assert here.stop - here.start == len(wanted)
         offsets = index.column("offset", here)
-        assert [lock.at(int(where)) for where in offsets[:]] == [one.locked for one in wanted]
+        assert [lock.at(int(where)) for where in offsets[:]] == wanted
         least = index.column("least", here)
-        assert least[5:9].tolist() == [one.least_triangles for one in wanted[5:9]]
+        assert least[5:9].tolist() == [assets[row.uid][1] for row in wanted[5:9]]
         assert least[len(wanted) :].tolist() == []
         camps = [facts.camps[number] for number in index.column("camp", here)[:]]
-        assert camps == [share_alike_camp(one.locked.licence) for one in wanted]
+        assert camps == [share_alike_camp(row.licence) for row in wanted]
         for camp, sizes in here.camps.items():
             of_camp = [
-                o.least_triangles for o in wanted if share_alike_camp(o.locked.licence) == camp
+                assets[row.uid][1] for row in wanted if share_alike_camp(row.licence) == camp
             ]
             found = dataclasses.astuple(sizes)
             assert found == (len(of_camp), min(of_camp), max(of_camp))
         names = [index.asset_name(at + row) for row in range(len(wanted))]
-        assert names == [one.asset_name for one in wanted]
+        assert names == [assets[row.uid][0] for row in wanted]
 
 
 def test_an_index_that_is_cut_off_says_so(tmp_path: Path) -> None:
     (row,) = _rows(1)
-    one = IndexedObject(locked=row, offset=0, asset_name="0" * 32, least_triangles=1)
+    write_objects_lock(tmp_path / "lock", [row])
     path = tmp_path / "index"
-    stated = IndexFacts(lock_sha256="", lock_bytes=1, asked="", num_found=1)
-    write_object_index(path, [one], stated)
+    write_object_index(path, tmp_path / "lock", [("0" * 32, 1)], query_sha256="", num_found=1)
     whole = path.read_bytes()
     path.write_bytes(whole[:-24])
     with pytest.raises(TrilightError, match="no index of objects .*delete it"):

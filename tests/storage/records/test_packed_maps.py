@@ -21,7 +21,6 @@ from safetensors.numpy import load, save
 from storage.conventions import MAPS_VERSION, SCHEMA_VERSION, latlong_direction, latlong_uv, srgb8
 from storage.errors import TrilightError
 from storage.records import packed_maps
-from storage.records.environment import Environment
 from storage.records.lookup import environment_values, texture_values
 from storage.records.packed_maps import (
     HeldMaps,
@@ -33,7 +32,7 @@ from storage.records.profiles import PROFILES, Profile
 from storage.records.sample import decode_sample, encode_sample
 from storage.records.scene_facts import SkyFacts, sky_facts, texture_families, textured_objects
 from storage.records.scene_file import decode_scene_file, encode_scene
-from storage.records.texture import MAX_MAPS_BYTES, MapSource, Texture
+from storage.records.texture import MAX_MAPS_BYTES, Environment, MapSource, Texture
 from tests.for_each import for_each
 from tests.scenes_by_hand import FLOOR, tiny_sample, tiny_scene
 from tests.sky_maps import COLOURS, POLES, six_poles

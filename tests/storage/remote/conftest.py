@@ -11,7 +11,7 @@ import pytest
 
 from storage.dataset.dataset import Dataset, open_dataset
 from storage.records.sample import encode_sample
-from storage.remote import retries, url
+from storage.remote import transfers, url
 from tests.http_server import Site, serve
 from tests.pipeline.documents.dataset_by_hand import five_scenes
 from tests.s3_server import moto as moto
@@ -24,7 +24,7 @@ def cache(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     monkeypatch.setenv("TRILIGHT_CACHE", str(tmp_path / "cache"))
     monkeypatch.delenv("TRILIGHT_SHARD_CACHE_GB", raising=False)
     monkeypatch.setenv("NO_PROXY", "127.0.0.1")
-    monkeypatch.setattr(retries, "PAUSE_S", 0.0)
+    monkeypatch.setattr(transfers, "PAUSE_S", 0.0)
     return tmp_path / "cache" / "shards"
 
 

@@ -20,9 +20,9 @@ from storage.dataset.dataset import Dataset, open_dataset
 from storage.dataset.shard_set import listed_shards
 from storage.dataset.verify import verify_dataset
 from storage.errors import TrilightError
-from storage.remote import retries
-from storage.remote.retries import TRIES, Pace, TransferFailed, with_tries
+from storage.remote import transfers
 from storage.remote.shard_cache import ShardCache, shard_cache
+from storage.remote.transfers import TRIES, Pace, TransferFailed, with_tries
 from storage.remote.url import RemoteUrl, public_text, safe_text, safe_url
 from tests.for_each import for_each
 from tests.http_server import Fault, Site
@@ -219,7 +219,7 @@ def test_what_passes_by_itself_is_outlived(
 ) -> None:
     if len(faults) > 4 and not ranges:
         pytest.skip("without ranges, a line that always breaks gets nowhere")
-    monkeypatch.setattr(retries, "LEAST_BYTES_PER_S", 0.0)  # of a busy machine
+    monkeypatch.setattr(transfers, "LEAST_BYTES_PER_S", 0.0)  # of a busy machine
     server.faults[PATH], server.ranges = list(faults), ranges
     assert read(server.url) == expected(local)
     assert not server.faults[PATH]
@@ -320,7 +320,7 @@ def test_a_manifest_that_is_not_there_is_named(server: Site) -> None:
 
 def patience(monkeypatch: pytest.MonkeyPatch, **limits: float) -> None:
     for name, value in limits.items():
-        monkeypatch.setattr(retries, name.upper(), value)
+        monkeypatch.setattr(transfers, name.upper(), value)
 
 
 def test_a_server_that_trickles_is_left(

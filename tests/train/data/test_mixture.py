@@ -21,7 +21,7 @@ from torch import Tensor
 from model.open import path_of_step
 from storage.conventions import log10_radiance
 from storage.dataset.dataset import Dataset
-from storage.dataset.training_data import TrainingData, open_mixture, open_training_data
+from storage.dataset.training_data import TrainingData, open_training_data
 from storage.errors import TrilightError
 from tests.for_each import for_each
 from tests.train.data.test_loader import identities
@@ -66,7 +66,7 @@ def roots(tmp_path_factory: pytest.TempPathFactory) -> list[str]:
 
 @pytest.fixture(scope="module")
 def data(roots: list[str]) -> TrainingData:
-    return open_mixture(roots)
+    return open_training_data(roots, may_mix=True)
 
 
 def mixture(*weights: float, **changes: object) -> Mixture:
@@ -113,7 +113,9 @@ def test_each_dataset_keeps_the_order_that_it_has_alone(
     turns = list(itertools.islice(mixture(*WEIGHTS).sources_from(0), len(scenes)))
     assert [turns.count(source) for source in (0, 1)] == [24, 12]
     for source, root in enumerate(roots):
-        alone = list(itertools.chain(*keys_of(take(open_mixture([root]), SETTINGS, 6))))
+        alone = list(
+            itertools.chain(*keys_of(take(open_training_data([root], may_mix=True), SETTINGS, 6)))
+        )
         mine = [scene.key for scene, turn in zip(scenes, turns, strict=True) if turn == source]
         assert mine == alone[: len(mine)]
     smaller = [scene for scene, turn in zip(scenes, turns, strict=True) if turn == 1]
@@ -147,7 +149,7 @@ def test_first_samples_come_from_every_dataset(data: TrainingData) -> None:
 def test_a_dataset_that_is_known_goes_on_where_it_was(roots: list[str], data: TrainingData) -> None:
     """One alone, then two, then other weights, then the second alone."""
     run = tiny_run(scenes_per_step=BATCH)
-    alone = [open_mixture([root]) for root in roots]
+    alone = [open_training_data([root], may_mix=True) for root in roots]
     header = {"step": 0, "settings": {"scenes_per_step": BATCH}, "data_digest": alone[0].digest}
     assert plan_mixture(alone[0], run, None) is None
     assert plan_mixture(alone[0], run, header | {"step": 5}) is None
@@ -167,9 +169,9 @@ def test_a_dataset_that_is_known_goes_on_where_it_was(roots: list[str], data: Tr
 
 def test_mistakes_about_several_datasets(roots: list[str], data: TrainingData) -> None:
     with pytest.raises(TrilightError, match="holds the same dataset as .*data_weights says"):
-        open_mixture([roots[0], roots[1], roots[0]])
+        open_training_data([roots[0], roots[1], roots[0]], may_mix=True)
     with pytest.raises(TrilightError, match="2 places of which 1 are shards"):
-        open_mixture([roots[0], f"{roots[1]}/train-000000.tar"])
+        open_training_data([roots[0], f"{roots[1]}/train-000000.tar"], may_mix=True)
     with pytest.raises(TrilightError, match="3 numbers, but --data names 2 datasets"):
         plan_mixture(data, tiny_run(data_weights=(1.0, 1.0, 1.0)), None)
     with pytest.raises(TrilightError, match="data_weights"):
@@ -183,7 +185,10 @@ def test_a_damaged_shard_is_replaced_by_its_own_datasets(tmp_path: Path) -> None
             tmp_path / name, train=4, validation=1, per_shard=2, resolution=resolution
         )
     (tmp_path / "a" / "train-000001.tar").write_bytes(b"no shard")
-    mixed, unusable = open_mixture([str(tmp_path / "a"), str(tmp_path / "b")]), BadSampleCounter(2)
+    mixed, unusable = (
+        open_training_data([str(tmp_path / "a"), str(tmp_path / "b")], may_mix=True),
+        BadSampleCounter(2),
+    )
     turns = list(itertools.islice(mixture(1.0, 1.0).sources_from(0), 16))
     found = take(mixed, SETTINGS, 4, workers=2, unusable=unusable, mixture=mixture(1.0, 1.0))
     keys = itertools.chain(*keys_of(found))
@@ -204,7 +209,7 @@ def test_a_run_of_two_datasets_resumes_to_the_bit_and_takes_up_a_third(
     (tmp_path / "third").mkdir()
     write_toy_dataset(tmp_path / "third", train=2, validation=1, per_shard=2, resolution=16)
     three = [*roots, str(tmp_path / "third")]
-    digest = open_mixture(three).digest
+    digest = open_training_data(three, may_mix=True).digest
     with pytest.raises(TrilightError, match=r"--change data=mix:[0-9a-f]{12}"):
         run_training(settings, data=three, out=out, start=StartOptions(resume=True))
     decided = {"data": digest[:16], "data_weights": (1.0, 2.0, 1.0), "num_steps": 10}

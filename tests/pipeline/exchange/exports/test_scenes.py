@@ -20,7 +20,7 @@ from storage.conventions import in_camera, preview_srgb8, srgb8
 from storage.dataset.dataset import open_dataset
 from storage.records.exr import decode_exr
 from storage.records.material import DIFFUSE, EMISSION, SPECULAR
-from storage.records.passes.pictures import view_passes
+from storage.records.passes import view_passes
 from storage.records.sample import PartFloor, Sample
 from storage.records.scene import Scene
 from tests.command_line import trilight

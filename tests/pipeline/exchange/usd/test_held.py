@@ -24,12 +24,11 @@ from pipeline.renders.mitsuba_variant import activate, choose_variant
 from scene_templates.rotations import uniform_rotation
 from storage.conventions import preview_srgb8
 from storage.metrics import psnr_linear_db
-from storage.records.environment import Environment
 from storage.records.material import EMISSION, PUBLISHED_COLUMNS
 from storage.records.retextured import with_textures
 from storage.records.scene import Scene
 from storage.records.scene_file import encode_scene
-from storage.records.texture import CONSTANT, MapSource, Texture
+from storage.records.texture import CONSTANT, Environment, MapSource, Texture
 from tests.columns_kit import COAT, WAVES, declared
 from tests.command_line import trilight
 from tests.for_each import case, for_each, with_folders

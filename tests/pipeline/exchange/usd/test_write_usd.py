@@ -28,12 +28,11 @@ from pipeline.foreign.limits import WRITTEN_USD_SUFFIXES
 from scene_templates.rotations import uniform_rotation
 from storage.conventions import linear_from_srgb8
 from storage.errors import TrilightError
-from storage.records.environment import Environment
 from storage.records.exr import encode_channels
 from storage.records.lookup import environment_values
 from storage.records.scene import Scene, SceneObject
 from storage.records.scene_file import encode_scene, scene_digest
-from storage.records.texture import MapSource, Texture
+from storage.records.texture import Environment, MapSource, Texture
 from tests.for_each import for_each, with_folders
 from tests.pipeline.exchange.exchange_kit import assert_usd_keeps_all, edited_layer, errors_of
 from tests.pipeline.foreign.test_light_pictures import radiance_hdr

@@ -121,7 +121,7 @@ class _Bucket:
 def bucket(monkeypatch: pytest.MonkeyPatch) -> _Bucket:
     """The bucket that any address leads to."""
     made = _Bucket({f"bucket/{name}.obj": name.encode() for name in "abc"})
-    for user in ("pipeline.objects.remote.source", "storage.remote.fetch"):
+    for user in ("pipeline.objects.remote.source", "storage.remote.transfers"):
         monkeypatch.setattr(f"{user}.shared_driver", lambda url: made)
     return made
 
@@ -430,6 +430,6 @@ def test_a_full_disk_ends_the_run(site: Site, monkeypatch: pytest.MonkeyPatch) -
     def full(*_: object) -> None:
         raise OSError(28, "No space left on device")
 
-    monkeypatch.setattr("storage.remote.fetch._fill_http", full)
+    monkeypatch.setattr("storage.remote.transfers._fill_http", full)
     with pytest.raises(TrilightError, match="disk is full"):
         find(site.url)

@@ -5,13 +5,13 @@ import pytest
 from numpy.typing import NDArray
 from scipy.interpolate import RegularGridInterpolator
 
-from storage.optics import multiscatter
-from storage.optics.bsdf import constant_albedos
-from storage.optics.multiscatter import (
+from storage import optics
+from storage.optics import (
     ROUGHNESS_STEPS,
     X_STEPS,
     Smith,
     albedo_table,
+    constant_albedos,
     directional_albedo,
     mean_albedo,
     scattered_again,
@@ -85,8 +85,8 @@ def test_the_table_is_exact_between_its_entries(
     for c in (cosine, np.minimum(dip, 1)):
         x = stretched(c, roughness**2)
         read.append((x, interpolated(x, roughness**2, smith)))
-    monkeypatch.setattr(multiscatter, "_INNER", 32)
-    monkeypatch.setattr(multiscatter, "_OUTER", 32)
+    monkeypatch.setattr(optics, "_INNER", 32)
+    monkeypatch.setattr(optics, "_OUTER", 32)
     for x, values in read:
         exact = directional_albedo(x, roughness**2, smith)
         # A furnace is off by as much as E is: a fifth of the 1 % that is allowed.

@@ -14,13 +14,16 @@ from storage.conventions import camera_rays, in_camera, look_at_c2w, pixel_place
 from storage.dataset.settings import StorageSettings
 from storage.errors import TrilightError
 from storage.raycast import first_hits
-from storage.records.exr import channel_names, decode_channels, encode_channels
+from storage.records import passes
+from storage.records.exr import decode_channels, encode_channels, read_header
 from storage.records.lookup import texture_values
 from storage.records.material import default_rows
-from storage.records.passes import pictures
-from storage.records.passes.declared import MOTION, PASSES, declared_passes, pass_names
-from storage.records.passes.pictures import (
+from storage.records.passes import (
+    MOTION,
+    PASSES,
+    declared_passes,
     decode_passes_exr,
+    pass_names,
     passes_exr,
     passes_in_file,
     picture_passes,
@@ -135,9 +138,9 @@ def test_blocks_of_rows_join_to_the_same_picture(
     """Means are those of Mitsuba's samples (tests/pipeline/renders/test_passes.py)."""
     for scene in (room(0), textured_scene()):
         resolution = 12
-        monkeypatch.setattr(pictures, "BLOCK_RAYS", 2**14)
+        monkeypatch.setattr(passes, "BLOCK_RAYS", 2**14)
         whole = view_passes(scene, resolution=resolution, rays_a_side=a_side)
-        monkeypatch.setattr(pictures, "BLOCK_RAYS", 5 * resolution * a_side**2)
+        monkeypatch.setattr(passes, "BLOCK_RAYS", 5 * resolution * a_side**2)
         joined = view_passes(scene, resolution=resolution, rays_a_side=a_side)
         centre = view_passes(scene, resolution=resolution)
         hit = view_passes(scene, ["hit"], resolution=resolution * a_side)["hit"]
@@ -343,10 +346,10 @@ def test_stored_passes_are_not_computed_and_ids_fit_float32(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     sample = with_passes(("triangle",))
-    monkeypatch.setattr(pictures, "MOST_IDS", 2)
+    monkeypatch.setattr(passes, "MOST_IDS", 2)
     with pytest.raises(TrilightError, match="3 triangles; expected at most 2"):
         with_passes(("triangle",))
-    monkeypatch.setattr(pictures, "view_passes", None)
+    monkeypatch.setattr(passes, "view_passes", None)
     assert sample.view_passes(["triangle"])["triangle"].shape == (16, 16)
 
 
@@ -469,7 +472,7 @@ def test_files_of_plain_scenes_have_no_coordinates_and_no_nan() -> None:
     names = ["uv", "shading_normal"]
     for scene, there in ((tiny_scene(), set()), (textured_scene(), {"uv"})):
         packed = passes_exr(scene, names, view=0, resolution=RESOLUTION)
-        channels = set(channel_names(packed))
+        channels = {channel.name for channel in read_header(packed)["channels"]}
         assert {name for name in channels if name.startswith("uv")} == (
             {"uv.U", "uv.V"} if there else set()
         )

@@ -1,1 +1,0 @@
-"""Materials as numbers of light: lobes, Fresnel terms and multiple scattering."""
