@@ -4,7 +4,7 @@ import bisect
 import dataclasses
 import json
 from collections import Counter
-from collections.abc import Collection, Iterable, Mapping, Sequence
+from collections.abc import Collection, Iterable
 from typing import Any
 
 from markupsafe import Markup
@@ -29,30 +29,12 @@ from storage.dataset.statistics import Statistics, dataset_statistics
 from storage.digests import sha256_hex, sha256_of_file
 from storage.licences import licence_url
 from storage.markdown import front_matter
-from storage.records.objects import SKY, TEXTURE
 from storage.records.profiles import PLAIN
-from storage.records.quantities import summary
 
 _TAGS = (
     "neural-rendering", "path-tracing", "renderformer", "3d", "hdr", "openexr", "webdataset",
     "trilight",
 )  # fmt: skip
-_SETTINGS = (
-    ("seed", "seed"),
-    ("objects from", "source"),
-    ("picture width, pixels", "renders.resolution"),
-    ("target stated error, dB", "renders.noise_floor_db"),
-    ("target as linear PSNR, dB", "renders.noise_floor_linear_db"),
-    ("target over geometry, dB", "renders.noise_floor_objects_db"),
-    ("most samples per pixel", "renders.max_spp"),
-    ("longest light path", "renders.max_depth"),
-    ("views of a scene", "scenes.num_views"),
-    ("most triangles of a scene", "scenes.max_triangles"),
-    ("scenes of a shard", "splits.scenes_per_shard"),
-    ("profile", "storage.profile"),
-)
-"""Labels and names of the settings that the card shows; the manifest has all of them."""
-_ENVIRONMENT = (("Mitsuba variant", "mitsuba_variant"), ("processor", "processor"))
 
 
 def encode_card(folder: DatasetFolder, manifest: Manifest, distributions: Distributions) -> bytes:
@@ -62,8 +44,6 @@ def encode_card(folder: DatasetFolder, manifest: Manifest, distributions: Distri
     layouts = Counter[str]()
     for (template, _), count in sorted(distributions.scenes.items()):
         layouts[template] += count
-    settings = [(label, manifest.setting(name)) for label, name in _SETTINGS]
-    settings += [(label, manifest.environment.get(name)) for label, name in _ENVIRONMENT]
     return render_markdown(
         "card.jinja",
         front=Markup(front_matter(_front(folder, manifest, licences, title))),
@@ -71,18 +51,11 @@ def encode_card(folder: DatasetFolder, manifest: Manifest, distributions: Distri
         folder=folder,
         manifest=manifest,
         found=distributions,
-        resolution=manifest.setting("renders.resolution"),
-        splits=_by_split(manifest, distributions),
-        states_expected=summary(distributions.all("expected_error_db"))["count"] > 0,
         layouts=layouts,
-        triangles=summary(distributions.all("triangles_per_scene")),
-        num_scenes=sum(distributions.scenes.values()),
-        families=Counter(kind for kind, _ in distributions.maps),
-        user_maps=_user_maps(distributions),
         derivation=derivation_of(manifest.settings),
-        settings=[(label, value) for label, value in settings if value is not None],
-        arrays=" or ".join(_arrays(distributions.packings)),
+        measured=list(MEASURED.values()),
         licences=licences,
+        plain=PLAIN,
     )
 
 
@@ -114,52 +87,6 @@ def _size_category(num_scenes: int) -> str:
     """Return Hugging Face's name for a number of samples."""
     names = ("n<1K", "1K<n<10K", "10K<n<100K", "100K<n<1M", "1M<n<10M", "n>10M")
     return names[bisect.bisect_right([10**power for power in range(3, 8)], num_scenes)]
-
-
-def _by_split(manifest: Manifest, distributions: Distributions) -> list[Sequence[object]]:
-    """Return the cells of each split's row."""
-    rows: list[Sequence[object]] = []
-    for split in distributions.splits:
-        floors = {name: summary(distributions.values[split][name]) for name in MEASURED.values()}
-        num_views = int(floors["noise_floor_db"]["count"])
-        shards = [shard for shard in manifest.shards if shard.split == split]
-        reached = distributions.reaches_targets(split)
-        expected = summary(distributions.values[split]["expected_error_db"])
-        probably = f", probably {expected['median']:.1f}" if expected["count"] else ""
-        rows.append(
-            (
-                split,
-                sum(shard.num_samples for shard in shards),
-                num_views,
-                len(shards),
-                _three(floors, "median") + probably if num_views else "",
-                _three(floors, "p5") if num_views else "",
-                f"{reached.mean():.0%}" if reached is not None and num_views else "",
-                f"{distributions.views_at_cap[split] / max(num_views, 1):.0%}",
-            )
-        )
-    return rows
-
-
-def _three(floors: Mapping[str, Mapping[str, float]], statistic: str) -> str:
-    log, linear, objects = (numbers[statistic] for numbers in floors.values())
-    return f"{log:.1f} ({linear:.1f}, {objects:.1f})"
-
-
-def _user_maps(distributions: Distributions) -> list[tuple[str, int, int]]:
-    """Return how many of the user's textures and of the maps there are and are used, if any."""
-    rows = []
-    for kind, name in ((TEXTURE, "textures"), (SKY, "skies")):
-        uids = {entry.uid for entry in distributions.locked if entry.kind == kind}
-        if uids:
-            rows.append((name, len(uids), len(uids & set(distributions.map_uses))))
-    return rows
-
-
-def _arrays(packings: Collection[str]) -> list[str]:
-    """Return expressions for a sample's arrays; a merged dataset may have both packings."""
-    *rest, last = sorted(packings) or [PLAIN]
-    return [*(f'sample.get("{packing}")' for packing in rest), f'sample["{last}"]']
 
 
 def write_documents(dataset: Dataset, out: DatasetFolder) -> Statistics:

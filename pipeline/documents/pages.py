@@ -18,6 +18,7 @@ from numpy.typing import NDArray
 from pipeline.documents.png import encode_png
 from storage.licences import DUTIES, duties_of, licence_url, union_of_duties
 from storage.markdown import code, text
+from storage.records.quantities import summary
 
 
 class Figure(NamedTuple):
@@ -96,4 +97,6 @@ _MARKDOWN.globals |= {
     "duty_texts": DUTIES,
 }
 _MARKDOWN.tests["known_licence"] = lambda name: duties_of(name) is not None
+_MARKDOWN.filters["summary"] = summary
+_MARKDOWN.filters["extract"] = lambda name, values: values[name]
 _MARKDOWN.filters["code"] = lambda value: Markup(code(value))
