@@ -18,7 +18,7 @@ import numpy as np
 from pipeline.documents.distributions import MEASURED, SURFACE_COUNTS, Distributions
 from pipeline.documents.figures import Panel, draw_bars, draw_panels
 from pipeline.documents.pages import data_uri, png_uri, render_page
-from pipeline.documents.scene_page import encode_scene_page, passes_command, preview
+from pipeline.documents.scene_page import encode_scene_page, preview
 from pipeline.documents.sheets import choose_scenes, read_chosen
 from storage.atomic import write_atomically
 from storage.conventions import preview_gain
@@ -162,7 +162,6 @@ def write_report(dataset: Dataset, distributions: Distributions, *, out: Dataset
         floors={label: numbers for label, numbers in floors.items() if numbers["count"]},
         cards=cards,
         filters=gallery_filters(cards),
-        passes_command=passes_command(),
         sections=report_sections(distributions),
         most_used=_most_used(distributions, dataset),
         settings=list(_lines(settings)),
