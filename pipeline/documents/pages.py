@@ -80,7 +80,7 @@ def _make_environment(**options: Any) -> Environment:
 
 _PAGES = _make_environment()
 _PAGES.tests["address"] = is_address
-_PAGES.filters["png"] = png_uri
+_PAGES.filters |= {"png": png_uri, "summary": summary}
 _PAGES.globals |= {
     "style": Markup((_TEMPLATES / "page.css").read_text()),
     "script": Markup(_SCRIPT),
@@ -97,6 +97,8 @@ _MARKDOWN.globals |= {
     "duty_texts": DUTIES,
 }
 _MARKDOWN.tests["known_licence"] = lambda name: duties_of(name) is not None
-_MARKDOWN.filters["summary"] = summary
-_MARKDOWN.filters["extract"] = lambda name, values: values[name]
-_MARKDOWN.filters["code"] = lambda value: Markup(code(value))
+_MARKDOWN.filters |= {
+    "code": lambda value: Markup(code(value)),
+    "extract": lambda name, values: values[name],
+    "summary": summary,
+}
