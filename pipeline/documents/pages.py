@@ -6,6 +6,7 @@ script.
 
 import base64
 import hashlib
+from collections import Counter
 from pathlib import Path
 from typing import Any, NamedTuple
 from urllib.parse import urlsplit
@@ -82,6 +83,7 @@ _PAGES = _make_environment()
 _PAGES.tests["address"] = is_address
 _PAGES.filters |= {"png": png_uri, "summary": summary}
 _PAGES.globals |= {
+    "Counter": Counter,
     "style": Markup((_TEMPLATES / "page.css").read_text()),
     "script": Markup(_SCRIPT),
     "script_sha256": base64.b64encode(hashlib.sha256(_SCRIPT.encode()).digest()).decode(),
