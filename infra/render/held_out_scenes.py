@@ -19,7 +19,6 @@ from pipeline.shards.pack_shards import PublishedShards
 from scene_templates.settings import SceneSettings
 from storage.dataset.layout import DatasetFolder
 from storage.dataset.splits import JUDGED_SPLIT
-from storage.errors import Rejected
 from storage.machine import available_cores
 from storage.records.scene import Scene
 from storage.settings.overrides import apply_overrides
@@ -93,7 +92,4 @@ def first_composed(
     Raises:
         Rejected: every attempt at it was rejected.
     """
-    scene = child.call_method(SceneWorker.compose_first, settings, scene_index, seed, split)
-    if scene is None:
-        raise Rejected("no_scene", f"scene {scene_index}: every attempt at it was rejected")
-    return scene
+    return child.call_method(SceneWorker.compose_first, settings, scene_index, seed, split)

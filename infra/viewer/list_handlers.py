@@ -189,7 +189,7 @@ class DatasetIndex:
                         if self._closed:
                             return
                         with reading(self._dataset.display_name, shard.name):
-                            row = _row(opened, key, shard)
+                            row = _row(self._dataset, opened, key, shard)
                         self._rows.append(row)
                         self._by_key[key] = row
             except (TrilightError, OSError) as error:
@@ -197,7 +197,7 @@ class DatasetIndex:
             self.shards_read += 1
 
 
-def _row(opened: ShardReader, key: str, shard: ShardEntry) -> SceneRow:
+def _row(dataset: Dataset, opened: ShardReader, key: str, shard: ShardEntry) -> SceneRow:
     members = opened.samples[key]
     record = json.loads(opened.read(members["json"]))
     values: dict[str, Any] = {
@@ -210,6 +210,7 @@ def _row(opened: ShardReader, key: str, shard: ShardEntry) -> SceneRow:
     for name in _OF_VIEWS:  # as single numbers, like those that `trilight shards select` compares
         values[name] = array("f", [view[name] for view in record["views"]])
     facts = SceneFacts(
+        dataset=dataset,
         shard=shard,
         key=key,
         template=values["template"],

@@ -4,14 +4,14 @@ import bisect
 import dataclasses
 import json
 from collections import Counter
-from collections.abc import Collection, Iterable, Mapping, Sequence
+from collections.abc import Collection, Iterable
 from typing import Any
 
 from markupsafe import Markup
 
 from pipeline.documents.checksums import renew_sums
 from pipeline.documents.distributions import MEASURED, Distributions, dataset_distributions
-from pipeline.documents.pages import render_markdown
+from pipeline.documents.pages import render_markdown, render_page
 from pipeline.documents.report import write_report
 from pipeline.documents.rights import encode_attribution, hub_licence
 from pipeline.documents.sheets import write_contact_sheet
@@ -21,7 +21,6 @@ from storage.dataset.dataset import Dataset
 from storage.dataset.layout import DatasetFolder
 from storage.dataset.manifest import (
     Manifest,
-    ShardEntry,
     derivation_of,
     read_manifest,
     write_manifest,
@@ -30,30 +29,12 @@ from storage.dataset.statistics import Statistics, dataset_statistics
 from storage.digests import sha256_hex, sha256_of_file
 from storage.licences import licence_url
 from storage.markdown import front_matter
-from storage.records.objects import SKY, TEXTURE
 from storage.records.profiles import PLAIN
-from storage.records.quantities import summary
 
 _TAGS = (
     "neural-rendering", "path-tracing", "renderformer", "3d", "hdr", "openexr", "webdataset",
     "trilight",
 )  # fmt: skip
-_SETTINGS = (
-    ("seed", "seed"),
-    ("objects from", "source"),
-    ("picture width, pixels", "renders.resolution"),
-    ("target stated error, dB", "renders.noise_floor_db"),
-    ("target as linear PSNR, dB", "renders.noise_floor_linear_db"),
-    ("target over geometry, dB", "renders.noise_floor_objects_db"),
-    ("most samples per pixel", "renders.max_spp"),
-    ("longest light path", "renders.max_depth"),
-    ("views of a scene", "scenes.num_views"),
-    ("most triangles of a scene", "scenes.max_triangles"),
-    ("scenes of a shard", "splits.scenes_per_shard"),
-    ("profile", "storage.profile"),
-)
-"""Labels and names of the settings that the card shows; the manifest has all of them."""
-_ENVIRONMENT = (("Mitsuba variant", "mitsuba_variant"), ("processor", "processor"))
 
 
 def encode_card(folder: DatasetFolder, manifest: Manifest, distributions: Distributions) -> bytes:
@@ -63,8 +44,6 @@ def encode_card(folder: DatasetFolder, manifest: Manifest, distributions: Distri
     layouts = Counter[str]()
     for (template, _), count in sorted(distributions.scenes.items()):
         layouts[template] += count
-    settings = [(label, manifest.setting(name)) for label, name in _SETTINGS]
-    settings += [(label, manifest.environment.get(name)) for label, name in _ENVIRONMENT]
     return render_markdown(
         "card.jinja",
         front=Markup(front_matter(_front(folder, manifest, licences, title))),
@@ -72,18 +51,11 @@ def encode_card(folder: DatasetFolder, manifest: Manifest, distributions: Distri
         folder=folder,
         manifest=manifest,
         found=distributions,
-        resolution=manifest.setting("renders.resolution"),
-        splits=_by_split(manifest, distributions),
-        states_expected=summary(distributions.all("expected_error_db"))["count"] > 0,
         layouts=layouts,
-        triangles=summary(distributions.all("triangles_per_scene")),
-        num_scenes=sum(distributions.scenes.values()),
-        families=Counter(kind for kind, _ in distributions.maps),
-        user_maps=_user_maps(distributions),
         derivation=derivation_of(manifest.settings),
-        settings=[(label, value) for label, value in settings if value is not None],
-        arrays=" or ".join(_arrays(distributions.packings)),
+        measured=list(MEASURED.values()),
         licences=licences,
+        plain=PLAIN,
     )
 
 
@@ -115,52 +87,6 @@ def _size_category(num_scenes: int) -> str:
     """Return Hugging Face's name for a number of samples."""
     names = ("n<1K", "1K<n<10K", "10K<n<100K", "100K<n<1M", "1M<n<10M", "n>10M")
     return names[bisect.bisect_right([10**power for power in range(3, 8)], num_scenes)]
-
-
-def _by_split(manifest: Manifest, distributions: Distributions) -> list[Sequence[object]]:
-    """Return the cells of each split's row."""
-    rows: list[Sequence[object]] = []
-    for split in distributions.splits:
-        floors = {name: summary(distributions.values[split][name]) for name in MEASURED.values()}
-        num_views = int(floors["noise_floor_db"]["count"])
-        shards = [shard for shard in manifest.shards if shard.split == split]
-        reached = distributions.reaches_targets(split)
-        expected = summary(distributions.values[split]["expected_error_db"])
-        probably = f", probably {expected['median']:.1f}" if expected["count"] else ""
-        rows.append(
-            (
-                split,
-                sum(shard.num_samples for shard in shards),
-                num_views,
-                len(shards),
-                _three(floors, "median") + probably if num_views else "",
-                _three(floors, "p5") if num_views else "",
-                f"{reached.mean():.0%}" if reached is not None and num_views else "",
-                f"{distributions.views_at_cap[split] / max(num_views, 1):.0%}",
-            )
-        )
-    return rows
-
-
-def _three(floors: Mapping[str, Mapping[str, float]], statistic: str) -> str:
-    log, linear, objects = (numbers[statistic] for numbers in floors.values())
-    return f"{log:.1f} ({linear:.1f}, {objects:.1f})"
-
-
-def _user_maps(distributions: Distributions) -> list[tuple[str, int, int]]:
-    """Return how many of the user's textures and of the maps there are and are used, if any."""
-    rows = []
-    for kind, name in ((TEXTURE, "textures"), (SKY, "skies")):
-        uids = {entry.uid for entry in distributions.locked if entry.kind == kind}
-        if uids:
-            rows.append((name, len(uids), len(uids & set(distributions.map_uses))))
-    return rows
-
-
-def _arrays(packings: Collection[str]) -> list[str]:
-    """Return expressions for a sample's arrays; a merged dataset may have both packings."""
-    *rest, last = sorted(packings) or [PLAIN]
-    return [*(f'sample.get("{packing}")' for packing in rest), f'sample["{last}"]']
 
 
 def write_documents(dataset: Dataset, out: DatasetFolder) -> Statistics:
@@ -198,150 +124,28 @@ def write_documents(dataset: Dataset, out: DatasetFolder) -> Statistics:
     return statistics
 
 
-_TERMS = (
-    "arrayShape citeAs column containedIn equivalentProperty extract field fileObject "
-    "fileProperty fileSet format includes isArray isLiveDataset jsonPath key md5 parentField "
-    "path recordSet references regex repeated replace samplingRate separator source subField "
-    "transform"
-).split()
-_CONTEXT: Mapping[str, Any] = {
-    "@language": "en",
-    "@vocab": "https://schema.org/",
-    "conformsTo": "dct:conformsTo",
-    "cr": "http://mlcommons.org/croissant/",
-    "data": {"@id": "cr:data", "@type": "@json"},
-    "dataType": {"@id": "cr:dataType", "@type": "@vocab"},
-    "dct": "http://purl.org/dc/terms/",
-    "description": {"@container": "@language"},
-    "examples": {"@id": "cr:examples", "@type": "@json"},
-    "name": {"@container": "@language"},
-    "rai": "http://mlcommons.org/croissant/RAI/",
-    "sc": "https://schema.org/",
-    **{term: f"cr:{term}" for term in _TERMS},
-}
-"""The context that the specification prescribes."""
-
-_SPLIT_URLS: Mapping[str, str] = {
-    "train": "http://mlcommons.org/croissant/Training",
-    "validation": "http://mlcommons.org/croissant/Validation",
-    "test": "http://mlcommons.org/croissant/Test",
-}
-_RECORDS = "scene-records"
+MOST_LISTED = 10_000
+"""Most shards that are listed one by one; beyond that only `manifest.json` has their digests."""
 
 
 def encode_croissant(manifest: Manifest, licences: Iterable[str]) -> bytes:
     """Return `croissant.json`: every shard with its sha256, and a record for each scene.
 
-    The vocabulary is Croissant 1.1 of MLCommons, as JSON-LD. It is written as plain JSON:
-    mlcroissant, which validates it in the tests, would be a slower way to write the same
-    dictionary. It has no date of publication: equal datasets give equal bytes. A licence without a
-    known URL is stated by its name.
+    The vocabulary is Croissant 1.1 of MLCommons, as JSON-LD. mlcroissant, which validates it in the
+    tests, would be a slower way to write the same document. It has no date of publication: equal
+    datasets give equal bytes. A licence without a known URL is stated by its name.
     """
-    digest = manifest.dataset_digest
-    shards = list(manifest.shards)
-    document: dict[str, Any] = {
-        "@context": _CONTEXT,
-        "@type": "sc:Dataset",
-        "conformsTo": "http://mlcommons.org/croissant/1.1",
-        "name": f"trilight-{manifest.build}",
-        "description": (
-            f"{manifest.num_samples} path-traced scenes of triangles with {manifest.num_views} HDR "
-            "views each, every view with its own measured error, as WebDataset shards."
-        ),
-        "version": f"{manifest.schema_version}.0.0+{digest[:12]}",
-        "identifier": f"sha256:{digest}",
-        "keywords": ["neural rendering", "path tracing", "HDR", "WebDataset"],
-        "license": [licence_url(name) or name for name in licences],
-        "distribution": _distribution(shards),
-        "recordSet": [_splits(shards), _scenes()] if shards else [],
-    }
-    text = json.dumps(document, indent=1, sort_keys=True, ensure_ascii=True)
+    shards = manifest.shards
+    listed = shards if len(shards) <= MOST_LISTED else ()
+    names = [shard.name for shard in listed] or (["shards"] if shards else [])
+    document = render_page(
+        "croissant.jinja",
+        f"trilight-{manifest.build}",
+        manifest=manifest,
+        licences=[licence_url(name) or name for name in licences],
+        listed=listed,
+        archives=[{"@id": name} for name in names],
+        splits=[split for split in SPLITS if any(shard.split == split for shard in shards)],
+    )
+    text = json.dumps(json.loads(document), indent=1, sort_keys=True, ensure_ascii=True)
     return text.encode() + b"\n"
-
-
-MOST_LISTED = 10_000
-"""Most shards that are listed one by one; beyond that only `manifest.json` has their digests."""
-
-
-def _distribution(shards: list[ShardEntry]) -> list[dict[str, Any]]:
-    """Return the shards, and the kinds of members in all of them."""
-    if len(shards) > MOST_LISTED:
-        files = [
-            _node(
-                "cr:FileSet",
-                "shards",
-                description="manifest.json has the size and sha256 of each",
-                encodingFormat="application/x-tar",
-                includes="**/*.tar",
-            )
-        ]
-    else:
-        files = [
-            _node(
-                "cr:FileObject",
-                shard.name,
-                contentUrl=shard.name,
-                contentSize=f"{shard.num_bytes} B",
-                encodingFormat="application/x-tar",
-                sha256=shard.sha256,
-            )
-            for shard in shards
-        ]
-    kinds = (
-        (_RECORDS, "objects, provenance and the record of each view", "application/json", "*.json"),
-        (
-            "scene-arrays",
-            "geometry, materials and cameras as safetensors, gzip where the name ends so",
-            "application/octet-stream",
-            "*.scene.safetensors*",
-        ),
-        ("pictures", "linear radiance of each view, half floats", "image/x-exr", "*.exr"),
-    )
-    archives = [{"@id": file["name"]} for file in files]
-    members = [
-        _node(
-            "cr:FileSet",
-            name,
-            description=description,
-            containedIn=archives,
-            encodingFormat=encoding,
-            includes=pattern,
-        )
-        for name, description, encoding, pattern in kinds
-    ]
-    return [*files, *members] if files else []
-
-
-def _node(kind: str, name: str, **fields: Any) -> dict[str, Any]:
-    return {"@type": kind, "@id": name, "name": name, **fields}
-
-
-def _splits(shards: list[ShardEntry]) -> dict[str, Any]:
-    used = [split for split in SPLITS if any(shard.split == split for shard in shards)]
-    return _node(
-        "cr:RecordSet",
-        "splits",
-        description="a shard holds one split; its name begins with it",
-        dataType="cr:Split",
-        key={"@id": "splits/name"},
-        field=[_field("splits/name", "sc:Text"), _field("splits/url", "sc:URL")],
-        data=[{"splits/name": split, "splits/url": _SPLIT_URLS[split]} for split in used],
-    )
-
-
-def _scenes() -> dict[str, Any]:
-    """Return the records of scenes: key and JSON, which is all mlcroissant reads of many tars."""
-    key = {"extract": {"fileProperty": "filename"}, "transform": {"regex": r"^([^.]+)\."}}
-    content = {"extract": {"fileProperty": "content"}}
-    return _node(
-        "cr:RecordSet",
-        "scenes",
-        description="one record per scene; its arrays and pictures have the same key",
-        key={"@id": "scenes/key"},
-        field=[_field("scenes/key", "sc:Text", key), _field("scenes/json", "sc:Text", content)],
-    )
-
-
-def _field(name: str, data_type: str, source: Mapping[str, Any] | None = None) -> dict[str, Any]:
-    field = _node("cr:Field", name, dataType=data_type)
-    return field | ({"source": {"fileSet": {"@id": _RECORDS}, **source}} if source else {})

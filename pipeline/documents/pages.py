@@ -6,6 +6,7 @@ script.
 
 import base64
 import hashlib
+from collections import Counter
 from pathlib import Path
 from typing import Any, NamedTuple
 from urllib.parse import urlsplit
@@ -18,6 +19,7 @@ from numpy.typing import NDArray
 from pipeline.documents.png import encode_png
 from storage.licences import DUTIES, duties_of, licence_url, union_of_duties
 from storage.markdown import code, text
+from storage.records.quantities import summary
 
 
 class Figure(NamedTuple):
@@ -79,8 +81,9 @@ def _make_environment(**options: Any) -> Environment:
 
 _PAGES = _make_environment()
 _PAGES.tests["address"] = is_address
-_PAGES.filters["png"] = png_uri
+_PAGES.filters |= {"png": png_uri, "summary": summary}
 _PAGES.globals |= {
+    "Counter": Counter,
     "style": Markup((_TEMPLATES / "page.css").read_text()),
     "script": Markup(_SCRIPT),
     "script_sha256": base64.b64encode(hashlib.sha256(_SCRIPT.encode()).digest()).decode(),
@@ -96,4 +99,8 @@ _MARKDOWN.globals |= {
     "duty_texts": DUTIES,
 }
 _MARKDOWN.tests["known_licence"] = lambda name: duties_of(name) is not None
-_MARKDOWN.filters["code"] = lambda value: Markup(code(value))
+_MARKDOWN.filters |= {
+    "code": lambda value: Markup(code(value)),
+    "extract": lambda name, values: values[name],
+    "summary": summary,
+}

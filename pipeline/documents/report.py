@@ -13,12 +13,10 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import NamedTuple
 
-import numpy as np
-
-from pipeline.documents.distributions import MEASURED, SURFACE_COUNTS, Distributions
+from pipeline.documents.distributions import MEASURED, Distributions
 from pipeline.documents.figures import Panel, draw_bars, draw_panels
 from pipeline.documents.pages import data_uri, png_uri, render_page
-from pipeline.documents.scene_page import encode_scene_page, passes_command, preview
+from pipeline.documents.scene_page import encode_scene_page, preview
 from pipeline.documents.sheets import choose_scenes, read_chosen
 from storage.atomic import write_atomically
 from storage.conventions import preview_gain
@@ -162,8 +160,9 @@ def write_report(dataset: Dataset, distributions: Distributions, *, out: Dataset
         floors={label: numbers for label, numbers in floors.items() if numbers["count"]},
         cards=cards,
         filters=gallery_filters(cards),
-        passes_command=passes_command(),
-        sections=report_sections(distributions),
+        parts=report_sections(distributions),
+        statistics=STATISTICS,
+        attempts=list(_ATTEMPTS),
         most_used=_most_used(distributions, dataset),
         settings=list(_lines(settings)),
         environment=list(_lines(manifest.environment)),
@@ -219,63 +218,50 @@ _LIMITS = {
     **{measured: ("target", name) for name, measured in MEASURED.items()},
 }
 """Word and setting of the line in a histogram, by quantity."""
-_SKY = ("sky_radiance", "sky_peak", "sky_half_light_deg")
-_KINDS = {"object": "objects", "shell": "floors and walls"}
-
-
-class Table(NamedTuple):
-    """Table whose last columns are numbers."""
-
-    texts: Sequence[str]
-    """Heads of the columns of text."""
-    numbers: Sequence[str]
-    """Heads of the columns of numbers."""
-    rows: Sequence[Sequence[object]]
+_HISTOGRAMS = {
+    "triangles": ("triangles_per_scene", "triangles_per_object"),
+    "materials": ("diffuse", "specular", "albedo_sum", "roughness"),
+    "lights": ("lights_per_scene", "total_emission", "light_distance", "light_size"),
+    "cameras": ("camera_distance", "elevation_deg", "fov_deg", "azimuth_deg"),
+    "pictures": (*MEASURED.values(), "spp", "coverage"),
+}
+"""Quantities of the histograms of a part."""
 
 
 class ReportPart(NamedTuple):
-    """Figure with tables and notes beside it."""
+    """Figure with the rows of its numbers."""
 
     figure: str
-    """Data URI; empty for none."""
+    """Address that holds the data of the picture itself."""
     alt: str
-    tables: Sequence[Table]
-    notes: Sequence[str] = ()
+    rows: Sequence[Sequence[object]]
+    """Cells of a table, the last of which are numbers."""
 
 
-def report_sections(distributions: Distributions) -> dict[str, list[ReportPart]]:
-    """Return the parts below each title; none without scenes, and without maps none on maps."""
+def report_sections(distributions: Distributions) -> dict[str, ReportPart]:
+    """Return the figures by the name of their part; none without scenes, and none without data."""
     if not distributions.scenes:
         return {}
-    triangles = ("triangles_per_scene", "triangles_per_object")
-    emitted = ("lights_per_scene", "total_emission", "light_distance", "light_size")
-    seen_from = ("camera_distance", "elevation_deg", "fov_deg", "azimuth_deg")
-    measured = (*MEASURED.values(), "spp", "coverage")
-    replaced = int((distributions.all("camera_attempt") > 0).sum())
-    note = f"{replaced} cameras stand in for rejected ones."
-    floors = _floors_by_split(distributions)
-    maps = [_maps(distributions), _map_sizes(distributions)] if distributions.maps else []
-    return {
-        "Scenes": [_scenes(distributions)],
-        "Objects": [_objects(distributions)],
-        "Triangles": [_histograms(distributions, triangles)],
-        "Materials": [_materials(distributions)],
-        **({"Textures and skies": maps} if maps else {}),
-        "Lights": [_histograms(distributions, emitted)],
-        "Cameras": [_histograms(distributions, seen_from, notes=[note])],
-        "Pictures": [_histograms(distributions, measured, tables=[floors])],
-        "Rejections": [_rejections(distributions)],
-        "Licenses": [_licences(distributions)],
-    }
+    uses = distributions.uses_per_object()
+    places = Panel(values=uses, label="places of an object in scenes", unit="objects")
+    parts = {name: _histograms(distributions, names) for name, names in _HISTOGRAMS.items()}
+    parts["scenes"] = _scenes(distributions)
+    parts["objects"] = _histograms(distributions, ["objects_per_scene"], more=[places])
+    if distributions.maps:
+        sizes = ("textures_per_scene", "texture_width")
+        skies = ("sky_radiance", "sky_peak", "sky_half_light_deg")
+        names = [
+            name for kind in (sizes, skies) if len(distributions.all(kind[-1])) for name in kind
+        ]
+        parts["maps"] = _maps(distributions)
+        parts["map_sizes"] = _histograms(distributions, names)
+    if distributions.rejections:
+        parts["rejections"] = _rejections(distributions)
+    return parts
 
 
 def _histograms(
-    distributions: Distributions,
-    names: Sequence[str],
-    *,
-    more: Sequence[Panel] = (),
-    tables: Sequence[Table] = (),
-    notes: Sequence[str] = (),
+    distributions: Distributions, names: Sequence[str], *, more: Sequence[Panel] = ()
 ) -> ReportPart:
     """Return histograms of quantities, and of whole numbers in `more`, with their statistics."""
     panels = [*(_panel(distributions, name) for name in names), *more]
@@ -285,8 +271,7 @@ def _histograms(
         for panel, places in zip(panels, digits, strict=True)
     ]
     alt = ", ".join(panel.label for panel in panels)
-    figure = data_uri(draw_panels(panels))
-    return ReportPart(figure, alt, [Table([""], STATISTICS, rows), *tables], notes)
+    return ReportPart(data_uri(draw_panels(panels)), alt, rows)
 
 
 def _panel(distributions: Distributions, name: str) -> Panel:
@@ -326,34 +311,11 @@ def _scenes(distributions: Distributions) -> ReportPart:
     }
     columns = [*counts.values(), [sum(row) for row in zip(*counts.values(), strict=True)]]
     rows = [*zip(names, *columns, strict=True), ("all", *map(sum, columns))]
-    table = Table(["template"], [*counts, "all"], rows)
-    return ReportPart(_bars(names, counts, "scenes"), "scenes by template and split", [table])
-
-
-def _objects(distributions: Distributions) -> ReportPart:
-    uses = np.array(distributions.uses_per_object())
-    places = Panel(values=uses, label="places of an object in scenes", unit="objects")
-    note = f"{int((uses > 0).sum())} of {len(uses)} objects stand in a scene."
-    return _histograms(distributions, ["objects_per_scene"], more=[places], notes=[note])
-
-
-def _materials(distributions: Distributions) -> ReportPart:
-    rows = []
-    for kind, name in _KINDS.items():
-        count, *those = (distributions.surfaces[kind, key] for key in SURFACE_COUNTS)
-        rows.append([name, count, *(_share(of_them, count) for of_them in those)])
-    shares = Table(["surfaces"], ["count", "smooth", "many colors", "textured"], rows)
-    note = (
-        "A surface is an object, a floor or a wall in one scene. Of many colors the mean over "
-        "triangles counts, of a texture its mean. Albedos are those of the strongest channel. "
-        "Smooth surfaces share vertices between triangles; the others are flat."
-    )
-    names = ("diffuse", "specular", "albedo_sum", "roughness")
-    return _histograms(distributions, names, tables=[shares], notes=[note])
+    return ReportPart(_bars(names, counts, "scenes"), "scenes by template and split", rows)
 
 
 def _maps(distributions: Distributions) -> ReportPart:
-    """Return the families of textures and skies, and the shares of scenes with some."""
+    """Return the families of textures and skies."""
     ordered = sorted(
         distributions.maps.items(), key=lambda entry: (entry[0][0], -entry[1], entry[0])
     )
@@ -362,57 +324,12 @@ def _maps(distributions: Distributions) -> ReportPart:
         for kind in dict.fromkeys(kind for (kind, _), _ in ordered)
     }
     figure = _bars([name for (_, name), _ in ordered], bars, "scenes")
-    shares = []
-    for name, of_scene in (("textured", "textures_per_scene"), ("below a sky", "skies_per_scene")):
-        values = distributions.all(of_scene)
-        count = int((values > 0).sum())
-        shares.append([f"scenes {name}", count, _share(count, len(values))])
-    for kind, name in _KINDS.items():
-        textured, count = (distributions.surfaces[kind, key] for key in ("textured", "all"))
-        shares.append([f"{name} textured", textured, _share(textured, count)])
-    families = [[kind, name, count] for (kind, name), count in ordered]
-    tables = [
-        Table([""], ["count", "share"], shares),
-        Table(["map", "family or name"], ["scenes"], families),
-    ]
-    return ReportPart(figure, "scenes by family of texture and of sky", tables)
-
-
-def _map_sizes(distributions: Distributions) -> ReportPart:
-    textured, sky_lit = (len(distributions.all(name)) for name in ("texture_width", "sky_radiance"))
-    names = (
-        *(("textures_per_scene", "texture_width") if textured else ()),
-        *(_SKY if sky_lit else ()),
-    )
-    note = "A sun like ours has half of its light in half a degree, a constant sky in 180."
-    return _histograms(distributions, names, notes=[note] if sky_lit else [])
-
-
-def _floors_by_split(distributions: Distributions) -> Table:
-    rows = []
-    for split in distributions.splits:
-        floors = distributions.values[split]["noise_floor_db"]
-        numbers = summary(floors)
-        expected = summary(distributions.values[split]["expected_error_db"])
-        reached = distributions.reaches_targets(split)
-        rows.append(
-            [
-                split,
-                len(floors),
-                *(_statistic(numbers, name, 1) for name in ("median", "p5")),
-                _statistic(expected, "median", 1) if expected["count"] else "",
-                "" if reached is None else _share(int(reached.sum()), len(floors)),
-                _share(distributions.views_at_cap[split], len(floors)),
-            ]
-        )
-    head = ["views", "median dB", "p5 dB", "expected, median dB", "reach the target", "at the cap"]
-    return Table(["split"], head, rows)
+    rows = [(*map_, count) for map_, count in ordered]
+    return ReportPart(figure, "scenes by family of texture and of sky", rows)
 
 
 def _rejections(distributions: Distributions) -> ReportPart:
     rejections = distributions.rejections
-    if not rejections:
-        return ReportPart("", "", [], ["Nothing was rejected."])
     parts = {
         label: [
             sum(number for attempt, number in counts.items() if low <= attempt <= high)
@@ -426,16 +343,4 @@ def _rejections(distributions: Distributions) -> ReportPart:
         [*where, *numbers]
         for where, *numbers in zip(rejections, totals, *parts.values(), strict=True)
     ]
-    table = Table(["stage", "reason"], ["all", *parts], rows)
-    return ReportPart(figure, "rejections by stage and reason", [table])
-
-
-def _licences(distributions: Distributions) -> ReportPart:
-    rows = [(name, *counts) for name, counts in distributions.licences.items()]
-    head = ["objects", "of them in scenes", "places in scenes"]
-    note = "attribution.csv names the author of each object."
-    return ReportPart("", "", [Table(["license"], head, rows)], [note])
-
-
-def _share(count: int, total: int) -> str:
-    return f"{count / total:.1%}" if total else ""
+    return ReportPart(figure, "rejections by stage and reason", rows)

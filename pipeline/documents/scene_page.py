@@ -121,18 +121,6 @@ PASS_VIEWS = (
 )
 
 
-def passes_command(*, scene: str | None = None, for_page: bool = False) -> str:
-    """Return the command that writes passes beside a dataset; it is run in the dataset's folder.
-
-    Args:
-        scene: key of the only scene; None for all.
-        for_page: True for the passes of a scene's page; False for those that the command chooses.
-    """
-    one = "" if scene is None else f" --scene {scene}"
-    words = ",".join(pass_view.word for pass_view in PASS_VIEWS)
-    return f"trilight passes .{one}{f' --passes {words}' if for_page else ''} --out ../passes"
-
-
 def pass_figures(sample: Sample) -> list[list[Figure]]:
     """Return small pictures of the passes, for each view."""
     names = [pass_names([pass_view.word])[0] for pass_view in PASS_VIEWS]
@@ -180,7 +168,8 @@ def encode_scene_page(
         parts=list(_parts(sample)),
         pass_px=PREVIEW_PX,
         passes=pass_figures(sample),
-        passes_command=passes_command(scene=sample.key, for_page=True),
+        key=sample.key,
+        pass_words=",".join(pass_view.word for pass_view in PASS_VIEWS),
         objects=[
             (entry, id_colors(row), shading.get(row, ""), counts[row])
             for row, entry in enumerate(scene.objects)

@@ -23,10 +23,10 @@ import numpy as np
 
 from pipeline.documents.dataset_documents import write_documents
 from pipeline.shards.expression import Condition, condition
-from pipeline.shards.finished_dataset import FinishedDataset, SceneFacts, open_finished, read_facts
+from pipeline.shards.finished_dataset import SceneFacts, open_finished, read_facts
 from storage.atomic import write_error
 from storage.conventions import MANIFEST_VERSION, SPLITS
-from storage.dataset.dataset import open_dataset
+from storage.dataset.dataset import Dataset, open_dataset
 from storage.dataset.layout import DatasetFolder
 from storage.dataset.manifest import (
     Derivation,
@@ -91,64 +91,52 @@ class Selection:
         )
 
 
-@dataclass(frozen=True, kw_only=True)
-class SelectedScene(SceneFacts):
-    """One scene of the new dataset, with its facts in the source."""
-
-    source: FinishedDataset
-    new_key: str
-
-
-_HELD_BY = attrgetter("source", "shard")
+_HELD_BY = attrgetter("dataset", "shard")
 """Returns the source and the shard that hold a selected scene."""
 
 
 def select_scenes(
-    sources: Sequence[FinishedDataset],
-    offsets: Sequence[int],
+    sources: Sequence[Dataset],
     selection: Selection,
     *,
     value_names: Sequence[str] = (),
     shard_done: Callable[[], None],
-) -> list[SelectedScene]:
+) -> list[SceneFacts]:
     """Return the selected scenes, in the order of the sources and of their shards.
 
     Args:
-        offsets: what is added to the keys of each source.
         value_names: names of values to read for each scene beside those of the condition.
 
     Raises:
         TrilightError: two sources hold the same scene, or a source is damaged.
     """
     names = {*value_names, *(selection.condition.names if selection.condition else ())}
-    selected: list[SelectedScene] = []
-    seen: dict[str, SelectedScene] = {}
-    for source, offset in zip(sources, offsets, strict=True):
-        for facts in read_facts(source, names=names, shard_done=shard_done):
-            if not selection.takes(facts):
+    selected: list[SceneFacts] = []
+    seen: dict[str, SceneFacts] = {}
+    for source in sources:
+        for entry in read_facts(source, names=names, shard_done=shard_done):
+            if not selection.takes(entry):
                 continue
-            new_key = offset_key(facts.key, offset)
-            entry = SelectedScene(**vars(facts), source=source, new_key=new_key)
-            first = seen.setdefault(facts.arrays_sha256, entry)
-            if first.source is not source:
+            first = seen.setdefault(entry.arrays_sha256, entry)
+            if first.dataset is not source:
                 raise TrilightError(
-                    f"scene {facts.key} of {source.folder.root} is scene {first.key} of "
-                    f"{first.source.folder.root}; expected each scene once. Leave one of "
+                    f"scene {entry.key} of {source.folder.root} is scene {first.key} of "
+                    f"{first.dataset.folder.root}; expected each scene once. Leave one of "
                     "the datasets out, or generate it with another --seed."
                 )
             selected.append(entry)
     return selected
 
 
-def key_offsets(sources: Sequence[FinishedDataset]) -> list[int]:
-    """Return the offset of the keys of each source: 0, then beyond all keys before.
+def key_offsets(sources: Sequence[Dataset]) -> dict[Dataset, int]:
+    """Return what is added to the keys of each source: 0, then beyond all keys before.
 
     Scenes that could not be made count too: `failures.jsonl` names them.
     """
-    offsets = []
+    offsets = {}
     following = 0
     for source in sources:
-        offsets.append(following)
+        offsets[source] = following
         last = -1
         if derivation_of(source.manifest.settings):  # else keys are indices
             keys = (key for shard in source.manifest.shards for key in source.keys(shard))
@@ -166,30 +154,35 @@ def offset_key(key: str, offset: int) -> str:
     return sample_key(int(key) + offset)
 
 
-def used_objects(selected: Sequence[SelectedScene]) -> list[LockedObject]:
+def used_objects(selected: Sequence[SceneFacts]) -> list[LockedObject]:
     """Return the locked objects that the selected scenes use.
 
     Raises:
         TrilightError: an object is in scenes of two splits, known by its uid or by its asset: what
             is learnt from one would be judged on the other. Or an object is in no lock.
     """
-    splits: dict[str, tuple[str, SelectedScene]] = {}
+    locked_by_uid: dict[Dataset, dict[str, list[LockedObject]]] = {}
+    for source in {entry.dataset for entry in selected}:
+        objects = locked_by_uid[source] = {}
+        for locked in source.objects_lock():  # a merged dataset may have several under one uid
+            objects.setdefault(locked.uid, []).append(locked)
+    splits: dict[str, tuple[str, SceneFacts]] = {}
     used: dict[LockedObject, None] = {}
     for entry in selected:
-        source = entry.source
+        objects = locked_by_uid[entry.dataset]
         for uid in entry.uids:
-            if uid not in source.objects:
+            if uid not in objects:
                 raise TrilightError(
-                    f"{source.folder.root}: object {uid!r} of scene {entry.key} is not in "
+                    f"{entry.dataset.folder.root}: object {uid!r} of scene {entry.key} is not in "
                     "objects.lock.jsonl; run `trilight verify`."
                 )
-            for locked in source.objects[uid]:
+            for locked in objects[uid]:
                 used[locked] = None
                 for name in (f"uid {uid}", f"asset {locked.asset_sha256}"):
                     split, first = splits.setdefault(name, (entry.shard.split, entry))
                     if split != entry.shard.split:
                         places = " and in ".join(
-                            f"{each.shard.split} of {each.source.folder.root} (scene {each.key})"
+                            f"{each.shard.split} of {each.dataset.folder.root} (scene {each.key})"
                             for each in (first, entry)
                         )
                         raise TrilightError(
@@ -213,7 +206,7 @@ _COLUMNS = {
 
 
 def list_scenes(
-    source: FinishedDataset,
+    source: Dataset,
     selection: Selection,
     *,
     progress: Callable[[int, int], None] = lambda done, total: None,
@@ -230,12 +223,11 @@ def list_scenes(
     total = len(source.manifest.shards)
     selected = select_scenes(
         [source],
-        [0],
         selection,
         value_names=(*_TEXTS, *_COLUMNS),
         shard_done=lambda: progress(next(done), total),
     )
-    return [{"key": entry.new_key, **columns_of(entry.values)} for entry in selected]
+    return [{"key": entry.key, **columns_of(entry.values)} for entry in selected]
 
 
 def columns_of(values: Mapping[str, Any]) -> dict[str, Any]:
@@ -270,7 +262,7 @@ class DeriveOptions:
 
 
 def derive_shards(
-    sources: Sequence[FinishedDataset],
+    sources: Sequence[Dataset],
     derive: DeriveOptions,
     out: DatasetFolder,
     *,
@@ -292,7 +284,7 @@ def derive_shards(
     done = itertools.count(1)
     offsets = key_offsets(sources)
     selected = select_scenes(
-        sources, offsets, derive.selection, shard_done=lambda: progress(next(done), total)
+        sources, derive.selection, shard_done=lambda: progress(next(done), total)
     )
     if not selected:
         num_scenes = sum(source.manifest.num_samples for source in sources)
@@ -302,11 +294,11 @@ def derive_shards(
     )
     groups, scenes_per_shard = _group_scenes(sources, derive, selected)
     write_objects_lock(out.objects_lock, objects)
-    write_failures(out.failures, _failures(sources, offsets, selected))
+    write_failures(out.failures, _failures(offsets, selected))
     shards = []
     for number, group in enumerate(groups):
         name = named_shard(number, group[0].shard.split)
-        write_shard(out.shard(name), _samples(group))
+        write_shard(out.shard(name), _samples(group, offsets))
         shards.append(index_shard(out.shard(name)))
         progress(next(done), total + len(groups))
     arguments = dataclasses.asdict(derive.selection) | {"scenes_per_shard": derive.scenes_per_shard}
@@ -314,8 +306,7 @@ def derive_shards(
         operation=derive.operation,
         arguments={name: value for name, value in arguments.items() if value is not None},
         sources=[
-            source_record(source.manifest, key_offset=offset)
-            for source, offset in zip(sources, offsets, strict=True)
+            source_record(source.manifest, key_offset=offset) for source, offset in offsets.items()
         ],
     )
     settings = derived_settings(derivation, scenes_per_shard=scenes_per_shard)
@@ -323,8 +314,8 @@ def derive_shards(
 
 
 def _group_scenes(
-    sources: Sequence[FinishedDataset], derive: DeriveOptions, selected: Sequence[SelectedScene]
-) -> tuple[list[list[SelectedScene]], int | None]:
+    sources: Sequence[Dataset], derive: DeriveOptions, selected: Sequence[SceneFacts]
+) -> tuple[list[list[SceneFacts]], int | None]:
     """Return the scenes of each new shard, and the shard size if it is not the sources'.
 
     Even shards hold one split each, of which the last may be smaller. They are ordered by their
@@ -341,18 +332,20 @@ def _group_scenes(
         for entries in of_splits
         for start in range(0, len(entries), size)
     ]
-    return sorted(groups, key=lambda entries: entries[0].new_key), size
+    return sorted(groups, key=lambda entries: entries[0].key), size
 
 
-def _samples(group: Sequence[SelectedScene]) -> Iterator[tuple[str, Mapping[str, bytes]]]:
+def _samples(
+    group: Sequence[SceneFacts], offsets: Mapping[Dataset, int]
+) -> Iterator[tuple[str, Mapping[str, bytes]]]:
     for (source, shard), entries in itertools.groupby(group, _HELD_BY):
         with source.open_shard(shard, checked=True) as opened:
             for entry in entries:
-                yield entry.new_key, opened.members(entry.key)
+                yield offset_key(entry.key, offsets[source]), opened.members(entry.key)
 
 
 def _manifest(
-    sources: Sequence[FinishedDataset],
+    sources: Sequence[Dataset],
     settings: Mapping[str, Any],
     objects: Sequence[LockedObject],
     shards: tuple[ShardEntry, ...],
@@ -385,18 +378,16 @@ def _extensions(manifests: Sequence[Manifest]) -> Mapping[str, str]:
     return {name: " ".join(sorted(several)) for name, several in sorted(digests.items())}
 
 
-def _failures(
-    sources: Sequence[FinishedDataset], offsets: Sequence[int], selected: Sequence[SelectedScene]
-) -> list[Failure]:
+def _failures(offsets: Mapping[Dataset, int], selected: Sequence[SceneFacts]) -> list[Failure]:
     """Return the rejections of the selected scenes, and of objects.
 
     A given-up scene is never selected. `merge` and `reshard`, which select all scenes, keep its
     rejections too.
     """
-    keys = {(entry.source, entry.key) for entry in selected}
-    held = sum(source.manifest.num_samples for source in sources)
+    keys = {(entry.dataset, entry.key) for entry in selected}
+    held = sum(source.manifest.num_samples for source in offsets)
     rows = []
-    for source, offset in zip(sources, offsets, strict=True):
+    for source, offset in offsets.items():
         for failure in source.failures():
             key, dot, view = failure.item.partition(".")
             if failure.stage not in ("scenes", "renders"):
@@ -407,8 +398,8 @@ def _failures(
     return rows
 
 
-def _require_alike(sources: Sequence[FinishedDataset]) -> None:
-    def facts(source: FinishedDataset) -> dict[str, Any]:
+def _require_alike(sources: Sequence[Dataset]) -> None:
+    def facts(source: Dataset) -> dict[str, Any]:
         of = source.manifest
         pairs = ((name, *name.split(".")) for name in _SAME)
         settings = {name: of.settings.get(a, {}).get(b, False) for name, a, b in pairs}

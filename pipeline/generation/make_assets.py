@@ -5,7 +5,6 @@ import dataclasses
 import hashlib
 import json
 import re
-from collections import Counter
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -260,22 +259,9 @@ def encode_quality_page(
         pairs: pictures by the name of their group.
     """
     rows = report.rows
-    budget = settings.budgets[0]
-    within = "" if settings.epsilon is None else f"fewest within {settings.epsilon:.2%}, "
-    requests = [row.materials for row in rows if row.materials is not None]
+    figure = data_uri(_draw_histograms(rows, settings.budgets[0])) if rows else ""
     return render_page(
-        "quality.html",
-        "Assets",
-        target=f"{settings.profile}, {within}at most {budget} triangles",
-        rows=sorted(rows, key=lambda row: (-row.quality.error_p99, row.uid)),
-        failures=report.failures,
-        groups=pairs,
-        unread=report.unread,
-        licences=Counter(row.licence for row in rows),
-        asked=requests,
-        reasons=Counter(materials.reason for materials in requests if materials.reason),
-        lost=Counter(word for materials in requests for word in materials.lost),
-        figure=data_uri(_draw_histograms(rows, budget)) if rows else "",
+        "quality.html", "Assets", report=report, settings=settings, groups=pairs, figure=figure
     )
 
 

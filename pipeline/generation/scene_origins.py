@@ -25,7 +25,8 @@ from pipeline.objects.licences import stated_licence
 from pipeline.presets.settings import DatasetSettings, RevisitSettings
 from pipeline.scenes.redrawn import with_new_lights, with_new_materials
 from pipeline.scenes.views import ViewCamera, cameras_of, require_valid, with_first_cameras
-from pipeline.shards.finished_dataset import FinishedDataset, open_finished
+from pipeline.shards.finished_dataset import open_finished
+from storage.dataset.dataset import Dataset
 from storage.dataset.layout import DatasetFolder
 from storage.dataset.manifest import ShardEntry
 from storage.dataset.progress import announce_objects, count_object
@@ -136,7 +137,7 @@ class RevisitedScenes:
         )
 
     @cached_property
-    def _source(self) -> FinishedDataset:
+    def _source(self) -> Dataset:
         return open_source(str(self.root), self.digest)
 
     def _origin(
@@ -162,12 +163,12 @@ class RevisitedScenes:
         )
 
 
-def shards_with_scenes(source: FinishedDataset) -> list[ShardEntry]:
+def shards_with_scenes(source: Dataset) -> list[ShardEntry]:
     """Return the shards of a dataset that hold at least one scene."""
     return [shard for shard in source.manifest.shards if shard.num_samples]
 
 
-def open_source(path: str, digest: str) -> FinishedDataset:
+def open_source(path: str, digest: str) -> Dataset:
     """Open a finished dataset; raises TrilightError if it has another digest, or as that does."""
     dataset = open_finished(path)
     if dataset.manifest.dataset_digest != digest:
@@ -238,11 +239,10 @@ def resolve_revisit(settings: DatasetSettings, path: str | None) -> tuple[Datase
     return settings, partial(_accept_objects, source)
 
 
-def _accept_objects(source: FinishedDataset, writer: DatasetWriter) -> AcceptedObjects:
+def _accept_objects(source: Dataset, writer: DatasetWriter) -> AcceptedObjects:
     """Freeze the objects of a finished dataset for the new one, with their licences and splits."""
     locked = sorted(
-        (entry for entries in source.objects.values() for entry in entries),
-        key=lambda entry: canonical_json(dataclasses.asdict(entry)),
+        source.objects_lock(), key=lambda entry: canonical_json(dataclasses.asdict(entry))
     )
     with writer.hold_lock("objects"):
         if writer.frozen_objects() is None:

@@ -3,14 +3,13 @@
 import json
 from collections.abc import Callable, Collection, Iterator, Mapping
 from dataclasses import dataclass
-from functools import cached_property
 from typing import Any
 
 from storage.dataset.dataset import Dataset, open_listed, reading
 from storage.dataset.manifest import ShardEntry, is_whole, num_planned
 from storage.digests import sha256_hex
 from storage.errors import TrilightError
-from storage.records.objects import LockedObject, locked_uids
+from storage.records.objects import locked_uids
 from storage.records.profiles import PACKED, PLAIN, unpack_arrays
 from storage.records.quantities import QUANTITIES
 from storage.records.sample import SceneRecord, decode_scene
@@ -18,23 +17,12 @@ from storage.records.scene_facts import scene_values
 from storage.remote.url import safe_url
 
 
-class FinishedDataset(Dataset):
-    """A dataset on this machine whose shards are all finished."""
-
-    @cached_property
-    def objects(self) -> Mapping[str, list[LockedObject]]:
-        """Locked objects by uid; a merged dataset may have several under one uid."""
-        objects: dict[str, list[LockedObject]] = {}
-        for entry in self.objects_lock():
-            objects.setdefault(entry.uid, []).append(entry)
-        return objects
-
-
 @dataclass(frozen=True, kw_only=True)
 class SceneFacts:
     """Facts that decide whether a scene is selected, and into which shard it goes."""
 
-    shard: ShardEntry  # the shard that holds it
+    dataset: Dataset  # the dataset that holds it
+    shard: ShardEntry  # its shard
     key: str  # its key in that shard
     template: str  # layout of the scene
     noise_floor_db: float  # stated error of its worst view, as psnr_log_db
@@ -43,7 +31,7 @@ class SceneFacts:
     values: Mapping[str, Any]  # requested values by name (pipeline.shards.expression)
 
 
-def open_finished(path: str) -> FinishedDataset:
+def open_finished(path: str) -> Dataset:
     """Open a finished dataset on this machine.
 
     Raises:
@@ -66,11 +54,11 @@ def open_finished(path: str) -> FinishedDataset:
             f"{path}: objects.lock.jsonl is missing or not the one of the manifest (sha256 "
             "differs); run `trilight verify`."
         )
-    return FinishedDataset(listed.store, manifest)
+    return listed
 
 
 def read_facts(
-    dataset: FinishedDataset, *, names: Collection[str], shard_done: Callable[[], None]
+    dataset: Dataset, *, names: Collection[str], shard_done: Callable[[], None]
 ) -> Iterator[SceneFacts]:
     """Yield the facts of every scene, with the values of some names.
 
@@ -94,6 +82,7 @@ def read_facts(
                     rows = ((str(row["kind"]), str(row["uid"])) for row in record["objects"])
                     floors_db = [float(view["noise_floor_db"]) for view in record["views"]]
                     facts = SceneFacts(
+                        dataset=dataset,
                         shard=shard,
                         key=key,
                         template=str(provenance.get("template", "unknown")),

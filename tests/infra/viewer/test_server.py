@@ -41,7 +41,6 @@ from infra.viewer.server import (
 from pipeline.exchange.convert import write_scene
 from pipeline.generation.derive_dataset import Selection, list_scenes
 from pipeline.renders.mitsuba_variant import Variant, choose_variant
-from pipeline.shards.finished_dataset import FinishedDataset
 from storage.conventions import preview_srgb8
 from storage.dataset.dataset import Dataset
 from storage.errors import TrilightError
@@ -334,9 +333,8 @@ def test_what_is_shown_is_what_the_printed_command_selects(
                 name: options.get(f"--{name}") for name in ("split", "template", "where")
             }
             selection = Selection(**stated)
-            whole = FinishedDataset(dataset.store, dataset.manifest)
             assert {row.pop("views") for row in found["rows"]} <= {2}
-            assert found["rows"] == list_scenes(whole, selection)
+            assert found["rows"] == list_scenes(dataset, selection)
 
 
 def test_the_facts_of_a_dataset_name_its_preset_as_people_type_it(dataset: Dataset) -> None:
