@@ -18,7 +18,6 @@ from safetensors.torch import load, load_file, save, save_file
 from torch import Tensor
 
 from infra.setup.builtin_network import MOST_BYTES
-from model.check_reference import TOLERANCE, differences, main
 from model.config import SIZES
 from model.inference import NeuralRenderer
 from model.open import (
@@ -57,6 +56,7 @@ from storage.digests import sha256_hex
 from storage.errors import LAST_COMMIT, TrilightError
 from storage.records.safe_read import safetensors_header
 from tests.for_each import case, for_each
+from tests.model.check_reference import TOLERANCE, differences, main
 from tests.model.kit import awake, publishable, tiny_config
 from tests.scenes_by_hand import tiny_scene
 
