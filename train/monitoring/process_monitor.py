@@ -115,38 +115,32 @@ class LayerNorms:
         self._groups: dict[str, list[nn.Parameter]] = {}
         for name, weight in model.named_parameters():
             self._groups.setdefault(layer_of(name), []).append(weight)
-        self.expect_update(False)
-
-    def expect_update(self, due: bool) -> None:
-        """Set whether the next update is measured."""
-        self._due = due
-        self._grads: list[Tensor] = []
-        self._before: list[list[Tensor]] = []
+        self.is_due = False
+        """True if the next update is measured."""
         self._norms: Tensor | None = None
 
+    @contextmanager
     @torch.no_grad()
-    def record_gradients(self) -> None:
-        """Record the gradient norms; call when gradients are complete and not clipped yet."""
-        if not self._due:
-            return
-        for weights in self._groups.values():
-            self._grads.append(_length([w.grad for w in weights if w.grad is not None], weights))
-            self._before.append([weight.clone() for weight in weights])
+    def measured_update(self) -> Iterator[None]:
+        """Measure the update in a block if it is due, without a wait for the device.
 
-    @torch.no_grad()
-    def record_update(self) -> None:
-        """Record weight and update norms after the update, without a wait for the device."""
+        The block begins when gradients are complete and not clipped yet.
+        """
+        if not self.is_due:
+            yield
+            return
+        self.is_due = False
+        groups = self._groups.values()
+        grads = [_length([w.grad for w in group if w.grad is not None], group) for group in groups]
+        before = [[weight.clone() for weight in group] for group in groups]
+        yield
         columns = []
-        for grad, weights, before in zip(
-            self._grads, self._groups.values(), self._before, strict=False
-        ):
-            length = _length(before, weights)
-            moved = [weight - old for weight, old in zip(weights, before, strict=True)]
+        for grad, weights, old_weights in zip(grads, groups, before, strict=True):
+            length = _length(old_weights, weights)
+            moved = [weight - old for weight, old in zip(weights, old_weights, strict=True)]
             ratio = _length(moved, weights) / length.clamp(min=torch.finfo(length.dtype).tiny)
             columns.append(torch.stack([grad, length, ratio]))
-        if columns:
-            self.expect_update(False)
-            self._norms = torch.stack(columns)
+        self._norms = torch.stack(columns)
 
     def pop_row(self) -> dict[str, list[float | None]]:
         """Return LAYER_COLUMNS by layer of the measured update once; empty if there is none.
@@ -156,7 +150,7 @@ class LayerNorms:
         if self._norms is None:
             return {}
         rows = self._norms.tolist()
-        self.expect_update(False)
+        self._norms = None
         return {
             layer: [float(f"{each:.{_DIGITS}g}") if math.isfinite(each) else None for each in row]
             for layer, row in zip(self._groups, rows, strict=True)
@@ -237,72 +231,54 @@ SKIPPED_STEPS = 3
 _ROWS = 40
 
 
-class StepProfiler:
-    """Traces steps of one process; costs nothing if there are none to trace."""
+@contextmanager
+def profiled_steps(
+    steps: int, done: int, device: torch.device, folder: Path, note: Callable[[str], None]
+) -> Iterator[Callable[[], None]]:
+    """Trace some steps of a block, and yield the function that ends a step.
 
-    def __init__(
-        self, steps: int, device: torch.device, folder: Path, note: Callable[[str], None]
-    ) -> None:
-        """Create the profiler.
+    A block that ends earlier leaves an incomplete trace.
 
-        Args:
-            steps: number of steps; 0 traces none.
-            folder: folder of the trace and the table.
-            note: called with a message that names the files.
-        """
-        self._steps = steps
-        self._device = device
-        self._folder = folder
-        self._note = note
-        self._step = 0
-        self._first = 0
-        self._profile: Any = None
-        self._is_written = False
+    Args:
+        steps: number of steps to trace; 0 traces none and costs nothing.
+        done: number of steps before the block.
+        folder: folder of the trace and the table.
+        note: called with a message that names the files.
+    """
+    if not steps:
+        yield lambda: None
+        return
+    from torch.profiler import ProfilerActivity, profile, schedule
 
-    def begin_step(self, step: int) -> None:
-        """Begin a step, counted from 1."""
-        self._step = step
-        if not self._steps or self._profile is not None:
-            return
-        from torch.profiler import ProfilerActivity, profile, schedule
+    first = done + SKIPPED_STEPS + 1
+    traces: list[Path] = []
 
-        on_gpu = [ProfilerActivity.CUDA] if self._device.type == "cuda" else []
-        self._first = step + SKIPPED_STEPS
-        self._profile = profile(
-            activities=[ProfilerActivity.CPU, *on_gpu],
-            schedule=schedule(
-                skip_first=SKIPPED_STEPS - 1, wait=0, warmup=1, active=self._steps, repeat=1
-            ),
-            on_trace_ready=self._write,
-        )
-        self._profile.start()
-
-    def end_step(self) -> None:
-        """End the step; the last of a trace writes it."""
-        if self._profile is not None:
-            self._profile.step()
-
-    def close(self) -> None:
-        """Write an incomplete trace of a run that has ended."""
-        if self._profile is not None:
-            self._profile.stop()
-        if self._steps and not self._is_written:
-            self._note(
-                f"nothing was profiled: the run ended before step {SKIPPED_STEPS + 1} of this call"
-            )
-
-    def _write(self, profiler: Any) -> None:
-        self._is_written = True
-        self._folder.mkdir(parents=True, exist_ok=True)
-        trace = self._folder / f"profile-steps-{self._first}-to-{self._step}.json.gz"
+    def write(profiler: Any) -> None:
+        last = done + profiler.step_num
+        folder.mkdir(parents=True, exist_ok=True)
+        trace = folder / f"profile-steps-{first}-to-{last}.json.gz"
         table = trace.with_name(trace.name.replace(".json.gz", ".txt"))
         profiler.export_chrome_trace(str(trace))
-        order = f"self_{self._device.type}_time_total"
+        order = f"self_{device.type}_time_total"
         table.write_text(profiler.key_averages().table(sort_by=order, row_limit=_ROWS))
-        self._note(
-            f"steps {self._first} to {self._step} were profiled: open {trace} at chrome://tracing "
-            f"in Chromium or at ui.perfetto.dev; {table.name} beside it lists the dearest operators"
+        note(
+            f"steps {first} to {last} were profiled: open {trace} at chrome://tracing in Chromium "
+            f"or at ui.perfetto.dev; {table.name} beside it lists the dearest operators"
         )
+        traces.append(trace)
+
+    on_gpu = [ProfilerActivity.CUDA] if device.type == "cuda" else []
+    planned = schedule(skip_first=SKIPPED_STEPS - 1, wait=0, warmup=1, active=steps, repeat=1)
+    try:
+        with profile(
+            activities=[ProfilerActivity.CPU, *on_gpu], schedule=planned, on_trace_ready=write
+        ) as profiler:
+            yield profiler.step
+    finally:
+        if not traces:
+            note(
+                f"nothing was profiled: the run ended before step {SKIPPED_STEPS + 1} of this call"
+            )
 
 
 def merge_spikes(by_rank: Sequence[Sequence[Mapping[str, Any]]]) -> list[dict[str, Any]]:
