@@ -33,8 +33,8 @@ from model.weights import (
     PUBLISHED_RANGE,
     TrainedRange,
     decode_config,
-    from_tensors,
     load_tensors,
+    network_of,
     read_metadata,
     read_tensors,
     trained_range,
@@ -135,11 +135,12 @@ def find_network(place: str | Path) -> NetworkFile:
     weights = _weights_file(source, path)
     metadata = read_metadata(weights)
     if CONFIG_KEY in metadata:
+        config = decode_config(metadata[CONFIG_KEY], str(weights))
         return NetworkFile(
             path=weights,
             trained=trained_range(metadata) or TrainedRange(),
-            any_width=decode_config(metadata[CONFIG_KEY], str(weights)).traces_hits,
-            open=lambda: from_tensors(*read_tensors(weights), str(weights)),
+            any_width=config.traces_hits,
+            open=lambda: network_of(config, read_tensors(weights)[0]),
         )
     return NetworkFile(
         path=weights,

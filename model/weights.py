@@ -20,7 +20,6 @@ from storage.records.safe_read import (
     MAX_HEADER_BYTES,
     name_unreadable,
     open_plain,
-    read_safetensors,
     safetensors_header,
 )
 from storage.settings.described import from_record
@@ -95,29 +94,6 @@ def _sort_metadata(data: bytes) -> bytes:
     text = json.dumps(header, separators=(",", ":"), ensure_ascii=False).encode()
     assert len(text) <= end - 8  # as compact as it was written, and padded with spaces alike
     return data[:8] + text.ljust(end - 8) + data[end:]
-
-
-def decode_weights(data: bytes) -> RenderFormer:
-    """Return the network of a file in our format, in evaluation mode on the CPU.
-
-    Raises:
-        TrilightError: not such a file, or its tensors do not match its configuration; the message
-            lists them. `model.open` reads published checkpoints too.
-    """
-    arrays, metadata = read_safetensors(data, name="weights")
-    return from_tensors({k: torch.from_numpy(array) for k, array in arrays.items()}, metadata)
-
-
-def from_tensors(
-    tensors: Mapping[str, Tensor], metadata: Mapping[str, str], source: str = "network"
-) -> RenderFormer:
-    """Return the network of tensors in our format; errors begin with `source`."""
-    if CONFIG_KEY not in metadata:
-        raise TrilightError(
-            f"weights: the file has no {CONFIG_KEY} entry; expected a model.safetensors as "
-            "`trilight train` writes it."
-        )
-    return network_of(decode_config(metadata[CONFIG_KEY], source), tensors)
 
 
 def read_tensors(path: Path) -> tuple[dict[str, Tensor], dict[str, str]]:

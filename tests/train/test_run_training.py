@@ -23,7 +23,7 @@ from safetensors.torch import load
 
 from model.layers import Norm
 from model.open import open_network, path_of_step, saved_steps
-from model.weights import TrainedRange, decode_weights, trained_range
+from model.weights import TrainedRange, trained_range
 from storage.dataset.dataset import Dataset
 from storage.dataset.training_data import NO_MANIFEST
 from storage.errors import TrilightError
@@ -189,7 +189,7 @@ def test_the_folder_holds_everything_and_agrees_with_the_result(
         max_triangles=64,  # of the manifest of the toy dataset
         resolution=16,
     )
-    model = decode_weights(weights)
+    model = open_network(folder.weights)
     assert sum(weight.numel() for weight in model.parameters()) == whole.num_parameters
 
     steps = [f"step {step}" for step in range(1, 13)]
