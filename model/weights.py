@@ -49,17 +49,6 @@ PUBLISHED_RANGE = TrainedRange(max_triangles=4096, resolution=512)
 """Range of the published checkpoints: their second stage (Zeng et al. 2025)."""
 
 
-def trained_range(metadata: Mapping[str, str]) -> TrainedRange | None:
-    """Return the trained range in the metadata of a file, or None without an entry.
-
-    Raises:
-        TrilightError: the entry is not readable.
-    """
-    if RANGE_KEY not in metadata:
-        return None
-    return read_json(metadata[RANGE_KEY], TrainedRange, RANGE_KEY)
-
-
 CONFIG_KEY = "trilight_model"
 """Metadata entry that holds the configuration as JSON."""
 
