@@ -13,7 +13,7 @@ from safetensors import SafetensorError
 from safetensors.torch import load_file, save
 from torch import Tensor
 
-from model.config import REMOVED, ModelConfig
+from model.config import ModelConfig
 from model.renderformer import RenderFormer
 from storage.errors import TrilightError, prefix_errors, without_removed
 from storage.records.safe_read import (
@@ -176,6 +176,6 @@ def decode_config(text: str, source: str = "network") -> ModelConfig:
         TrilightError: the JSON is invalid, or uses removed settings.
     """
     fields = read_json(text, dict[str, Any], f"{source}: its model configuration")
-    known = without_removed(fields, REMOVED, f"{source}: model")
+    known = without_removed(fields, ModelConfig.REMOVED, f"{source}: model")
     with prefix_errors(f"{source}: model"):
         return from_record(ModelConfig, known)
