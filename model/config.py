@@ -46,7 +46,7 @@ class ModelConfig:
 
     PRESETS: ClassVar[Mapping[str, Callable[[], "ModelConfig"]]] = {}
     """Named sizes, which a setting of this type accepts (storage.settings.overrides)."""
-    REMOVED: ClassVar = {
+    REMOVED: ClassVar[dict[str, Any]] = {
         "projected_freqs": 0,
         "texture_cells": 0,
         "sky_cells": 0,

@@ -13,8 +13,8 @@ from typing import Any
 
 import torch
 
-from model.open import Checkpoint, find_checkpoint, open_network, read_header, saved_steps
-from model.renderformer import RenderFormer, count_parameters
+from model.open import find_checkpoint, open_network, read_header, saved_steps
+from model.renderformer import count_parameters
 from model.scene_tensors import lit_sky, require_known_sky
 from model.weights import TrainedRange, decode_config, encode_weights
 from storage.atomic import write_atomically
@@ -46,7 +46,7 @@ from train.loop.train_state import TrainState, new_state
 from train.loop.trainer import Trainer, scene_flops
 from train.loss.training_loss import TrainingLoss, load_lpips
 from train.progress import TrainProgress
-from train.resume import Event, ResumePlan, StartOptions, plan_resume
+from train.resume import Event, StartOptions, StartPlan, plan_resume
 from train.settings import TrainSettings, WatchSettings, stored_settings
 
 LOSS_SHARE = 20
@@ -284,18 +284,6 @@ def _make_judge(
     return Judge(samples, settings.resolution, median_picture(training))
 
 
-@dataclass(frozen=True, kw_only=True, eq=False)
-class StartPlan(ResumePlan):
-    """Everything that a run starts or resumes with; nothing is written yet."""
-
-    network: RenderFormer | None = None
-    """Network whose weights are copied; None for random weights or a checkpoint."""
-    checkpoint: Checkpoint | None = None
-    """Checkpoint that is restored; None for a new run."""
-    branch: Path | None = None
-    """Checkpoint or run folder that a new folder continues; None otherwise."""
-
-
 def plan_start(
     settings: TrainSettings,
     folder: RunFolder,
@@ -344,12 +332,11 @@ def plan_start(
         config = decode_config(checkpoint.header["model"], str(branch or folder.root))
         settings = dataclasses.replace(settings, model=config)
     header = checkpoint.header
-    resume_plan = plan_resume(header, settings, data_digest, start.decisions)
-    plan = StartPlan(**vars(resume_plan), checkpoint=checkpoint, branch=branch)
-    if branch is None:
-        return plan
-    origin = _origin(header["step"], "checkpoint", header)
-    return dataclasses.replace(plan, history=(*plan.history, origin))
+    plan = plan_resume(header, settings, data_digest, start.decisions)
+    history = plan.history
+    if branch is not None:
+        history += (_origin(header["step"], "checkpoint", header),)
+    return dataclasses.replace(plan, history=history, checkpoint=checkpoint, branch=branch)
 
 
 def init_or_resume_state(

@@ -61,7 +61,7 @@ class LossSettings:
     noise_half: Annotated[float, Within(0, 10)] = 0.0
     """Root mean square noise of log10(1 + radiance) at which a view has half the weight of a
     noiseless one; 0 gives all views the same weight."""
-    REMOVED: ClassVar = {"lpips_precision": "float32"}
+    REMOVED: ClassVar[dict[str, Any]] = {"lpips_precision": "float32"}
     """Settings of earlier versions, which old files may hold, with the values that meant none."""
 
 
@@ -193,10 +193,7 @@ def _wrong(name: str, got: object, expected: str) -> None:
     raise TrilightError(f"train settings: {name} is {got}; expected {expected}.")
 
 
-_REMOVED: Mapping[str, Mapping[str, Any]] = {
-    "model": ModelConfig.REMOVED,
-    "loss": LossSettings.REMOVED,
-}
+_REMOVED = {"model": ModelConfig.REMOVED, "loss": LossSettings.REMOVED}
 
 _BEFORE = {
     "projected_freqs": "rope_max_freq",

@@ -44,16 +44,6 @@ PHASES = {
 """Description of each phase of training, by name."""
 
 
-@dataclass(frozen=True)
-class ActivePhase:
-    """Phase in progress."""
-
-    phase: str
-    """Name of the phase, one of PHASES."""
-    since_s: float
-    """Start of the phase, by time.monotonic()."""
-
-
 class Activity:
     """Timer of phases: each moment belongs to exactly one.
 
@@ -66,20 +56,21 @@ class Activity:
     """
 
     def __init__(self) -> None:
-        self.now = ActivePhase("other", time.monotonic())
+        self.now = ("other", time.monotonic())
+        """Name of the phase in progress, one of PHASES, and its start."""
         self._taken_s = dict.fromkeys(PHASES, 0.0)
 
     def begin(self, phase: str) -> None:
         """End the current phase, and begin another."""
         moment_s = time.monotonic()
-        before = self.now
-        self._taken_s[before.phase] += moment_s - before.since_s
-        self.now = ActivePhase(phase, moment_s)
+        before, since_s = self.now
+        self._taken_s[before] += moment_s - since_s
+        self.now = (phase, moment_s)
 
     @contextmanager
     def during(self, phase: str) -> Iterator[None]:
         """Assign the time of a block to a phase, then return to the previous one."""
-        before = self.now.phase
+        before, _ = self.now
         self.begin(phase)
         try:
             yield
@@ -88,13 +79,13 @@ class Activity:
 
     def working_seconds(self) -> float:
         """Return the seconds, above 0, since `pop_seconds` without validations and checkpoints."""
-        self.begin(self.now.phase)
+        self.begin(self.now[0])
         pauses_s = self._taken_s["validation"] + self._taken_s["saving"]
         return max(sum(self._taken_s.values()) - pauses_s, 1e-9)
 
     def pop_seconds(self) -> dict[str, float]:
         """Return the seconds of each phase since the last call, and reset them."""
-        self.begin(self.now.phase)
+        self.begin(self.now[0])
         taken_s = self._taken_s
         self._taken_s = dict.fromkeys(PHASES, 0.0)
         return taken_s
@@ -480,13 +471,13 @@ class Watchdog:
 
     def _report(self, stretch: _Stretch, now_s: float) -> None:
         """Write the stacks, and report the current phase of this process."""
-        doing = self._activity.now
+        phase, began_s = self._activity.now
         path = self._path(stretch.step, self._dist_context.rank)
         usual = "" if stretch.usual_s is None else f", where {stretch.usual_s:.2g} s is usual"
         line = (
             f"process {self._dist_context.rank} of {self._dist_context.world_size}: {stretch.name} "
             f"has taken {now_s - stretch.since_s:.1f} s{usual}; for "
-            f"{now_s - doing.since_s:.1f} s it has been in: {PHASES[doing.phase]}"
+            f"{now_s - began_s:.1f} s it has been in: {PHASES[phase]}"
         )
         written = ""
         if self._files <= MAX_FILES:
