@@ -364,8 +364,6 @@ class _Stretch:
     """time.monotonic() at which it was seen to hang; None if it does not."""
     next_s: float = 0.0
     """time.monotonic() of the next report."""
-    is_reported: bool = False
-    """True after this process has reported the hang."""
     is_stopped: bool = False
     """True after the run was asked to stop."""
     passed_on: set[Path] = field(default_factory=set)
@@ -458,8 +456,8 @@ class Watchdog:
                 hang.hung_s = now_s
                 self._files += 1
             if now_s >= hang.next_s:
-                hang.next_s = hang.since_s + 2 * (now_s - hang.since_s)  # ever more rarely
                 self._report(hang, now_s)
+                hang.next_s = hang.since_s + 2 * (now_s - hang.since_s)  # ever more rarely
             if self._dist_context.is_first:
                 self._forward_reports(hang, now_s)
                 should_stop = self._settings.on_hang == "stop" and not hang.is_stopped
@@ -482,9 +480,8 @@ class Watchdog:
         written = ""
         if self._files <= MAX_FILES:
             with suppress(OSError):
-                _write_stacks(path, line, appends=stretch.is_reported)
+                _write_stacks(path, line, appends=stretch.next_s > 0)
                 written = f". Stacks of its threads: {path}"
-        stretch.is_reported = True
         self._note_safely(line + written)
 
     def _note_safely(self, text: str) -> None:
