@@ -27,9 +27,6 @@ VERTEX_COORDINATES = 9
 NUM_TAPS = 4
 """Number of decoder layers that a DPT head reads (Ranftl et al. 2021)."""
 
-REMOVED: Mapping[str, Any] = {"projected_freqs": 0, "texture_cells": 0, "sky_cells": 0}
-"""Removed settings that files of networks may hold, with the values that switched them off."""
-
 HITS_PX = 8
 """Pixels whose multiple is the width of pictures of the view stage `hits`."""
 
@@ -49,8 +46,12 @@ class ModelConfig:
 
     PRESETS: ClassVar[Mapping[str, Callable[[], "ModelConfig"]]] = {}
     """Named sizes, which a setting of this type accepts (storage.settings.overrides)."""
-    REMOVED: ClassVar = tuple(REMOVED)
-    """Names of settings of earlier versions, which old files may hold."""
+    REMOVED: ClassVar[dict[str, Any]] = {
+        "projected_freqs": 0,
+        "texture_cells": 0,
+        "sky_cells": 0,
+    }
+    """Settings of earlier versions, which old files may hold, with the values that meant none."""
     width: Annotated[int, Within(2 * VERTEX_COORDINATES, 16_384)]
     """Width of every token, a multiple of num_heads."""
     num_heads: Annotated[int, Within(1, 512)]

@@ -31,13 +31,13 @@ from model.renderformer import RenderFormer
 from model.weights import (
     CONFIG_KEY,
     PUBLISHED_RANGE,
+    RANGE_KEY,
     TrainedRange,
     decode_config,
-    from_tensors,
     load_tensors,
+    network_of,
     read_metadata,
     read_tensors,
-    trained_range,
 )
 from storage.aliases import NETWORKS, stored_name
 from storage.atomic import write_atomically
@@ -135,11 +135,12 @@ def find_network(place: str | Path) -> NetworkFile:
     weights = _weights_file(source, path)
     metadata = read_metadata(weights)
     if CONFIG_KEY in metadata:
+        config = decode_config(metadata[CONFIG_KEY], str(weights))
         return NetworkFile(
             path=weights,
-            trained=trained_range(metadata) or TrainedRange(),
-            any_width=decode_config(metadata[CONFIG_KEY], str(weights)).traces_hits,
-            open=lambda: from_tensors(*read_tensors(weights), str(weights)),
+            trained=read_json(metadata.get(RANGE_KEY, "{}"), TrainedRange, RANGE_KEY),
+            any_width=config.traces_hits,
+            open=lambda: network_of(config, read_tensors(weights)[0]),
         )
     return NetworkFile(
         path=weights,

@@ -133,12 +133,10 @@ def encode_published_config(config: PublishedConfig) -> dict[str, Any]:
     """
     model, texture_patch = config
     doubled = model.rope_max_freq == _max_freq(model.rope_num_freqs, doubled=True)
-    if model.head != "dpt":
-        _raise_unpublished("head linear", "dpt")
-    if model.demodulated:
-        _raise_unpublished("demodulated True", "False")
-    if model.material_columns != PUBLISHED_COLUMNS:
-        _raise_unpublished(f"material_columns {model.material_columns}", f"{PUBLISHED_COLUMNS}")
+    fixed = {"head": "dpt", "demodulated": False, "material_columns": PUBLISHED_COLUMNS}
+    for name, expected in fixed.items():
+        if getattr(model, name) != expected:
+            _raise_unpublished(f"{name} {getattr(model, name)}", f"{expected}")
     if model.window_bundles not in (0, WINDOW_BUNDLES):
         _raise_unpublished(f"window_bundles {model.window_bundles}", f"0 or {WINDOW_BUNDLES}")
     if not doubled and model.rope_max_freq != _max_freq(model.rope_num_freqs, doubled=False):

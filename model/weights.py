@@ -13,14 +13,13 @@ from safetensors import SafetensorError
 from safetensors.torch import load_file, save
 from torch import Tensor
 
-from model.config import REMOVED, ModelConfig
+from model.config import ModelConfig
 from model.renderformer import RenderFormer
 from storage.errors import TrilightError, prefix_errors, without_removed
 from storage.records.safe_read import (
     MAX_HEADER_BYTES,
     name_unreadable,
     open_plain,
-    read_safetensors,
     safetensors_header,
 )
 from storage.settings.described import from_record
@@ -48,17 +47,6 @@ class TrainedRange:
 
 PUBLISHED_RANGE = TrainedRange(max_triangles=4096, resolution=512)
 """Range of the published checkpoints: their second stage (Zeng et al. 2025)."""
-
-
-def trained_range(metadata: Mapping[str, str]) -> TrainedRange | None:
-    """Return the trained range in the metadata of a file, or None without an entry.
-
-    Raises:
-        TrilightError: the entry is not readable.
-    """
-    if RANGE_KEY not in metadata:
-        return None
-    return read_json(metadata[RANGE_KEY], TrainedRange, RANGE_KEY)
 
 
 CONFIG_KEY = "trilight_model"
@@ -95,29 +83,6 @@ def _sort_metadata(data: bytes) -> bytes:
     text = json.dumps(header, separators=(",", ":"), ensure_ascii=False).encode()
     assert len(text) <= end - 8  # as compact as it was written, and padded with spaces alike
     return data[:8] + text.ljust(end - 8) + data[end:]
-
-
-def decode_weights(data: bytes) -> RenderFormer:
-    """Return the network of a file in our format, in evaluation mode on the CPU.
-
-    Raises:
-        TrilightError: not such a file, or its tensors do not match its configuration; the message
-            lists them. `model.open` reads published checkpoints too.
-    """
-    arrays, metadata = read_safetensors(data, name="weights")
-    return from_tensors({k: torch.from_numpy(array) for k, array in arrays.items()}, metadata)
-
-
-def from_tensors(
-    tensors: Mapping[str, Tensor], metadata: Mapping[str, str], source: str = "network"
-) -> RenderFormer:
-    """Return the network of tensors in our format; errors begin with `source`."""
-    if CONFIG_KEY not in metadata:
-        raise TrilightError(
-            f"weights: the file has no {CONFIG_KEY} entry; expected a model.safetensors as "
-            "`trilight train` writes it."
-        )
-    return network_of(decode_config(metadata[CONFIG_KEY], source), tensors)
 
 
 def read_tensors(path: Path) -> tuple[dict[str, Tensor], dict[str, str]]:
@@ -211,6 +176,6 @@ def decode_config(text: str, source: str = "network") -> ModelConfig:
         TrilightError: the JSON is invalid, or uses removed settings.
     """
     fields = read_json(text, dict[str, Any], f"{source}: its model configuration")
-    known = without_removed(fields, REMOVED, f"{source}: model")
+    known = without_removed(fields, ModelConfig.REMOVED, f"{source}: model")
     with prefix_errors(f"{source}: model"):
         return from_record(ModelConfig, known)

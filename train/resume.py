@@ -8,13 +8,18 @@ each of which the run records.
 import json
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
-from typing import Any, Literal
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, Literal
 
 from storage.errors import TrilightError
 from storage.settings.described import checked, from_record, settings_record
 from storage.settings.fields import describe_fields
 from storage.settings.overrides import apply_overrides
 from train.settings import TrainSettings, decay_start_step, known_settings
+
+if TYPE_CHECKING:
+    from model.open import Checkpoint
+    from model.renderformer import RenderFormer
 
 DATA = "data"
 """Name of the change to other data. Its value is the start of their digest, after `sha256:` for a
@@ -115,8 +120,8 @@ class Event:
 
 
 @dataclass(frozen=True, kw_only=True)
-class ResumePlan:
-    """Settings, history and messages of a run that resumes."""
+class StartPlan:
+    """Everything that a run starts or resumes with; nothing is written yet."""
 
     settings: TrainSettings
     """Settings of the next step."""
@@ -126,6 +131,12 @@ class ResumePlan:
     """Messages for the user, one per change."""
     changes_meaning: bool = True
     """True if this resume changes a setting or the data that decide the weights."""
+    network: "RenderFormer | None" = None
+    """Network whose weights are copied; None for random weights or a checkpoint."""
+    checkpoint: "Checkpoint | None" = None
+    """Checkpoint that is restored; None for a new run."""
+    branch: Path | None = None
+    """Checkpoint or run folder that a new folder continues; None otherwise."""
 
 
 def plan_resume(
@@ -133,7 +144,7 @@ def plan_resume(
     typed: TrainSettings,
     data_digest: str,
     decisions: Mapping[str, Any],
-) -> ResumePlan:
+) -> StartPlan:
     """Return the plan to resume a run from a checkpoint.
 
     Args:
@@ -181,7 +192,7 @@ def plan_resume(
         events.append(Event(step=step, kind=kind, name=name, before=old[name], after=value))
     events += _data_event(header, data_digest, decisions.get(DATA))
     _require_possible(before, settings, step, events)
-    return ResumePlan(
+    return StartPlan(
         settings=settings,
         history=(*past_events, *events),
         notes=tuple(_notes(before, settings, step, past_events, events)),

@@ -13,8 +13,8 @@ from typing import Any
 
 import torch
 
-from model.open import Checkpoint, find_checkpoint, open_network, read_header, saved_steps
-from model.renderformer import RenderFormer, count_parameters
+from model.open import find_checkpoint, open_network, read_header, saved_steps
+from model.renderformer import count_parameters
 from model.scene_tensors import lit_sky, require_known_sky
 from model.weights import TrainedRange, decode_config, encode_weights
 from storage.atomic import write_atomically
@@ -46,7 +46,7 @@ from train.loop.train_state import TrainState, new_state
 from train.loop.trainer import Trainer, scene_flops
 from train.loss.training_loss import TrainingLoss, load_lpips
 from train.progress import TrainProgress
-from train.resume import Event, ResumePlan, StartOptions, plan_resume
+from train.resume import Event, StartOptions, StartPlan, plan_resume
 from train.settings import TrainSettings, WatchSettings, stored_settings
 
 LOSS_SHARE = 20
@@ -284,20 +284,6 @@ def _make_judge(
     return Judge(samples, settings.resolution, median_picture(training))
 
 
-@dataclass(frozen=True, kw_only=True, eq=False)
-class StartPlan(ResumePlan):
-    """Everything that a run starts or resumes with; nothing is written yet."""
-
-    network: RenderFormer | None = None
-    """Network whose weights are copied; None for random weights or a checkpoint."""
-    network_source: str = ""
-    """Path or name from which that network was opened."""
-    checkpoint: Checkpoint | None = None
-    """Checkpoint that is restored; None for a new run."""
-    branch: Path | None = None
-    """Checkpoint or run folder that a new folder continues; None otherwise."""
-
-
 def plan_start(
     settings: TrainSettings,
     folder: RunFolder,
@@ -329,7 +315,11 @@ def plan_start(
             return StartPlan(settings=settings)
         network = open_network(source)
         settings = dataclasses.replace(settings, model=network.config)
-        return StartPlan(settings=settings, network=network, network_source=source)
+        stored = find_checkpoint(Path(source))
+        before = read_header(stored) if stored else {}
+        before["sha256"] = sha256_hex(encode_weights(network))
+        origin = _origin(0, "weights", before)
+        return StartPlan(settings=settings, network=network, history=(origin,))
     branch = None if start.resume or start.branch is None else Path(start.branch)
     if branch is None or branch.is_dir():
         checkpoints = (folder if branch is None else RunFolder(branch)).checkpoints
@@ -341,8 +331,12 @@ def plan_start(
     if settings.from_weights:
         config = decode_config(checkpoint.header["model"], str(branch or folder.root))
         settings = dataclasses.replace(settings, model=config)
-    resume_plan = plan_resume(checkpoint.header, settings, data_digest, start.decisions)
-    return StartPlan(**vars(resume_plan), checkpoint=checkpoint, branch=branch)
+    header = checkpoint.header
+    plan = plan_resume(header, settings, data_digest, start.decisions)
+    history = plan.history
+    if branch is not None:
+        history += (_origin(header["step"], "checkpoint", header),)
+    return dataclasses.replace(plan, history=history, checkpoint=checkpoint, branch=branch)
 
 
 def init_or_resume_state(
@@ -365,18 +359,11 @@ def init_or_resume_state(
     mixture = plan_mixture(data, plan.settings, header)
     if mixture is not None:
         note(f"the stream mixes {mixture}")
-    digest = None
     if plan.checkpoint is None or header is None:
         state = new_state(plan.settings, device, plan.network, precision)
-        if plan.network is not None:
-            digest = sha256_hex(encode_weights(plan.network))
-            source = find_checkpoint(Path(plan.network_source))
-            before = {**(read_header(source) if source else {}), "sha256": digest}
-            state.history = (_origin(0, "weights", before),)
+        state.history = plan.history
     else:
         state = restore_state(plan.checkpoint, plan, device, precision)
-        if plan.branch is not None:
-            state.history += (_origin(state.step, "checkpoint", header),)
         for text in plan.notes:
             note(text)
         state.history += tuple(_execution_changes(header, dist_context, state, note))
@@ -386,7 +373,7 @@ def init_or_resume_state(
         if plan.branch is not None:
             root = plan.branch if plan.branch.is_dir() else plan.branch.parent.parent
             copy_rows(RunFolder(root).metrics, folder.metrics, state.step)
-        _write_settings(folder, state, dist_context, digest)
+        _write_settings(folder, state, dist_context, plan)
         if plan.branch is not None or (header is not None and plan.changes_meaning):
             save_checkpoint(folder.checkpoints, state, world_size=dist_context.world_size)
     return state
@@ -404,14 +391,11 @@ def _origin(step: int, name: str, header: Mapping[str, Any]) -> Event:
 
 
 def _write_settings(
-    folder: RunFolder,
-    state: TrainState,
-    dist_context: DistributedContext,
-    begun_with: str | None,
+    folder: RunFolder, state: TrainState, dist_context: DistributedContext, plan: StartPlan
 ) -> None:
     """Write settings.json: current settings, their history, and how the run started."""
     origin = {
-        "begun_with_sha256": begun_with,
+        "begun_with_sha256": plan.history[0].after["sha256"] if plan.network else None,
         **({"extensions": extensions} if (extensions := extension_digests("weights")) else {}),
         "versions": {"torch": torch.__version__, "python": platform.python_version()},
         "threads": torch.get_num_threads(),

@@ -11,7 +11,6 @@ from collections.abc import Mapping
 from dataclasses import field
 from typing import Annotated, Any, ClassVar, Literal
 
-from model.config import REMOVED as REMOVED_FROM_MODEL
 from model.config import BaseWidths, ModelConfig
 from storage.errors import TrilightError, without_removed
 from storage.settings.described import checked, settings_record
@@ -62,8 +61,8 @@ class LossSettings:
     noise_half: Annotated[float, Within(0, 10)] = 0.0
     """Root mean square noise of log10(1 + radiance) at which a view has half the weight of a
     noiseless one; 0 gives all views the same weight."""
-    REMOVED: ClassVar = ("lpips_precision",)
-    """Names of settings of earlier versions, which old files may hold."""
+    REMOVED: ClassVar[dict[str, Any]] = {"lpips_precision": "float32"}
+    """Settings of earlier versions, which old files may hold, with the values that meant none."""
 
 
 Precision = Literal["float32", "bfloat16"]
@@ -194,8 +193,7 @@ def _wrong(name: str, got: object, expected: str) -> None:
     raise TrilightError(f"train settings: {name} is {got}; expected {expected}.")
 
 
-_REMOVED = {"model": REMOVED_FROM_MODEL, "loss": {"lpips_precision": "float32"}}
-"""Removed settings of each group, with the value that switched them off."""
+_REMOVED = {"model": ModelConfig.REMOVED, "loss": LossSettings.REMOVED}
 
 _BEFORE = {
     "projected_freqs": "rope_max_freq",

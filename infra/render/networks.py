@@ -170,9 +170,8 @@ class DirectLightRenderer(RendererHere):
         lit.light = SceneLight(direct_2T3=dark, indirect_2T3=dark, mean_3=np.ones(3, np.float32))
 
         def view(camera: Camera) -> NDArray[np.float32]:
-            inputs = view_inputs(lit, camera.c2w, camera.fov_deg, self.resolution, config)
-            of_lamps = inputs.pixels[..., Channel.SHOWN_DIFFUSE]
-            return of_lamps + inputs.pixels[..., Channel.DIRECT_SPECULAR]
+            pixels, *_ = view_inputs(lit, camera.c2w, camera.fov_deg, self.resolution, config)
+            return pixels[..., Channel.SHOWN_DIFFUSE] + pixels[..., Channel.DIRECT_SPECULAR]
 
         return SceneHere(
             render_image=lambda camera: image_here(lambda: view(camera), {}),

@@ -17,8 +17,8 @@ import cyclopts
 from cyclopts import Parameter
 from PIL import Image
 
-from model.open import BUILTIN_NETWORKS
-from model.weights import decode_weights, network_digest
+from model.open import BUILTIN_NETWORKS, open_network
+from model.weights import network_digest
 from storage.atomic import write_atomically
 from storage.dataset.dataset import Dataset, open_dataset
 from storage.digests import sha256_hex
@@ -71,8 +71,9 @@ def main(
     every = [json.loads((each / "evaluation.json").read_text()) for each in (evaluation, *also)]
     judged, *other_evaluations = every
     _check(dataset, weights, about, judged["about"])
+    digest = network_digest(open_network(folder.weights))
     for each in every:
-        if each["about"]["network sha256"] != network_digest(decode_weights(weights)):
+        if each["about"]["network sha256"] != digest:
             raise TrilightError("builtin network: another network was judged.")
     place = BUILTIN_NETWORKS[name]
     summary = json.loads(folder.summary.read_text())

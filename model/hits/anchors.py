@@ -146,8 +146,8 @@ class Rays:
         self._focal = focal_px(fov_deg, resolution).astype(np.float32)
         self._a_side = rays_a_side
 
-    def direction(self, ray_index: int, pixels: NDArray[np.int64] | slice = slice(None)) -> Floats:
-        """Return unit directions [3, P] of ray `ray_index` of pixels, counted row by row."""
+    def direction(self, ray_index: int) -> Floats:
+        """Return unit directions [3, P] of ray `ray_index` of all pixels, counted row by row."""
         row, column = divmod(ray_index, self._a_side)
         count = np.arange(self.resolution, dtype=np.float32) - np.float32(self.resolution / 2)
         x = count + np.float32((column + 0.5) / self._a_side)
@@ -155,7 +155,7 @@ class Rays:
         right, up, back = self._axes.T
         along = right[:, None, None] * x + up[:, None, None] * y[:, None]
         along -= (back * self._focal)[:, None, None]
-        return unit(along.reshape(3, -1)[:, pixels])
+        return unit(along.reshape(3, -1))
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)

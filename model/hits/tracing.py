@@ -114,13 +114,14 @@ def traced_views(
         else:
             c2w, angle = (DeviceArray(each.to(place.device), place) for each in camera)
         views.append(view_inputs(scene, c2w, angle, resolution, config, seed))
+    pixels, anchor, gathered = (as_tensor(np.stack(each)) for each in zip(*views, strict=True))
     given_VI = np.ones((len(views), len(INPUTS)), np.float32)
     return Traced(
         sides_T12=as_tensor(scene.light.sides_T12),
         unit_3=as_tensor(scene.light.mean_3),
-        pixels_VRRC=as_tensor(np.stack([view.pixels for view in views])),
-        anchor_VA=as_tensor(np.stack([view.anchor for view in views])),
-        gathered_VA3=as_tensor(np.stack([view.gathered for view in views])),
+        pixels_VRRC=pixels,
+        anchor_VA=anchor,
+        gathered_VA3=gathered,
         given_VI=as_tensor(scene.here(given_VI)),
     )
 

@@ -1,4 +1,4 @@
-"""`ViewInputs`: results of the rays of each pixel and of anchors, as numbers for a network.
+"""Inputs of a view: results of the rays of each pixel and of anchors, as numbers for a network.
 
 A pixel has rays_a_side^2 rays, whose findings are averaged after shading, as the film does. Light
 from other surfaces is smooth but where it is mirrored. So it is gathered by many rays at few
@@ -42,7 +42,7 @@ if TYPE_CHECKING:  # it loads pydantic
 
 
 class Channel:
-    """Position of each quantity in the last axis of `ViewInputs.pixels`."""
+    """Position of each quantity in the last axis of the pixels of `view_inputs`."""
 
     COVERAGE = slice(0, 1)
     """Share of the pixel's rays that meet something."""
@@ -81,18 +81,6 @@ class Channel:
 NUM_CHANNELS = 40
 
 
-@dataclass(frozen=True, kw_only=True, eq=False)
-class ViewInputs:
-    """One view of a scene; R pixels across, A anchors."""
-
-    pixels: NDArray[np.float32]
-    """[R, R, 40], by `Channel`; 0 where nothing is met."""
-    anchor: NDArray[np.int64]
-    """[A] pixel that each anchor stands in, counted row by row: the fullest of its part."""
-    gathered: NDArray[np.float32]
-    """[A, 3] irradiance over pi from other surfaces, at the anchors; 0 where nothing is met."""
-
-
 def view_inputs(
     scene: LitScene,
     c2w: Floats,
@@ -100,7 +88,7 @@ def view_inputs(
     resolution: int,
     config: "ModelConfig",
     seed: int = 0,
-) -> ViewInputs:
+) -> tuple[NDArray[np.float32], NDArray[np.int64], NDArray[np.float32]]:
     """Trace the inputs of a view; equal arguments give equal numbers.
 
     Args:
@@ -111,6 +99,11 @@ def view_inputs(
             resolution. Without gather_rays nothing is gathered, and nothing mirrored. Each ray of
             a pixel is shaded where nothing denoises pictures of this width.
         seed: of the noise, which stays where it is on the picture from view to view.
+
+    Returns:
+        Numbers of the pixels [R, R, 40], by `Channel`, 0 where nothing is met; the pixel [A] that
+        each anchor stands in, counted row by row: the fullest of its part; and irradiance over pi
+        from other surfaces at the anchors [A, 3], 0 where nothing is met.
     """
     rays = Rays(c2w, fov_deg, resolution, config.hit_rays)
     hits = camera_hits(scene, rays)
@@ -133,13 +126,8 @@ def view_inputs(
         of_part = hits.only(part), noise.only(part)
         _add_pixels(sums[:, part], scene, rays, *of_part, config)
     join_gathered()
-    return ViewInputs(
-        pixels=_average_rays(sums, rays.rays_per_pixel)
-        .T.copy()
-        .reshape(resolution, resolution, NUM_CHANNELS),
-        anchor=anchor,
-        gathered=gathered,
-    )
+    pixels = _average_rays(sums, rays.rays_per_pixel).T.copy()
+    return pixels.reshape(resolution, resolution, NUM_CHANNELS), anchor, gathered
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)

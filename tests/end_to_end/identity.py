@@ -13,7 +13,6 @@ from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any
 
-from model.check_reference import differences
 from model.inference import NeuralRenderer
 from model.open import BUILTIN, BUILTIN_NETWORKS
 from pipeline.assets.recipe import RECIPE
@@ -39,6 +38,7 @@ from storage.records.scene import Scene
 from storage.records.scene_file import encode_arrays, encode_scene
 from storage.seeds import SceneKey
 from tests.conftest import ROOT
+from tests.model.check_reference import differences
 from tests.scenes_by_hand import tiny_scene
 from trilight.scenes import read_scene
 

@@ -4,7 +4,6 @@ Light of groups adds up to the scene's. Demodulated pictures: what reflects noth
 """
 
 import dataclasses
-import json
 import warnings
 from pathlib import Path
 from typing import Any
@@ -15,6 +14,7 @@ import torch
 from hypothesis import given
 from hypothesis import strategies as st
 from numpy.typing import NDArray
+from safetensors.torch import save
 from torch import Tensor
 from torch.nn.functional import interpolate
 
@@ -22,10 +22,11 @@ from model import inference
 from model.config import SIZES, ModelConfig
 from model.hits.tracing import with_traced
 from model.inference import LightGroup, NeuralRenderer, light_groups
+from model.open import find_network
 from model.renderformer import RenderFormer, radiance
 from model.scene_tensors import SceneTensors, scene_tensors
 from model.view_decoder import BilinearUpsample, Fusion, compose_radiance
-from model.weights import RANGE_KEY, TrainedRange, encode_weights, trained_range
+from model.weights import CONFIG_KEY, RANGE_KEY, TrainedRange, encode_config, encode_weights
 from storage.conventions import look_at_c2w
 from storage.errors import TrilightError
 from storage.raycast import first_hits
@@ -148,14 +149,17 @@ def test_more_triangles_than_trained_are_rendered_with_a_warning(tmp_path: Path)
         assert all("3 triangles, and the network was trained on at most 2" in t for t in texts)
 
 
-def test_what_it_was_trained_on_goes_round_through_metadata() -> None:
-    for known in (TrainedRange(max_triangles=1536), TrainedRange(resolution=64), TrainedRange()):
-        assert trained_range({RANGE_KEY: json.dumps(vars(known))}) == known
-    assert trained_range({}) is None
+def test_what_it_was_trained_on_goes_round_through_metadata(tmp_path: Path) -> None:
+    model, path = network(), tmp_path / "model.safetensors"
+    for known in (TrainedRange(max_triangles=1536), TrainedRange(resolution=64), None):
+        path.write_bytes(encode_weights(model, known))
+        assert find_network(path).trained == (known or TrainedRange())
     lies = ("", "[]", '{"max_triangles": "many"}', '{"resolution": Infinity}', "[" * 100_000)
     for text in lies:
+        metadata = {CONFIG_KEY: encode_config(model.config), RANGE_KEY: text}
+        path.write_bytes(save(model.state_dict(), metadata=metadata))
         with pytest.raises(TrilightError, match="^trilight_trained_range"):
-            trained_range({RANGE_KEY: text})
+            find_network(path)
 
 
 @for_each("resolution", [0, -8, 12])

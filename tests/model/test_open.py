@@ -18,7 +18,6 @@ from safetensors.torch import load, load_file, save, save_file
 from torch import Tensor
 
 from infra.setup.builtin_network import MOST_BYTES
-from model.check_reference import TOLERANCE, differences, main
 from model.config import SIZES
 from model.inference import NeuralRenderer
 from model.open import (
@@ -47,25 +46,30 @@ from model.renderformer import RenderFormer, count_parameters
 from model.weights import (
     CONFIG_KEY,
     TrainedRange,
-    decode_weights,
     encode_weights,
-    from_tensors,
     read_tensors,
-    trained_range,
 )
 from storage.digests import sha256_hex
 from storage.errors import LAST_COMMIT, TrilightError
 from storage.records.safe_read import safetensors_header
 from tests.for_each import case, for_each
+from tests.model.check_reference import TOLERANCE, differences, main
 from tests.model.kit import awake, publishable, tiny_config
 from tests.scenes_by_hand import tiny_scene
 
 
+def reopened(data: bytes, folder: Path) -> RenderFormer:
+    """Return the network of a file of these bytes."""
+    path = folder / WEIGHTS_NAME
+    path.write_bytes(data)
+    return open_network(path)
+
+
 @for_each("head", ["linear", "dpt"])
-def test_round_trip_is_exact_and_reproducible(head: str) -> None:
+def test_round_trip_is_exact_and_reproducible(head: str, tmp_path: Path) -> None:
     model = awake(tiny_config(head), torch.float32)
     data = encode_weights(model)
-    again = decode_weights(data)
+    again = reopened(data, tmp_path)
     assert again.config == model.config
     assert not again.training
     for (name, a), b in zip(model.named_parameters(), again.parameters(), strict=True):
@@ -82,7 +86,9 @@ def test_equal_networks_give_equal_bytes_in_any_process() -> None:
     assert list(header) == sorted(header) and len(header) == 2
 
 
-def test_removed_settings_are_refused_where_they_are_used_and_no_configuration_always() -> None:
+def test_removed_settings_are_refused_where_they_are_used_and_no_configuration_always(
+    tmp_path: Path,
+) -> None:
     """Removed settings load where they meant none."""
     data = encode_weights(awake(tiny_config(), torch.float32))
 
@@ -91,15 +97,15 @@ def test_removed_settings_are_refused_where_they_are_used_and_no_configuration_a
         return save(load(data), metadata={CONFIG_KEY: json.dumps(config)})
 
     off = stating(projected_freqs=0, texture_cells=0, sky_cells=0)
-    assert encode_weights(decode_weights(off)) == data
+    assert encode_weights(reopened(off, tmp_path)) == data
     for name, value in (("projected_freqs", 7), ("texture_cells", 4), ("sky_cells", 48)):
-        message = f"^network: model.{name} is {value}: removed since, and commit {LAST_COMMIT} is"
-        with pytest.raises(TrilightError, match=message):
-            decode_weights(stating(**{name: value}))
-    with pytest.raises(TrilightError, match="the file has no trilight_model entry"):
-        decode_weights(save(load(data)))
-    with pytest.raises(TrilightError, match="^network: model: setting 'width' is missing"):
-        decode_weights(save(load(data), metadata={CONFIG_KEY: "{}"}))
+        removed = f"model.{name} is {value}: removed since, and commit {LAST_COMMIT} is"
+        with pytest.raises(TrilightError, match=f"{WEIGHTS_NAME}: {removed}"):
+            reopened(stating(**{name: value}), tmp_path)
+    with pytest.raises(TrilightError, match="weights that carry no configuration of ours need"):
+        reopened(save(load(data)), tmp_path)
+    with pytest.raises(TrilightError, match=f"{WEIGHTS_NAME}: model: setting 'width' is missing"):
+        reopened(save(load(data), metadata={CONFIG_KEY: "{}"}), tmp_path)
 
 
 @pytest.fixture
@@ -233,9 +239,8 @@ def test_a_shipped_file_is_that_of_its_card_and_is_written_again_byte_for_byte(n
     assert f"{len(weights)} bytes, sha256 `{sha256_hex(weights)}`" in card
     (stated,) = re.findall(r"size: (\d+) parameters", card)
     assert count_parameters(open_network(name)) == int(stated)
-    tensors, metadata = read_tensors(file)
-    network = from_tensors(tensors, metadata)
-    assert encode_weights(network, trained_range(metadata)) == weights
+    network = open_network(file)
+    assert encode_weights(network, find_network(file).trained) == weights
 
 
 def test_a_name_that_does_not_come_along_is_said_and_the_better_one_needs_none() -> None:

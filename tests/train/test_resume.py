@@ -23,7 +23,7 @@ from train.presets import (
     scale_intervals,
     training_preset,
 )
-from train.resume import ResumePlan, plan_resume
+from train.resume import StartPlan, plan_resume
 from train.settings import AugmentationSettings, TrainSettings, known_settings, stored_settings
 
 DIGEST = "d" * 64
@@ -40,7 +40,7 @@ def header(settings: TrainSettings | None = None, *, step: int = 8, **more: Any)
     return json.loads(json.dumps(record | more))
 
 
-def following(before: dict[str, Any], going: ResumePlan, step: int) -> dict[str, Any]:
+def following(before: dict[str, Any], going: StartPlan, step: int) -> dict[str, Any]:
     """Return the header of a later checkpoint of a run that went on."""
     history = [dataclasses.asdict(event) for event in going.history]
     later = header(going.settings, step=step, history=history)
@@ -49,7 +49,7 @@ def following(before: dict[str, Any], going: ResumePlan, step: int) -> dict[str,
 
 def test_the_same_command_goes_on_and_nothing_happens() -> None:
     going = plan_resume(header(), tiny_run(), DIGEST, {})
-    assert going == ResumePlan(settings=tiny_run(), history=(), notes=(), changes_meaning=False)
+    assert going == StartPlan(settings=tiny_run(), history=(), notes=(), changes_meaning=False)
 
 
 def test_removed_settings_stand_in_checkpoints_where_they_stood() -> None:

@@ -22,12 +22,11 @@ from PIL import Image
 from safetensors.torch import load
 
 from model.layers import Norm
-from model.open import open_network, path_of_step, saved_steps
-from model.weights import TrainedRange, decode_weights, trained_range
+from model.open import find_network, open_network, path_of_step, saved_steps
+from model.weights import TrainedRange
 from storage.dataset.dataset import Dataset
 from storage.dataset.training_data import NO_MANIFEST
 from storage.errors import TrilightError
-from storage.records.safe_read import safetensors_header
 from storage.remote import transfers
 from tests.command_line import expect_output
 from tests.for_each import for_each
@@ -184,12 +183,11 @@ def test_the_folder_holds_everything_and_agrees_with_the_result(
     assert rows[-1]["validation"] == whole.scores
     with Image.open(folder.sheet) as sheet:
         assert min(sheet.size) > 200
-    weights = folder.weights.read_bytes()
-    assert trained_range(safetensors_header(weights)["__metadata__"]) == TrainedRange(
+    assert find_network(folder.weights).trained == TrainedRange(
         max_triangles=64,  # of the manifest of the toy dataset
         resolution=16,
     )
-    model = decode_weights(weights)
+    model = open_network(folder.weights)
     assert sum(weight.numel() for weight in model.parameters()) == whole.num_parameters
 
     steps = [f"step {step}" for step in range(1, 13)]

@@ -102,7 +102,6 @@ def _scene_of(
     key: str, scene: Scene, views: Sequence[ViewRecord], pictures: Stored, resolution: int
 ) -> TrainingScene:
     """Return a scene with the pictures of all of its cameras."""
-    require_divisor(resolution, pictures.shape[1])
     if pictures.dtype == np.uint16 and pictures.shape[1] == resolution:
         # the bits were validated: mode "clip" avoids another range check, which would copy
         target_VRR3 = np.take(stored_levels(), pictures.view(np.uint16), mode="clip")
@@ -141,7 +140,11 @@ def block_mean(radiance_rgb: NDArray[np.float32], resolution: int) -> NDArray[np
         TrilightError: `resolution` does not divide the pictures' own.
     """
     views, stored = radiance_rgb.shape[:2]
-    require_divisor(resolution, stored)
+    if resolution < 1 or stored % resolution:
+        raise TrilightError(
+            f"resolution {resolution}: expected a divisor of {stored}, the resolution of the "
+            "dataset. Choose one, or generate the dataset at another resolution."
+        )
     factor = stored // resolution
     if factor == 1:
         return radiance_rgb
@@ -149,12 +152,3 @@ def block_mean(radiance_rgb: NDArray[np.float32], resolution: int) -> NDArray[np
     rows = radiance_rgb.reshape(views, resolution, factor, stored, 3).sum(axis=2, dtype=np.float32)
     blocks = rows.reshape(views, resolution, resolution, factor, 3).sum(axis=3, dtype=np.float32)
     return blocks / np.float32(factor**2)
-
-
-def require_divisor(resolution: int, stored: int) -> None:
-    """Raise TrilightError where `resolution` does not divide that of the stored pictures."""
-    if resolution < 1 or stored % resolution:
-        raise TrilightError(
-            f"resolution {resolution}: expected a divisor of {stored}, the resolution of the "
-            "dataset. Choose one, or generate the dataset at another resolution."
-        )

@@ -122,22 +122,20 @@ def judge_views(config: EvalConfig, scene_done: Callable[[], None]) -> list[Judg
         )
         contestants = {NETWORK: predict(config.network, tensors, config.resolution)}
         contestants |= withheld_pictures(config.network, tensors, config.resolution)
-        grouped_VRR3 = grouped_pictures(config.network, sample.scene, config.resolution)
-        if grouped_VRR3 is not None:
-            contestants[GROUPED] = grouped_VRR3
+        contestants |= grouped_pictures(config.network, sample.scene, config.resolution)
+        swapped_VRR3 = _swapped_pictures(config, tensors, before)
         views = range(len(scene.target_VRR3))
         traced = _traced_pictures(config, sample, views[:first] if number % every == 0 else ())
-        scene_rows = []
         for view in views:
             pictures = {name: pictures_VRR3[view] for name, pictures_VRR3 in contestants.items()}
             if config.baselines is not None:
                 pictures |= config.baselines.pictures(scene.target_VRR3[view])
             if view in traced:
                 pictures[TRACER] = traced[view]
-            scene_rows.append(judge_view(sample, scene, view, pictures, config.lpips))
-        if before is not None and config.network.config.scene_tokens:
-            scene_rows = _add_swapped_scores(config, scene_rows, scene, tensors, before)
-        rows += scene_rows
+            rows.append(judge_view(sample, scene, view, pictures, config.lpips))
+            if swapped_VRR3 is not None:
+                score = psnr_log_db(swapped_VRR3[view], scene.target_VRR3[view])
+                rows[-1] = dataclasses.replace(rows[-1], swapped_psnr_log_db=score)
         before = tensors
         scene_done()
     if not rows:
@@ -179,19 +177,17 @@ def _traced_pictures(
         return {}
 
 
-def _add_swapped_scores(
-    config: EvalConfig,
-    rows: Sequence[JudgedView],
-    judged: ValidationScene,
-    cameras: SceneTensors,
-    other: SceneTensors,
-) -> list[JudgedView]:
-    """Return rows with the scores of predictions that are given another scene's triangles.
+def _swapped_pictures(
+    config: EvalConfig, cameras: SceneTensors, other: SceneTensors | None
+) -> NDArray[np.float64] | None:
+    """Return predictions that are given another scene's triangles; None without such a scene.
 
     This tests whether the network uses the scene: one that has only learned an average picture is
     no worse with other triangles. A network of hits keeps its own hits; only the scene's tokens are
     replaced.
     """
+    if other is None or not config.network.config.scene_tokens:
+        return None
     seen = dataclasses.replace(  # its albedo, which other cameras have seen, is traced again
         other, c2w_V44=cameras.c2w_V44, fov_deg_V=cameras.fov_deg_V, albedo_VRR6=None
     )
@@ -200,11 +196,7 @@ def _add_swapped_scores(
         ratio_12 = (cameras.traced.unit_3 / other.traced.unit_3).repeat(4)
         traced = dataclasses.replace(cameras.traced, sides_T12=other.traced.sides_T12 * ratio_12)
         seen = dataclasses.replace(seen, traced=traced)
-    pictures_VRR3 = predict(config.network, seen, config.resolution)
-    return [
-        dataclasses.replace(row, swapped_psnr_log_db=psnr_log_db(picture, target))
-        for row, picture, target in zip(rows, pictures_VRR3, judged.target_VRR3, strict=True)
-    ]
+    return predict(config.network, seen, config.resolution)
 
 
 def sheet_views(config: EvalConfig, chosen: Sequence[JudgedView]) -> list[SheetView]:
@@ -217,9 +209,9 @@ def sheet_views(config: EvalConfig, chosen: Sequence[JudgedView]) -> list[SheetV
             traced = _traced_pictures(config, sample, [row.view for row in rows])
             black = np.zeros_like(pictures[0])
             for row in rows:
-                view = _sheet_view(row, scene, pictures[row.view])
                 extra = {} if config.tracer is None else {CAPTION: traced.get(row.view, black)}
-                sheet_of_view[row.key, row.view] = dataclasses.replace(view, extra_rgb=extra)
+                view = _sheet_view(row, scene, pictures[row.view], extra)
+                sheet_of_view[row.key, row.view] = view
     return [sheet_of_view[row.key, row.view] for row in chosen]
 
 
@@ -240,7 +232,9 @@ def rows_of_sheets(rows: Sequence[JudgedView]) -> dict[str, list[JudgedView]]:
     )
 
 
-def _sheet_view(row: JudgedView, scene: TrainingScene, picture: NDArray[np.float64]) -> SheetView:
+def _sheet_view(
+    row: JudgedView, scene: TrainingScene, picture: NDArray, extra_rgb: Mapping[str, NDArray]
+) -> SheetView:
     scores = row.scores[NETWORK]
     excursion = "" if row.excursion is None else f", {row.excursion[0]} {row.excursion[1]:g}"
     return SheetView(
@@ -251,21 +245,22 @@ def _sheet_view(row: JudgedView, scene: TrainingScene, picture: NDArray[np.float
         target_rgb=radiance_from_log10(scene.target_VRR3[row.view].double().numpy()),
         predicted_rgb=picture,
         noise=float(scene.noise_V[row.view]),
+        extra_rgb=extra_rgb,
     )
 
 
 def grouped_pictures(
     network: RenderFormer, scene: Scene, resolution: int
-) -> NDArray[np.float64] | None:
+) -> dict[str, NDArray[np.float64]]:
     """Render a scene as `trilight render` does, as the sum over groups of lights.
 
     Returns:
-        Linear radiance [V, R, R, 3] of at least 0, or None if one pass takes every light.
+        Linear radiance [V, R, R, 3] of at least 0 of GROUPED; empty if one pass takes every light.
     """
     if network.config.view_stage == "hits" or len(light_groups(scene, MAX_LIGHTS)) == 1:
-        return None
+        return {}
     with warnings.catch_warnings(action="ignore"):  # that there are groups is known
-        return NeuralRenderer(network).render(scene, resolution).astype(np.float64)
+        return {GROUPED: NeuralRenderer(network).render(scene, resolution).astype(np.float64)}
 
 
 def withheld_pictures(

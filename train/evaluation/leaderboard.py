@@ -15,9 +15,6 @@ from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from typing import Any, NamedTuple
 
-import numpy as np
-from numpy.typing import NDArray
-
 from storage.atomic import append_line
 from storage.dataset.shard_set import ShardSet
 from storage.digests import canonical_json, sha256_hex
@@ -276,7 +273,7 @@ def judge_all(board: Board, on_progress: OnProgress) -> None:
             is_priced = not timed or board.rows.price(keys[0], board.machine) is not None
             if not is_priced or any(board.rows.get(key) is None for key in keys):
                 on_progress(done, total, f"{width} px, {method.name}")
-                _judge(board, method, sample, judged, timed=timed)
+                _judge(board, method, sample, judged, keys, timed=timed)
         _judge_noise(board, sample, width, judged)
     on_progress(total, total, "")
 
@@ -286,22 +283,30 @@ def _judge(
     method: Method,
     sample: Sample,
     judged: Callable[[], ValidationScene],
+    keys: Sequence[RowKey],
     *,
     timed: bool,
 ) -> None:
-    """Add a method's rows of a scene, or record why the scene is left out."""
+    """Add a method's rows of a scene by their keys, or record why the scene is left out."""
+    price: dict[str, Any] = {}
     try:
-        pictures, price = _show(method, sample, timed=timed)
+        if isinstance(method, PictureSource):
+            pictures = list(method.pictures(sample))
+        else:
+            scene = sample.scene
+            measured = time_scene(method, scene, sample.key) if timed else None
+            loaded = measured.loaded if measured else method.load(scene, sample.key)
+            cameras = [Camera.of_scene(scene, view) for view in range(scene.num_views)]
+            pictures = [loaded.render(camera).radiance_rgb for camera in cameras]
+            if measured:
+                price = asdict(measured.price) | {"machine": board.machine}
     except Unrenderable as error:
         board.left_out[method.resolution, sample.key] = f"{method.name}: {error}"
         return
-    scene = judged()
-    for view, picture in enumerate(pictures):
-        scores = picture_scores(picture, scene.target_VRR3[view], scene.hits_VRR[view], board.lpips)
-        row = Row(scores=scores)
-        if price is not None and view == 0:
-            row = Row(scores=scores, **asdict(price), machine=board.machine)
-        board.rows.add(board.key_of(method, sample.key, view), row)
+    views = zip(keys, pictures, judged().target_VRR3, judged().hits_VRR, strict=True)
+    for key, picture, target, hits in views:
+        board.rows.add(key, Row(scores=picture_scores(picture, target, hits, board.lpips), **price))
+        price = {}  # it is that of the first view
 
 
 def _judge_noise(
@@ -316,20 +321,6 @@ def _judge_noise(
                 sample, view, scene.target_VRR3[view], scene.hits_VRR[view], board.lpips
             )
             board.rows.add(key, Row(scores=floors, facts=scene_facts(sample)))
-
-
-def _show(
-    method: Method, sample: Sample, *, timed: bool
-) -> tuple[Sequence[NDArray[np.floating]], Price | None]:
-    """Return the pictures [R, R, 3] of all views, and the price if it is measured."""
-    if isinstance(method, PictureSource):
-        return list(method.pictures(sample)), None
-    scene = sample.scene
-    measured = time_scene(method, scene, sample.key) if timed else None
-    loaded = measured.loaded if measured else method.load(scene, sample.key)
-    cameras = [Camera.of_scene(scene, view) for view in range(scene.num_views)]
-    pictures = [loaded.render(camera).radiance_rgb for camera in cameras]
-    return pictures, measured.price if measured else None
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -33,7 +33,7 @@ from train.data.order import RECORD, Mixture
 from train.loop.distributed import DistributedContext
 from train.loop.step import StepReport
 from train.loop.train_state import TrainState, new_state
-from train.resume import Event, ResumePlan
+from train.resume import Event, StartPlan
 from train.settings import Precision, decay_start_step, stored_settings
 
 UNSEALED = "0" * 64
@@ -114,7 +114,7 @@ def read_checkpoint(path: Path) -> Checkpoint:
 
 def restore_state(
     checkpoint: Checkpoint,
-    plan: ResumePlan,
+    plan: StartPlan,
     device: torch.device | None = None,
     muon_precision: Precision = "bfloat16",
 ) -> TrainState:

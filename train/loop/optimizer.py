@@ -209,12 +209,10 @@ class StackedMuon(torch.optim.Muon):
         """Update the momentum, and return the gradients [M, N] with Nesterov's momentum."""
         if not weights:
             return []
-        gradients: list[Tensor] = []
-        for weight in weights:
-            assert weight.grad is not None
-            gradients.append(weight.grad)
+        gradients = [weight.grad for weight in weights if weight.grad is not None]
+        for weight, gradient in zip(weights, gradients, strict=True):
             if "momentum_buffer" not in self.state[weight]:
-                self.state[weight]["momentum_buffer"] = torch.zeros_like(weight.grad)
+                self.state[weight]["momentum_buffer"] = torch.zeros_like(gradient)
         means: list[Tensor] = [self.state[weight]["momentum_buffer"] for weight in weights]
         move_towards(means, gradients, 1 - momentum, self.decision)
         return torch._foreach_lerp(gradients, means, momentum)

@@ -137,13 +137,13 @@ class Stepper:
                     batch.to(self._dist_context.device), num_views, last=last
                 )
         activity.begin("optimiser")
-        self.layers.record_gradients()
-        norm = nn.utils.clip_grad_norm_(state.model.parameters(), self._settings.grad_clip)
-        activity.begin("exchange")
-        stop_flag = torch.full_like(sums[:1], float(asked_to_stop))
-        means = self._dist_context.mean_on_device(torch.cat([sums / num_views, stop_flag]))
-        activity.begin("optimiser")
-        applied = self._move(means[0], norm, learning_rate)
+        with self.layers.measured_update():
+            norm = nn.utils.clip_grad_norm_(state.model.parameters(), self._settings.grad_clip)
+            activity.begin("exchange")
+            stop_flag = torch.full_like(sums[:1], float(asked_to_stop))
+            means = self._dist_context.mean_on_device(torch.cat([sums / num_views, stop_flag]))
+            activity.begin("optimiser")
+            applied = self._move(means[0], norm, learning_rate)
         activity.begin("other")
         return torch.cat([means[:4], torch.stack([norm.to(means), applied.to(means)]), means[4:]])
 
@@ -157,7 +157,6 @@ class Stepper:
         state.optimizer.step(learning_rate, decision)
         state.update_ema(decision)
         self._updates += applied
-        self.layers.record_update()
         return applied
 
     def sync(self, steps: Sequence[PendingStats]) -> tuple[list[StepReport], bool]:

@@ -8,7 +8,7 @@ import json
 import math
 import time
 from collections.abc import Callable, Iterable, Iterator, Sequence
-from contextlib import closing, contextmanager, suppress
+from contextlib import contextmanager, suppress
 from functools import lru_cache
 
 import torch
@@ -28,11 +28,11 @@ from train.loss.training_loss import TrainingLoss
 from train.monitoring.process_monitor import (
     Spike,
     SpikeDetector,
-    StepProfiler,
     Watchdog,
     memory_mb,
     merge_spikes,
     own_seconds,
+    profiled_steps,
     slowest_rank,
 )
 from train.progress import TrainProgress
@@ -146,6 +146,7 @@ class Trainer:
         slow_rank: process that the last row of the log found slow; None for none.
         window_steps: steps since the last row of the log in this call.
         window_flops: FLOPs of this process's scenes in them, without padding.
+        num_profiled: number of steps to trace with PyTorch's profiler.
     """
 
     def __init__(
@@ -178,12 +179,7 @@ class Trainer:
         self.slow_rank: int | None = None
         self.window_steps = 0
         self.window_flops = 0.0
-        self.profiler = StepProfiler(
-            watched.profile if dist_context.is_first else 0,
-            dist_context.device,
-            folder.monitoring,
-            self._note,
-        )
+        self.num_profiled = watched.profile if dist_context.is_first else 0
         self.watchdog = Watchdog(
             watched,
             self.activity,
@@ -200,8 +196,9 @@ class Trainer:
             TrilightError: a signal stops the run or the start is dead (the state is saved), or too
                 many steps in a row fail.
         """
+        traces = self.num_profiled, self.state.step, self.dist_context.device
         with (
-            closing(self.profiler),
+            profiled_steps(*traces, self.folder.monitoring, self._note) as end_step,
             self.watchdog,
             self.writing,
             deferred_interrupts(self.progress.report_interrupt) as asked_to_stop,
@@ -210,6 +207,7 @@ class Trainer:
             self._catch_up(asked_to_stop)
             while self.state.step < self.settings.num_steps:
                 self._step(steps, asked_to_stop)
+                end_step()
                 waited = self._after_step(asked_to_stop)
                 self._stop_if_asked(asked_to_stop, together=waited)
                 if self.state.step == self.settings.num_steps:
@@ -252,9 +250,8 @@ class Trainer:
         settings = self.settings
         step = self.state.step
         self.watchdog.begin("step", step + 1)
-        self.profiler.begin_step(step + 1)
         is_measured = self.dist_context.is_first and self._is_window_end(step + 1)
-        self.stepper.layers.expect_update(is_measured)
+        self.stepper.layers.is_due = is_measured
         with self.activity.during("data"):
             scenes = next(steps)
         with explain_out_of_memory(settings, step):
@@ -270,7 +267,6 @@ class Trainer:
         self.window_steps += 1
         self.window_flops += sum(scene_flops(settings, count) for count in scenes.num_triangles)
         self.state.step += 1
-        self.profiler.end_step()
         self.pending.append((self.state.step, scenes.keys, stats))
         syncs = not self.stepper.defer_sync or self._is_window_end(self.state.step)
         if syncs or len(self.pending) == MAX_PENDING:

@@ -44,16 +44,6 @@ PHASES = {
 """Description of each phase of training, by name."""
 
 
-@dataclass(frozen=True)
-class ActivePhase:
-    """Phase in progress."""
-
-    phase: str
-    """Name of the phase, one of PHASES."""
-    since_s: float
-    """Start of the phase, by time.monotonic()."""
-
-
 class Activity:
     """Timer of phases: each moment belongs to exactly one.
 
@@ -66,20 +56,21 @@ class Activity:
     """
 
     def __init__(self) -> None:
-        self.now = ActivePhase("other", time.monotonic())
+        self.now = ("other", time.monotonic())
+        """Name of the phase in progress, one of PHASES, and its start."""
         self._taken_s = dict.fromkeys(PHASES, 0.0)
 
     def begin(self, phase: str) -> None:
         """End the current phase, and begin another."""
         moment_s = time.monotonic()
-        before = self.now
-        self._taken_s[before.phase] += moment_s - before.since_s
-        self.now = ActivePhase(phase, moment_s)
+        before, since_s = self.now
+        self._taken_s[before] += moment_s - since_s
+        self.now = (phase, moment_s)
 
     @contextmanager
     def during(self, phase: str) -> Iterator[None]:
         """Assign the time of a block to a phase, then return to the previous one."""
-        before = self.now.phase
+        before, _ = self.now
         self.begin(phase)
         try:
             yield
@@ -88,13 +79,13 @@ class Activity:
 
     def working_seconds(self) -> float:
         """Return the seconds, above 0, since `pop_seconds` without validations and checkpoints."""
-        self.begin(self.now.phase)
+        self.begin(self.now[0])
         pauses_s = self._taken_s["validation"] + self._taken_s["saving"]
         return max(sum(self._taken_s.values()) - pauses_s, 1e-9)
 
     def pop_seconds(self) -> dict[str, float]:
         """Return the seconds of each phase since the last call, and reset them."""
-        self.begin(self.now.phase)
+        self.begin(self.now[0])
         taken_s = self._taken_s
         self._taken_s = dict.fromkeys(PHASES, 0.0)
         return taken_s
@@ -115,38 +106,32 @@ class LayerNorms:
         self._groups: dict[str, list[nn.Parameter]] = {}
         for name, weight in model.named_parameters():
             self._groups.setdefault(layer_of(name), []).append(weight)
-        self.expect_update(False)
-
-    def expect_update(self, due: bool) -> None:
-        """Set whether the next update is measured."""
-        self._due = due
-        self._grads: list[Tensor] = []
-        self._before: list[list[Tensor]] = []
+        self.is_due = False
+        """True if the next update is measured."""
         self._norms: Tensor | None = None
 
+    @contextmanager
     @torch.no_grad()
-    def record_gradients(self) -> None:
-        """Record the gradient norms; call when gradients are complete and not clipped yet."""
-        if not self._due:
-            return
-        for weights in self._groups.values():
-            self._grads.append(_length([w.grad for w in weights if w.grad is not None], weights))
-            self._before.append([weight.clone() for weight in weights])
+    def measured_update(self) -> Iterator[None]:
+        """Measure the update in a block if it is due, without a wait for the device.
 
-    @torch.no_grad()
-    def record_update(self) -> None:
-        """Record weight and update norms after the update, without a wait for the device."""
+        The block begins when gradients are complete and not clipped yet.
+        """
+        if not self.is_due:
+            yield
+            return
+        self.is_due = False
+        groups = self._groups.values()
+        grads = [_length([w.grad for w in group if w.grad is not None], group) for group in groups]
+        before = [[weight.clone() for weight in group] for group in groups]
+        yield
         columns = []
-        for grad, weights, before in zip(
-            self._grads, self._groups.values(), self._before, strict=False
-        ):
-            length = _length(before, weights)
-            moved = [weight - old for weight, old in zip(weights, before, strict=True)]
+        for grad, weights, old_weights in zip(grads, groups, before, strict=True):
+            length = _length(old_weights, weights)
+            moved = [weight - old for weight, old in zip(weights, old_weights, strict=True)]
             ratio = _length(moved, weights) / length.clamp(min=torch.finfo(length.dtype).tiny)
             columns.append(torch.stack([grad, length, ratio]))
-        if columns:
-            self.expect_update(False)
-            self._norms = torch.stack(columns)
+        self._norms = torch.stack(columns)
 
     def pop_row(self) -> dict[str, list[float | None]]:
         """Return LAYER_COLUMNS by layer of the measured update once; empty if there is none.
@@ -156,7 +141,7 @@ class LayerNorms:
         if self._norms is None:
             return {}
         rows = self._norms.tolist()
-        self.expect_update(False)
+        self._norms = None
         return {
             layer: [float(f"{each:.{_DIGITS}g}") if math.isfinite(each) else None for each in row]
             for layer, row in zip(self._groups, rows, strict=True)
@@ -237,72 +222,54 @@ SKIPPED_STEPS = 3
 _ROWS = 40
 
 
-class StepProfiler:
-    """Traces steps of one process; costs nothing if there are none to trace."""
+@contextmanager
+def profiled_steps(
+    steps: int, done: int, device: torch.device, folder: Path, note: Callable[[str], None]
+) -> Iterator[Callable[[], None]]:
+    """Trace some steps of a block, and yield the function that ends a step.
 
-    def __init__(
-        self, steps: int, device: torch.device, folder: Path, note: Callable[[str], None]
-    ) -> None:
-        """Create the profiler.
+    A block that ends earlier leaves an incomplete trace.
 
-        Args:
-            steps: number of steps; 0 traces none.
-            folder: folder of the trace and the table.
-            note: called with a message that names the files.
-        """
-        self._steps = steps
-        self._device = device
-        self._folder = folder
-        self._note = note
-        self._step = 0
-        self._first = 0
-        self._profile: Any = None
-        self._is_written = False
+    Args:
+        steps: number of steps to trace; 0 traces none and costs nothing.
+        done: number of steps before the block.
+        folder: folder of the trace and the table.
+        note: called with a message that names the files.
+    """
+    if not steps:
+        yield lambda: None
+        return
+    from torch.profiler import ProfilerActivity, profile, schedule
 
-    def begin_step(self, step: int) -> None:
-        """Begin a step, counted from 1."""
-        self._step = step
-        if not self._steps or self._profile is not None:
-            return
-        from torch.profiler import ProfilerActivity, profile, schedule
+    first = done + SKIPPED_STEPS + 1
+    traces: list[Path] = []
 
-        on_gpu = [ProfilerActivity.CUDA] if self._device.type == "cuda" else []
-        self._first = step + SKIPPED_STEPS
-        self._profile = profile(
-            activities=[ProfilerActivity.CPU, *on_gpu],
-            schedule=schedule(
-                skip_first=SKIPPED_STEPS - 1, wait=0, warmup=1, active=self._steps, repeat=1
-            ),
-            on_trace_ready=self._write,
-        )
-        self._profile.start()
-
-    def end_step(self) -> None:
-        """End the step; the last of a trace writes it."""
-        if self._profile is not None:
-            self._profile.step()
-
-    def close(self) -> None:
-        """Write an incomplete trace of a run that has ended."""
-        if self._profile is not None:
-            self._profile.stop()
-        if self._steps and not self._is_written:
-            self._note(
-                f"nothing was profiled: the run ended before step {SKIPPED_STEPS + 1} of this call"
-            )
-
-    def _write(self, profiler: Any) -> None:
-        self._is_written = True
-        self._folder.mkdir(parents=True, exist_ok=True)
-        trace = self._folder / f"profile-steps-{self._first}-to-{self._step}.json.gz"
+    def write(profiler: Any) -> None:
+        last = done + profiler.step_num
+        folder.mkdir(parents=True, exist_ok=True)
+        trace = folder / f"profile-steps-{first}-to-{last}.json.gz"
         table = trace.with_name(trace.name.replace(".json.gz", ".txt"))
         profiler.export_chrome_trace(str(trace))
-        order = f"self_{self._device.type}_time_total"
+        order = f"self_{device.type}_time_total"
         table.write_text(profiler.key_averages().table(sort_by=order, row_limit=_ROWS))
-        self._note(
-            f"steps {self._first} to {self._step} were profiled: open {trace} at chrome://tracing "
-            f"in Chromium or at ui.perfetto.dev; {table.name} beside it lists the dearest operators"
+        note(
+            f"steps {first} to {last} were profiled: open {trace} at chrome://tracing in Chromium "
+            f"or at ui.perfetto.dev; {table.name} beside it lists the dearest operators"
         )
+        traces.append(trace)
+
+    on_gpu = [ProfilerActivity.CUDA] if device.type == "cuda" else []
+    planned = schedule(skip_first=SKIPPED_STEPS - 1, wait=0, warmup=1, active=steps, repeat=1)
+    try:
+        with profile(
+            activities=[ProfilerActivity.CPU, *on_gpu], schedule=planned, on_trace_ready=write
+        ) as profiler:
+            yield profiler.step
+    finally:
+        if not traces:
+            note(
+                f"nothing was profiled: the run ended before step {SKIPPED_STEPS + 1} of this call"
+            )
 
 
 def merge_spikes(by_rank: Sequence[Sequence[Mapping[str, Any]]]) -> list[dict[str, Any]]:
@@ -397,8 +364,6 @@ class _Stretch:
     """time.monotonic() at which it was seen to hang; None if it does not."""
     next_s: float = 0.0
     """time.monotonic() of the next report."""
-    is_reported: bool = False
-    """True after this process has reported the hang."""
     is_stopped: bool = False
     """True after the run was asked to stop."""
     passed_on: set[Path] = field(default_factory=set)
@@ -491,8 +456,8 @@ class Watchdog:
                 hang.hung_s = now_s
                 self._files += 1
             if now_s >= hang.next_s:
-                hang.next_s = hang.since_s + 2 * (now_s - hang.since_s)  # ever more rarely
                 self._report(hang, now_s)
+                hang.next_s = hang.since_s + 2 * (now_s - hang.since_s)  # ever more rarely
             if self._dist_context.is_first:
                 self._forward_reports(hang, now_s)
                 should_stop = self._settings.on_hang == "stop" and not hang.is_stopped
@@ -504,20 +469,19 @@ class Watchdog:
 
     def _report(self, stretch: _Stretch, now_s: float) -> None:
         """Write the stacks, and report the current phase of this process."""
-        doing = self._activity.now
+        phase, began_s = self._activity.now
         path = self._path(stretch.step, self._dist_context.rank)
         usual = "" if stretch.usual_s is None else f", where {stretch.usual_s:.2g} s is usual"
         line = (
             f"process {self._dist_context.rank} of {self._dist_context.world_size}: {stretch.name} "
             f"has taken {now_s - stretch.since_s:.1f} s{usual}; for "
-            f"{now_s - doing.since_s:.1f} s it has been in: {PHASES[doing.phase]}"
+            f"{now_s - began_s:.1f} s it has been in: {PHASES[phase]}"
         )
         written = ""
         if self._files <= MAX_FILES:
             with suppress(OSError):
-                _write_stacks(path, line, appends=stretch.is_reported)
+                _write_stacks(path, line, appends=stretch.next_s > 0)
                 written = f". Stacks of its threads: {path}"
-        stretch.is_reported = True
         self._note_safely(line + written)
 
     def _note_safely(self, text: str) -> None:

@@ -1,13 +1,14 @@
 """Scenes for the tests of what is traced, as `LitScene` has them."""
 
 from types import SimpleNamespace
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
+from numpy.typing import NDArray
 
 from model.hits.lit_scene import LitScene
 from model.hits.textures import surface_textures
-from model.hits.view_inputs import Channel, ViewInputs, view_inputs
+from model.hits.view_inputs import Channel, view_inputs
 from storage.records.retextured import with_textures
 from storage.records.scene import Scene
 from storage.records.texture import Environment, Texture
@@ -43,10 +44,18 @@ def corner(
     return join(parts, eye=(1.0, -3.0, 1.4), target=(0, 0, 0.4), fov_deg=38.0, sky=sky)
 
 
+class ViewInputs(NamedTuple):
+    """What `view_inputs` returns, by name."""
+
+    pixels: NDArray
+    anchor: NDArray
+    gathered: NDArray
+
+
 def traced(scene: Scene, resolution: int = 32, **changes: int) -> ViewInputs:
     lit, fov_deg = lit_scene(scene), float(scene.fov_deg[0])
     seed = changes.pop("seed", 0)
-    return view_inputs(lit, scene.c2w[0], fov_deg, resolution, rays(**changes), seed)
+    return ViewInputs(*view_inputs(lit, scene.c2w[0], fov_deg, resolution, rays(**changes), seed))
 
 
 def rays(

@@ -78,7 +78,7 @@ def test_a_white_ball_in_a_white_sky_is_white(roughness: float) -> None:
 
 def test_scenes_without_a_sky_stay_as_they_are_to_the_bit() -> None:
     plain, asked = traced(corner(), sky_rays=0), traced(corner(), sky_rays=8)
-    for name, value in vars(plain).items():
+    for name, value in plain._asdict().items():
         assert np.array_equal(value, getattr(asked, name)), name
 
 
@@ -98,7 +98,7 @@ def test_a_sky_joins_the_unit_and_what_triangles_receive() -> None:
 @for_each("sky", [one_sun(1e6), constant(1e9), constant(1e-9, height=1)])
 def test_extreme_skies_are_finite(sky: Environment) -> None:
     inputs = traced(corner(sky=sky), sky_rays=3)
-    assert all(np.isfinite(value).all() for value in vars(inputs).values())
+    assert all(np.isfinite(value).all() for value in inputs)
 
 
 def test_the_lobe_ray_and_the_others_share_what_a_mirror_shows() -> None:

@@ -178,7 +178,7 @@ def _pixels(tensors: SceneTensors, **changes: int) -> NDArray:
     (lit,) = lit_scenes(batch_scenes([tensors]))
     camera = tensors.c2w_V44[0].numpy(), float(tensors.fov_deg_V[0])
     seed = changes.pop("seed", 0)
-    return view_inputs(lit, *camera, 32, rays(gather_rays=0, **changes), seed).pixels
+    return view_inputs(lit, *camera, 32, rays(gather_rays=0, **changes), seed)[0]
 
 
 def _direct(tensors: SceneTensors) -> NDArray:

@@ -238,11 +238,11 @@ def test_the_page_prints_na_escapes_text_and_puts_the_benchmark_beside_the_paper
 def test_many_lights_are_judged_in_one_pass_and_in_groups(dataset: Dataset) -> None:
     network = new_state(tiny_run()).model
     scene = toy_scene(0)
-    assert grouped_pictures(network, scene, 16) is None, "one light is one group"
+    assert not grouped_pictures(network, scene, 16), "one light is one group"
     floor = quad([[-1, -1, 0], [1, -1, 0], [1, 1, 0], [-1, 1, 0]], material(diffuse=0.5))
     lamps = [light([[x, 0, 2], [x + 0.05, 0, 2], [x, 0.05, 2]], 9.0) for x in np.arange(20) / 10]
     many = join([floor, *lamps]).with_cameras(scene.c2w, scene.fov_deg)
-    grouped = grouped_pictures(network, many, 16)
+    grouped = grouped_pictures(network, many, 16)[GROUPED]
     assert grouped is not None and grouped.shape == (2, 16, 16, 3)
     # by hand: every group's picture times its share, the same sums in another order
     expected = sum(

@@ -1,4 +1,4 @@
-"""`python -m model.check_reference FILE`: compares this network with the published one's outputs.
+"""`python -m tests.model.check_reference FILE`: compares this network with the published outputs.
 
 Reads a file with a configuration, weights under published names, scenes, and the published code's
 outputs; runs this network on all scenes, padded to the longest, and on each alone. Prints the
@@ -92,7 +92,7 @@ def _scenes(tensors: Mapping[str, Tensor]) -> list[SceneTensors]:
 def main(arguments: list[str]) -> int:
     """Run the comparison on one file; returns the exit status."""
     if len(arguments) != 1:
-        sys.stderr.write("usage: python -m model.check_reference FILE.safetensors\n")
+        sys.stderr.write("usage: python -m tests.model.check_reference FILE.safetensors\n")
         return 2
     try:
         largest = differences(Path(arguments[0]))
