@@ -143,10 +143,11 @@ def build_scene(
     """
     data = _read_scene_file(root, name)
     description = read_renderformer_json(data, name)
+    objects = description.objects.values()
     num_views = len(description.cameras) if num_views is None else num_views
     digests = {name: sha256_hex(data)}
     meshes: dict[tuple[str, int | None], LoadedMesh] = {}
-    for described in description.objects:
+    for described in objects:
         key = (described.mesh_path, described.remesh_faces)
         if key not in meshes:
             where = f"{name}: objects.{described.name}.mesh_path"
@@ -161,7 +162,7 @@ def build_scene(
                 notes += (f"{uid}: {text}" for text in meshes[key].unread)
     scene = scene_from_description(
         description,
-        [meshes[described.mesh_path, described.remesh_faces] for described in description.objects],
+        [meshes[described.mesh_path, described.remesh_faces] for described in objects],
         num_views=num_views,
         albedo_over_one=albedo_over_one,
         provenance={

@@ -16,7 +16,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from pipeline.scenes.pieces import ScenePiece, concatenate_pieces
-from pipeline.scenes.shading_normals import ShadedMesh, flat_shaded
+from pipeline.scenes.shading_normals import ShadedMesh, face_normals, flat_shaded
 from storage.conventions import linear_from_srgb8, look_at_c2w, srgb8
 from storage.errors import TrilightError, prefix_errors
 from storage.records.environment import Environment
@@ -192,6 +192,25 @@ def group_triangles(scene: Scene) -> list[tuple[int, int, NDArray[np.intp]]]:
         (*divmod(int(key), len(scene.materials)), triangles)
         for key, triangles in zip(distinct, np.split(order, starts[1:]), strict=True)
     ]
+
+
+def mesh_of_triangles(scene: Scene, triangles: NDArray[Any]) -> ShadedMesh:
+    """Return triangles of a scene, by their rows or a mask [T], with the vertices that they use."""
+    rows, corners = np.unique(scene.faces[triangles], return_inverse=True)
+    faces = corners.reshape(-1, 3).astype(np.uint32)
+    return ShadedMesh(
+        positions=scene.vertex_positions[rows],
+        normals=scene.vertex_normals[rows],
+        faces=faces,
+        groups=np.zeros(len(faces), np.int64),
+    )
+
+
+def is_smooth(mesh: ShadedMesh, tolerance: float) -> bool:
+    """Return whether a normal differs by more than a tolerance from that of its triangle."""
+    with np.errstate(invalid="ignore", divide="ignore"):
+        flat = face_normals(mesh.positions, mesh.faces)  # not finite without an area
+        return bool((np.abs(mesh.normals[mesh.faces] - flat[:, None]) > tolerance).any())
 
 
 class SceneParts:

@@ -46,7 +46,6 @@ from pipeline.exchange.exports.pictures import (
 from pipeline.exchange.reader import SceneReader, scene_source
 from pipeline.exchange.textured_triangles import LoadedScene
 from storage.atomic import atomic_writer, write_atomically
-from storage.conventions import SPLITS
 from storage.dataset.dataset import Dataset, open_dataset
 from storage.dataset.manifest import ShardEntry
 from storage.dataset.shard import ShardReader
@@ -82,7 +81,6 @@ def _write_sample(form: str, sample: Sample, folder: Path) -> Sequence[str]:
         for view, radiance_rgb in enumerate(sample.radiance_rgb):
             write_atomically(folder / picture_name(sample.key, view), encode_exr(radiance_rgb))
         return ()
-    folder.mkdir(parents=True, exist_ok=True)
     target = folder / f"{sample.key}{SCENE_SUFFIXES[form]}"
     return write_scene(target, sample.scene, sample.radiance_rgb)
 
@@ -207,7 +205,7 @@ def write_energon(
     Raises:
         TrilightError: there is no such shard, or its bytes are not those of the manifest.
     """
-    shards = [shard for shard in dataset.manifest.shards if split in (None, shard.split)]
+    shards = dataset.shards_of(split)
     if not shards:
         raise TrilightError(
             f"{dataset.display_name}: no shard in split {split}; expected one of "
@@ -232,7 +230,6 @@ def _copy_shard(
     dataset: Dataset, shard: ShardEntry, out: Path, done: Callable[[int], None]
 ) -> None:
     target = out / shard.name
-    target.parent.mkdir(parents=True, exist_ok=True)
     with dataset.open_stream(shard, checked=True) as stream:
         with atomic_writer(target) as copy:
             shutil.copyfileobj(stream, copy)
@@ -327,13 +324,9 @@ def select_samples(
     Raises:
         TrilightError: the split or scene does not exist, or the dataset is empty or damaged.
     """
-    if split is not None and split not in SPLITS:
-        raise TrilightError(f"split is {split!r}; expected one of {', '.join(SPLITS)}.")
     scene_key = sample_key(int(scene)) if scene is not None and scene.isdecimal() else scene
     has_samples = False
-    for shard in dataset.manifest.shards:
-        if split not in (None, shard.split):
-            continue
+    for shard in dataset.shards_of(split):
         keys = [key for key in dataset.keys(shard) if scene_key in (None, key)]
         has_samples = has_samples or bool(keys)
         for sample in dataset.read_samples(shard, keys):
