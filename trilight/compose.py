@@ -151,8 +151,7 @@ class SceneBuilder:
             licence: SPDX identifier, or `LicenseRef-...`.
 
         Raises:
-            TrilightError: no such file, arrays that are not a mesh, invalid numbers, or a name that
-                another object has.
+            TrilightError: no such file, arrays that are no mesh, invalid numbers, or a used name.
         """
         if isinstance(mesh, tuple):
             name = name or f"object{len(self._objects)}"
