@@ -293,8 +293,7 @@ class SceneBuilder:
         """Build the scene, which passes `Scene.check`. A child process reads the mesh files.
 
         Raises:
-            TrilightError: a file is unusable, albedos add up to more than 1, or there is no lamp,
-                no camera or no surface.
+            TrilightError: an unusable file, albedos beyond 1, or no lamp, camera or surface.
         """
         if not self._objects:
             raise TrilightError(

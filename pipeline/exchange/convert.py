@@ -148,13 +148,6 @@ _LOST = "textures became their means: reduced triangles have no texture coordina
 _FLAT = 1e-3
 
 
-def reduce_scene(scene: Scene, budget: int) -> LoadedScene:
-    """Call `within_budget` in a child process."""
-    with SceneReader() as reader:
-        loaded = LoadedScene(scene=scene, notes=())
-        return reader.call(within_budget, loaded, budget, name="scene")
-
-
 def within_budget(loaded: LoadedScene, budget: int) -> LoadedScene:
     """Return a scene with at most `budget` triangles and no pictures, and notes on what that cost.
 

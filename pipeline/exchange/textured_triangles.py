@@ -377,20 +377,21 @@ def is_constant(values: Map) -> bool:
 
 
 def resample_to_largest(*maps: Map) -> tuple[Map, ...]:
-    """Resample all maps but constants to the size of the largest in each direction."""
-    sizes = [values.shape[:2] for values in maps if not is_constant(values)]
-    if len(set(sizes)) < 2:
+    """Interpolate all maps but constants to the size of the largest in each direction.
+
+    The values at the texel centers are those of texture look-ups.
+    """
+    sizes = {values.shape[:2] for values in maps if not is_constant(values)}
+    if len(sizes) < 2:
         return maps
-    height, width = (max(size[axis] for size in sizes) for axis in range(2))
+    size = tuple(map(max, zip(*sizes, strict=True)))
     return tuple(
-        values if is_constant(values) else resample_map(values, height, width) for values in maps
+        values if is_constant(values) or values.shape[:2] == size else _resample(values, *size)
+        for values in maps
     )
 
 
-def resample_map(values: Map, height: int, width: int) -> Map:
-    """Interpolate a map at the texel centers of another size, as texture look-ups do."""
-    if values.shape[:2] == (height, width):
-        return values
+def _resample(values: Map, height: int, width: int) -> Map:
     texture = Texture(texels=values)
     u, v = ((np.arange(count) + 0.5) / count for count in (width, height))
     resampled = np.zeros((height, width, values.shape[2]), np.float32)
