@@ -76,9 +76,8 @@ def within_budget(scene: Scene, max_triangles: int) -> Scene:
     Raises:
         TrilightError: the emitters alone exceed it, or an object cannot be reduced that far.
     """
-    loaded = LoadedScene(scene=scene, notes=())
     with SceneReader() as reader:
-        return _warn_notes(reader.call(convert.within_budget, loaded, max_triangles, name="scene"))
+        return _warn_notes(reader.call(convert.within_budget, scene, max_triangles, name="scene"))
 
 
 def _warn_notes(loaded: LoadedScene) -> Scene:

@@ -123,10 +123,13 @@ def convert_sources(
     def load(source: SceneSource) -> LoadedScene:
         nonlocal triangles
         loaded = load_source(source, pictures=form.holds_pictures)
-        if budget is not None and loaded.scene.num_triangles > budget:
-            loaded = within_budget(loaded, budget)
-        triangles += loaded.scene.num_triangles
         notes.extend(loaded.notes)
+        if budget is not None and loaded.scene.num_triangles > budget:
+            has_pictures = loaded.radiance_rgb is not None
+            loaded = within_budget(loaded.scene, budget)
+            notes.extend(loaded.notes)
+            notes.extend(["pictures left out: they show the scene before that"] * has_pictures)
+        triangles += loaded.scene.num_triangles
         return loaded
 
     if form.write_many and len(sources) > 1:
@@ -148,16 +151,14 @@ _LOST = "textures became their means: reduced triangles have no texture coordina
 _FLAT = 1e-3
 
 
-def within_budget(loaded: LoadedScene, budget: int) -> LoadedScene:
-    """Return a scene with at most `budget` triangles and no pictures, and notes on what that cost.
+def within_budget(scene: Scene, budget: int) -> LoadedScene:
+    """Return a scene with at most `budget` triangles, and notes on what that cost.
 
     Raises:
         TrilightError: emitters alone exceed the budget, or an object cannot be reduced that far.
     """
-    lost = [_LOST] if loaded.scene.textures else []
-    if loaded.radiance_rgb is not None:
-        lost.append("pictures left out: they show the scene before that")
-    scene = without_maps(loaded.scene, environment=False)
+    lost = [_LOST] if scene.textures else []
+    scene = without_maps(scene, environment=False)
     counts = np.bincount(scene.object_index, minlength=len(scene.objects))
     emits = np.array([entry.kind == "emitter" for entry in scene.objects])
     room = budget - int(counts[emits].sum())
@@ -184,7 +185,7 @@ def within_budget(loaded: LoadedScene, budget: int) -> LoadedScene:
     )
     reduced.check()
     note = f"{scene.num_triangles} triangles reduced to {total}"
-    return LoadedScene(scene=reduced, notes=(*loaded.notes, note, *lost))
+    return LoadedScene(scene=reduced, notes=(note, *lost))
 
 
 def _build_piece(scene: Scene, row: int) -> ScenePiece:
