@@ -23,7 +23,6 @@ from numpy.typing import NDArray
 
 from pipeline.exchange.from_description import (
     SHELL_FOLDER,
-    CameraFile,
     DescribedCamera,
     DescribedObject,
     SceneDescription,
@@ -65,29 +64,19 @@ _MAX_SHOWN = 120
 
 
 def read_renderformer_json(data: bytes, name: str) -> SceneDescription:
-    """Parse the bytes of a scene file; messages call it `name`.
+    """Parse the bytes of a scene file; as `read_record`."""
+    return read_record(SceneDescription, data, name)
+
+
+def read_record(kind: type[Record], data: bytes, name: str) -> Record:
+    """Parse the bytes of a scene file, or of another file with `cameras`; messages call it `name`.
+
+    The record names the fields that no record has, so that a misspelt option is reported.
 
     Raises:
         TrilightError: the file exceeds MAX_BYTES or is not JSON; a JSON object repeats a name; or a
             field is missing, of the wrong type, not finite or out of range. The message names file,
             field (with the object's name), value and expected value.
-    """
-    return _read(SceneDescription, data, name)
-
-
-def read_cameras(data: bytes, name: str) -> tuple[DescribedCamera, ...]:
-    """Return the cameras of a scene file, or of a JSON file that has nothing but `cameras`.
-
-    Raises:
-        TrilightError: as `read_renderformer_json`, for the cameras alone.
-    """
-    return _read(CameraFile, data, name).cameras
-
-
-def _read(kind: type[Record], data: bytes, name: str) -> Record:
-    """Return a file as a record, with the names of fields that no record has.
-
-    So a misspelt option is reported instead of ignored.
     """
     if len(data) > MAX_BYTES:
         raise TrilightError(f"{name}: {len(data)} bytes; expected at most {MAX_BYTES}.")

@@ -15,13 +15,14 @@ import numpy as np
 from pipeline.assets.settings import AssetSettings
 from pipeline.exchange.from_description import (
     AlbedoOverOne,
+    CameraFile,
     Cameras,
     LoadedMesh,
     SceneDescription,
     build_cameras,
     scene_from_description,
 )
-from pipeline.exchange.renderformer_json import MAX_BYTES, read_cameras, read_renderformer_json
+from pipeline.exchange.renderformer_json import MAX_BYTES, read_record, read_renderformer_json
 from pipeline.foreign.material_files import find_in_any_case
 from storage.digests import sha256_hex
 from storage.errors import EnvironmentFailure, Rejected, TrilightError
@@ -117,7 +118,8 @@ def read_scene_cameras(root: Path, name: str) -> Cameras:
     Raises:
         TrilightError: the file or a camera in it is unusable; the message names it.
     """
-    return build_cameras(read_cameras(_read_scene_file(root, name), name), name)
+    file = read_record(CameraFile, _read_scene_file(root, name), name)
+    return build_cameras(file.cameras, name)
 
 
 def build_scene(

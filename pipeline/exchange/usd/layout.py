@@ -50,11 +50,7 @@ VERTEX_ROWS = NAMESPACE + "vertexRows"
 FACE_ROWS = NAMESPACE + "faceRows"
 VISIBLE_TO_CAMERA = NAMESPACE + "visibleToCamera"
 OBJECT_TEXTS = {
-    "name": NAMESPACE + "name",
-    "kind": NAMESPACE + "kind",
-    "uid": NAMESPACE + "uid",
-    "licence": NAMESPACE + "licence",
-    "attribution": NAMESPACE + "attribution",
+    **{name: NAMESPACE + name for name in ("name", "kind", "uid", "licence", "attribution")},
     "source_url": NAMESPACE + "sourceUrl",
 }
 """Attributes of a mesh: row of its object, rows of vertices and faces, fields of SceneObject."""
