@@ -122,7 +122,7 @@ class SceneBuilder:
     def __init__(self, name: str = "scene") -> None:
         """Begin an empty scene; messages and its provenance hold `name`."""
         self._name = name
-        self._objects: list[DescribedObject] = []
+        self._objects: dict[str, DescribedObject] = {}
         self._meshes: list[_Mesh] = []
         self._cameras: list[DescribedCamera] = []
 
@@ -151,7 +151,7 @@ class SceneBuilder:
             licence: SPDX identifier, or `LicenseRef-...`.
 
         Raises:
-            TrilightError: no such file, arrays that are not a mesh, or invalid numbers.
+            TrilightError: no such file, arrays that are no mesh, invalid numbers, or a used name.
         """
         if isinstance(mesh, tuple):
             name = name or f"object{len(self._objects)}"
@@ -293,8 +293,7 @@ class SceneBuilder:
         """Build the scene, which passes `Scene.check`. A child process reads the mesh files.
 
         Raises:
-            TrilightError: a file is unusable, two objects have one name, albedos add up to more
-                than 1, or there is no lamp, no camera or no surface.
+            TrilightError: an unusable file, albedos beyond 1, or no lamp, camera or surface.
         """
         if not self._objects:
             raise TrilightError(
@@ -304,9 +303,9 @@ class SceneBuilder:
         description = SceneDescription(
             file=self._name,
             scene_name=self._name,
-            objects=tuple(self._objects),
+            version="1.0",
+            objects=self._objects,
             cameras=tuple(self._cameras),
-            unknown_fields=(),
         )
         with SceneReader() as reader:  # starts a child process only for mesh files
             meshes = [
@@ -327,7 +326,9 @@ class SceneBuilder:
         transform: DescribedTransform,
         material: Material,
     ) -> Self:
-        described = DescribedObject(
+        if name in self._objects:
+            raise TrilightError(f"objects holds the name {name!r} twice; expected unique names.")
+        self._objects[name] = DescribedObject(
             name=name,
             mesh_path=str(mesh[0]) if isinstance(mesh, tuple) else mesh.uid,
             transform=transform,
@@ -339,12 +340,10 @@ class SceneBuilder:
                 smooth_shading=material.smooth,
             ),
         )
-        self._objects.append(described)
         self._meshes.append(mesh)
         return self
 
     def _unique_name(self, name: str) -> str:
         """Return a name that no object has yet: `name`, `name1` or `name2`, and so on."""
-        taken = {described.name for described in self._objects}
-        tries = (f"{name}{number or ''}" for number in range(len(taken) + 1))
-        return next(text for text in tries if text not in taken)
+        tries = (f"{name}{number or ''}" for number in range(len(self._objects) + 1))
+        return next(text for text in tries if text not in self._objects)

@@ -9,8 +9,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 from numpy.typing import NDArray
 
-from pipeline.exchange.convert import reduce_scene
-from pipeline.exchange.convert import write_scene as write_in_form
+from pipeline.exchange import convert
 from pipeline.exchange.reader import LoadedScene, SceneReader, scene_source
 from pipeline.generation.generate_options import GenerateOptions
 from storage.records.scene import Scene
@@ -64,7 +63,7 @@ def write_scene(
         TrilightError: the scene breaks a rule, the suffix is unknown, or writing fails.
     """
     scene.check()
-    return write_in_form(Path(path), scene, radiance_rgb)
+    return convert.write_scene(Path(path), scene, radiance_rgb)
 
 
 def within_budget(scene: Scene, max_triangles: int) -> Scene:
@@ -77,7 +76,8 @@ def within_budget(scene: Scene, max_triangles: int) -> Scene:
     Raises:
         TrilightError: the emitters alone exceed it, or an object cannot be reduced that far.
     """
-    return _warn_notes(reduce_scene(scene, max_triangles))
+    with SceneReader() as reader:
+        return _warn_notes(reader.call(convert.within_budget, scene, max_triangles, name="scene"))
 
 
 def _warn_notes(loaded: LoadedScene) -> Scene:

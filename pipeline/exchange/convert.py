@@ -8,7 +8,7 @@ the nearest old one, and smooth normals are computed again.
 """
 
 import dataclasses
-from collections.abc import Callable, Iterable, Iterator, Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -18,23 +18,17 @@ from numpy.typing import NDArray
 from pipeline.exchange.formats import (
     FORMATS,
     LoadedScene,
-    Pictures,
     SceneFormat,
     SceneSource,
     drop_uncarried_maps,
     list_lost_members,
 )
-from pipeline.exchange.from_description import SMOOTH_ANGLE_DEG
+from pipeline.exchange.from_description import shade
 from pipeline.exchange.reader import SceneReader, load_source
+from pipeline.exchange.textured_triangles import is_smooth, mesh_of_triangles
 from pipeline.foreign.mesh import TriangleMesh
 from pipeline.scenes.pieces import ScenePiece, concatenate_pieces
-from pipeline.scenes.shading_normals import (
-    ShadedMesh,
-    face_normals,
-    flat_shaded,
-    has_area,
-    smooth_shaded,
-)
+from pipeline.scenes.shading_normals import has_area
 from storage.atomic import write_error
 from storage.errors import Rejected, TrilightError
 from storage.records.retextured import without_maps
@@ -96,8 +90,15 @@ def write_scene(
     """
     form = _form_of(target)
     assert form.write is not None
-    carried = drop_uncarried_maps(scene, form.carried)
-    return (*list_lost_members(scene, form.carried), *form.write(target, carried, radiance_rgb))
+    lost = list[str]()
+    carried = _carry(scene, form, lost)
+    return (*lost, *form.write(target, carried, radiance_rgb))
+
+
+def _carry(scene: Scene, form: SceneFormat, lost: list[str]) -> Scene:
+    """Return what a format holds of a scene; `lost` receives a text about the rest."""
+    lost += list_lost_members(scene, form.carried)
+    return drop_uncarried_maps(scene, form.carried)
 
 
 def _form_of(target: Path) -> SceneFormat:
@@ -117,28 +118,29 @@ def convert_sources(
     form = _form_of(target)
     triangles = 0
     notes = list[str]()
+    lost = list[str]()
 
-    def carried_scenes() -> Iterator[tuple[str, Scene, Pictures]]:
+    def load(source: SceneSource) -> LoadedScene:
         nonlocal triangles
-        for source in sources:
-            loaded = load_source(source, pictures=form.holds_pictures)
-            if budget is not None and loaded.scene.num_triangles > budget:
-                loaded = within_budget(loaded, budget)
-            triangles += loaded.scene.num_triangles
+        loaded = load_source(source, pictures=form.holds_pictures)
+        notes.extend(loaded.notes)
+        if budget is not None and loaded.scene.num_triangles > budget:
+            has_pictures = loaded.radiance_rgb is not None
+            loaded = within_budget(loaded.scene, budget)
             notes.extend(loaded.notes)
-            note_losses(list_lost_members(loaded.scene, form.carried))
-            carried = drop_uncarried_maps(loaded.scene, form.carried)
-            yield str(source.key), carried, loaded.radiance_rgb
-
-    def note_losses(lost: Iterable[str]) -> None:
-        notes.extend(f"{target.name}: cannot hold {text}" for text in lost)
+            notes.extend(["pictures left out: they show the scene before that"] * has_pictures)
+        triangles += loaded.scene.num_triangles
+        return loaded
 
     if form.write_many and len(sources) > 1:
-        form.write_many(target, ((key, scene) for key, scene, _ in carried_scenes()))
-    elif form.write:
-        for _, scene, radiance_rgb in carried_scenes():
-            note_losses(form.write(target, scene, radiance_rgb))
+        scenes = ((str(each.key), _carry(load(each).scene, form, lost)) for each in sources)
+        form.write_many(target, scenes)
+    else:
+        (source,) = sources
+        loaded = load(source)
+        lost += write_scene(target, loaded.scene, loaded.radiance_rgb)
     files = (target, *(form.named_files(target) if form.named_files else ()))
+    notes += (f"{target.name}: cannot hold {text}" for text in lost)
     return ConvertResult(files=files, triangles=triangles, notes=tuple(notes))
 
 
@@ -149,23 +151,14 @@ _LOST = "textures became their means: reduced triangles have no texture coordina
 _FLAT = 1e-3
 
 
-def reduce_scene(scene: Scene, budget: int) -> LoadedScene:
-    """Call `within_budget` in a child process."""
-    with SceneReader() as reader:
-        loaded = LoadedScene(scene=scene, notes=())
-        return reader.call(within_budget, loaded, budget, name="scene")
-
-
-def within_budget(loaded: LoadedScene, budget: int) -> LoadedScene:
-    """Return a scene with at most `budget` triangles and no pictures, and notes on what that cost.
+def within_budget(scene: Scene, budget: int) -> LoadedScene:
+    """Return a scene with at most `budget` triangles, and notes on what that cost.
 
     Raises:
         TrilightError: emitters alone exceed the budget, or an object cannot be reduced that far.
     """
-    lost = [_LOST] if loaded.scene.textures else []
-    if loaded.radiance_rgb is not None:
-        lost.append("pictures left out: they show the scene before that")
-    scene = without_maps(loaded.scene, environment=False)
+    lost = [_LOST] if scene.textures else []
+    scene = without_maps(scene, environment=False)
     counts = np.bincount(scene.object_index, minlength=len(scene.objects))
     emits = np.array([entry.kind == "emitter" for entry in scene.objects])
     room = budget - int(counts[emits].sum())
@@ -192,22 +185,15 @@ def within_budget(loaded: LoadedScene, budget: int) -> LoadedScene:
     )
     reduced.check()
     note = f"{scene.num_triangles} triangles reduced to {total}"
-    return LoadedScene(scene=reduced, notes=(*loaded.notes, note, *lost))
+    return LoadedScene(scene=reduced, notes=(note, *lost))
 
 
 def _build_piece(scene: Scene, row: int) -> ScenePiece:
     in_object = scene.object_index == row
-    rows, corners = np.unique(scene.faces[in_object], return_inverse=True)
     palette, index = np.unique(scene.material_index[in_object], return_inverse=True)
-    faces = corners.reshape(-1, 3).astype(np.uint32)
     return ScenePiece(
         entry=scene.objects[row],
-        mesh=ShadedMesh(
-            positions=scene.vertex_positions[rows],
-            normals=scene.vertex_normals[rows],
-            faces=faces,
-            groups=np.zeros(len(faces), np.int64),
-        ),
+        mesh=mesh_of_triangles(scene, in_object),
         materials=scene.materials[palette],
         material_index=index.astype(np.int64),
     )
@@ -232,13 +218,7 @@ def _reduce_piece(piece: ScenePiece, count: int) -> ScenePiece:
     positions = reduced.positions.astype(np.float32)
     faces = reduced.faces.astype(np.uint32)
     faces = faces[has_area(positions, faces)]
-    flat = face_normals(old.positions, old.faces)[:, None]
-    smooth = bool((np.abs(old.normals[old.faces] - flat) > _FLAT).any())
-    mesh = (
-        smooth_shaded(positions, faces, SMOOTH_ANGLE_DEG)
-        if smooth
-        else flat_shaded(positions, faces)
-    )
+    mesh = shade(positions, faces, is_smooth=is_smooth(old, _FLAT))
     centers = old.positions[old.faces].mean(axis=1)
     _, nearest = cKDTree(centers).query(mesh.positions[mesh.faces].mean(axis=1))
     return dataclasses.replace(piece, mesh=mesh, material_index=piece.material_index[nearest])

@@ -16,8 +16,7 @@ from pathlib import Path
 
 from pipeline.assets.settings import AssetSettings
 from pipeline.exchange.from_description import AlbedoOverOne, Cameras, scaled_albedo_notes
-from pipeline.exchange.gltf.read_gltf import read_gltf
-from pipeline.exchange.gltf.write_gltf import write_gltf
+from pipeline.exchange.gltf import read_gltf, write_gltf
 from pipeline.exchange.renderformer_h5 import read_renderformer_h5, write_renderformer_h5
 from pipeline.exchange.renderformer_json import write_renderformer_json
 from pipeline.exchange.scene_files import build_scene, read_scene_cameras, read_scene_description

@@ -25,7 +25,7 @@ from numpy.typing import NDArray
 
 from pipeline.exchange.textured_triangles import MAX_ROWS, require_at_most
 from pipeline.scenes.pieces import ScenePiece, concatenate_pieces
-from pipeline.scenes.shading_normals import flat_shaded, has_area, smooth_shaded
+from pipeline.scenes.shading_normals import ShadedMesh, flat_shaded, has_area, smooth_shaded
 from scene_templates.rotations import rotate_points, rotation_xyz
 from storage.conventions import look_at_c2w
 from storage.errors import TrilightError, prefix_errors
@@ -110,15 +110,22 @@ class DescribedCamera:
 
 
 @dataclass(frozen=True, kw_only=True)
-class SceneDescription:
-    """One scene file."""
+class CameraFile:
+    """A file with a list of cameras, which may be a scene file."""
 
     file: str  # name of the file, for messages and provenance
-    scene_name: str  # what its author calls it
-    objects: tuple[DescribedObject, ...]  # in the order of the file
     cameras: tuple[DescribedCamera, ...]  # in the order of the file
-    unknown_fields: tuple[str, ...]
+    unknown_fields: tuple[str, ...] = ()
     """Dotted names of unknown fields, which were left out."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class SceneDescription(CameraFile):
+    """One scene file."""
+
+    scene_name: PrintableText  # what its author calls it
+    version: Literal["1.0"]
+    objects: Mapping[str, DescribedObject]  # by name, in the order of the file
 
 
 Cameras = tuple[NDArray[np.float32], NDArray[np.float32]]
@@ -170,7 +177,7 @@ def scene_from_description(
     """
     pieces: list[ScenePiece] = []
     scales: dict[str, float] = {}
-    for described, mesh in zip(description.objects, meshes, strict=True):
+    for described, mesh in zip(description.objects.values(), meshes, strict=True):
         with prefix_errors(f"{description.file}: objects.{described.name}"):
             object_pieces, scale = _pieces(described, mesh, albedo_over_one)
         pieces += object_pieces
@@ -236,11 +243,7 @@ def _pieces(
         if len(parts) > 1:
             names = [f"{described.name}.{row}" for row in range(len(parts))]
     else:
-        parts = [
-            smooth_shaded(positions, faces, SMOOTH_ANGLE_DEG)
-            if material.smooth_shading
-            else flat_shaded(positions, faces)
-        ]
+        parts = [shade(positions, faces, is_smooth=material.smooth_shading)]
         rows = np.zeros(len(parts[0].faces), np.int64)
         if (seed := material.rand_tri_diffuse_seed) is not None:
             # in the published converter a flat mesh shares no vertices: each triangle is a group
@@ -265,6 +268,15 @@ def _pieces(
         for name, part in zip(names, parts, strict=True)
     ]
     return pieces, scale
+
+
+def shade(
+    positions: NDArray[np.float32], faces: NDArray[np.uint32], *, is_smooth: bool
+) -> ShadedMesh:
+    """Return a mesh with smooth normals across edges of up to SMOOTH_ANGLE_DEG, or flat ones."""
+    if is_smooth:
+        return smooth_shaded(positions, faces, SMOOTH_ANGLE_DEG)
+    return flat_shaded(positions, faces)
 
 
 def build_cameras(cameras: Sequence[DescribedCamera], file: str) -> Cameras:

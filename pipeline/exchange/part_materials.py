@@ -32,7 +32,7 @@ from pipeline.foreign.picture import Picture, Wrap, spread_points
 from pipeline.scenes.shading_normals import SMALLEST_DOUBLE_AREA
 from storage.conventions import srgb8
 from storage.records.exr import MAX_RESOLUTION
-from storage.records.material import DIFFUSE, EMISSION, ROUGHNESS, SPECULAR, default_rows
+from storage.records.material import EMISSION, REFLECTING, default_rows
 from storage.records.scene import MAX_UV
 from storage.records.texture import MapSource
 
@@ -140,13 +140,10 @@ class PartConverter:
             means = self._means[id(part.material)]
             if len(tints) > _MOST_TINTS:
                 means, uv = _build_palette(means, tints, tint_index)
-                white = np.ones(3)
-                texture_sets = [_textures(part.material, means, white, source)]
+                texture_sets = [_textures(part.material, means, np.ones(3), source)]
             else:
-                values = _columns(part.material, means, np.asarray(tints)[None])[0, tint_index]
-                rows[:, DIFFUSE] = values[:, :3]
-                rows[:, SPECULAR] = values[:, 3:6]
-                rows[:, ROUGHNESS] = values[:, 6]
+                columns = _columns(part.material, means, np.asarray(tints)[None])
+                rows[:, REFLECTING] = columns[0, tint_index]
         return TexturedTriangles(
             positions=part.positions,
             normals=part.normals,

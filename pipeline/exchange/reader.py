@@ -252,13 +252,3 @@ def _by_number(path: Path) -> list[tuple[int, str]]:
 
 
 LIMITS = ChildLimits(memory_bytes=16 << 30, wall_s=1800, calls_per_child=1000)
-
-
-def unconfined_child(address_space: Callable[[int], int]) -> IsolatedChild:
-    """Return an unconfined child with limits, for scenes that are already read; close it.
-
-    Args:
-        address_space: returns the memory limit for what the child renders with, of the usual one.
-    """
-    memory_bytes = address_space(LIMITS.memory_bytes)
-    return IsolatedChild(limits=replace(LIMITS, memory_bytes=memory_bytes))

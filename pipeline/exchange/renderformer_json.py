@@ -15,28 +15,28 @@ import json
 import re
 from collections import Counter
 from collections.abc import Mapping
-from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, Literal, TypeVar, cast
+from typing import Any, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
 
 from pipeline.exchange.from_description import (
     SHELL_FOLDER,
-    SMOOTH_ANGLE_DEG,
     DescribedCamera,
     DescribedObject,
-    PrintableText,
     SceneDescription,
+    shade,
 )
 from pipeline.exchange.textured_triangles import (
     group_triangles,
+    is_smooth,
+    mesh_of_triangles,
     require_at_most,
     unique_name,
 )
 from pipeline.foreign.numbers import Malformed
-from pipeline.scenes.shading_normals import face_normals, has_area, smooth_shaded
+from pipeline.scenes.shading_normals import ShadedMesh, has_area
 from storage.atomic import write_atomically
 from storage.conventions import HALF_FLOAT_MAX
 from storage.errors import TrilightError
@@ -56,68 +56,52 @@ MAX_OBJECTS = 8192
 MAX_CAMERAS = 1000
 """Maximum number of cameras in a file."""
 
+_OURS = ("name", "file", "unknown_fields")
+"""Fields of records that no object of a file has."""
+
 _MAX_SHOWN = 120
 """Maximum number of characters of a value in a message."""
 
 
-@dataclass(frozen=True, kw_only=True)
-class _CameraFile:
-    """What a list of cameras states, and a scene file too."""
-
-    cameras: tuple[DescribedCamera, ...]
-
-
-@dataclass(frozen=True, kw_only=True)
-class _SceneFile(_CameraFile):
-    """What a scene file states; each object also has its key as its name."""
-
-    scene_name: PrintableText
-    version: Literal["1.0"]
-    objects: Mapping[str, DescribedObject]
-
-
 def read_renderformer_json(data: bytes, name: str) -> SceneDescription:
-    """Parse the bytes of a scene file; messages call it `name`.
+    """Parse the bytes of a scene file; as `read_record`."""
+    return read_record(SceneDescription, data, name)
+
+
+def read_record(kind: type[Record], data: bytes, name: str) -> Record:
+    """Parse the bytes of a scene file, or of another file with `cameras`; messages call it `name`.
+
+    The record names the fields that no record has, so that a misspelt option is reported.
 
     Raises:
         TrilightError: the file exceeds MAX_BYTES or is not JSON; a JSON object repeats a name; or a
             field is missing, of the wrong type, not finite or out of range. The message names file,
             field (with the object's name), value and expected value.
     """
-    unknown: list[str] = []
-    file = _read(_SceneFile, data, name, unknown)
-    return SceneDescription(
-        file=name,
-        scene_name=file.scene_name,
-        objects=tuple(file.objects.values()),
-        cameras=file.cameras,
-        unknown_fields=tuple(unknown),
-    )
-
-
-def read_cameras(data: bytes, name: str) -> tuple[DescribedCamera, ...]:
-    """Return the cameras of a scene file, or of a JSON file that has nothing but `cameras`.
-
-    Raises:
-        TrilightError: as `read_renderformer_json`, for the cameras alone.
-    """
-    return _read(_CameraFile, data, name, []).cameras
-
-
-def _read(kind: type[Record], data: bytes, name: str, unknown: list[str]) -> Record:
-    """Return a file as a record; `unknown` receives the names of fields that no record has.
-
-    So a misspelt option is reported instead of ignored.
-    """
-    tree = _parse_json(data, name)
-    if not isinstance(tree, dict):
-        raise TrilightError(f"{name}: the file is {_to_text(tree)}; expected a JSON object.")
-    for field in describe_fields(cast(Any, kind)):
-        if field.name not in tree:
-            raise TrilightError(f"{name}: {field.name} is missing; add it.")
-    known = _take_known(kind, tree, "", unknown)
+    if len(data) > MAX_BYTES:
+        raise TrilightError(f"{name}: {len(data)} bytes; expected at most {MAX_BYTES}.")
+    try:
+        tree = json.loads(
+            data.decode("utf-8-sig"),
+            object_pairs_hook=_refuse_repeats,
+            parse_constant=_refuse_constant,
+        )
+        unknown: list[str] = []
+        known = _take_known(kind, tree, "", unknown)
+        if isinstance(known, dict):
+            known |= {"file": name, "unknown_fields": unknown}
+        text = json.dumps(known)
+    except RecursionError as error:
+        raise TrilightError(f"{name}: nested too deeply; expected a scene.") from error
+    except Malformed as error:
+        raise TrilightError(f"{name}: not readable as JSON ({error}).") from error
+    except json.JSONDecodeError as error:
+        where = f"line {error.lineno}, column {error.colno}"
+        raise TrilightError(f"{name}: not readable as JSON from {where} on.") from error
+    except ValueError as error:
+        raise TrilightError(f"{name}: not readable as JSON in UTF-8.") from error
     for what, most in (("objects", MAX_OBJECTS), ("cameras", MAX_CAMERAS)):
-        entries = known.get(what)
+        entries = known.get(what) if isinstance(known, dict) else None
         if isinstance(entries, list | dict) and not 1 <= len(entries) <= most:
             raise TrilightError(f"{name}: {len(entries)} {what}; expected 1 to {most}.")
         for key in entries if isinstance(entries, dict) else ():
@@ -126,10 +110,7 @@ def _read(kind: type[Record], data: bytes, name: str, unknown: list[str]) -> Rec
                     f"{name}: {_to_text(f'{what}.{key}')} is {_to_text(key)}; expected a printable "
                     "name of 1 to 200 letters."
                 )
-    try:
-        return read_json(json.dumps(known), kind, name)
-    except RecursionError as error:
-        raise TrilightError(f"{name}: nested too deeply; expected a scene.") from error
+    return read_json(text, kind, name)
 
 
 def _take_known(kind: Any, value: Any, where: str, unknown: list[str]) -> Any:
@@ -147,7 +128,7 @@ def _take_known(kind: Any, value: Any, where: str, unknown: list[str]) -> Any:
         return entries
     if not group_of(kind) or not isinstance(value, dict):
         return value
-    hints = {each.name: each.hint for each in describe_fields(kind) if each.name != "name"}
+    hints = {each.name: each.hint for each in describe_fields(kind) if each.name not in _OURS}
     paths = {key: f"{where}.{key}" if where else key for key in value}
     unknown += [_to_text(paths[key]) for key in value if key not in hints]
     return {
@@ -161,26 +142,6 @@ def _to_text(value: Any) -> str:
     """Return a value as short text for a message, on one line without control characters."""
     text = value if isinstance(value, str) and value.isprintable() else repr(value)
     return text if len(text) <= _MAX_SHOWN else f"{text[: _MAX_SHOWN - 3]}..."
-
-
-def _parse_json(data: bytes, name: str) -> Any:
-    if len(data) > MAX_BYTES:
-        raise TrilightError(f"{name}: {len(data)} bytes; expected at most {MAX_BYTES}.")
-    try:
-        return json.loads(
-            data.decode("utf-8-sig"),
-            object_pairs_hook=_refuse_repeats,
-            parse_constant=_refuse_constant,
-        )
-    except RecursionError as error:
-        raise TrilightError(f"{name}: nested too deeply for a scene; expected JSON.") from error
-    except Malformed as error:
-        raise TrilightError(f"{name}: not readable as JSON ({error}).") from error
-    except json.JSONDecodeError as error:
-        where = f"line {error.lineno}, column {error.colno}"
-        raise TrilightError(f"{name}: not readable as JSON from {where} on.") from error
-    except ValueError as error:
-        raise TrilightError(f"{name}: not readable as JSON in UTF-8.") from error
 
 
 def _refuse_repeats(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
@@ -223,17 +184,17 @@ def write_renderformer_json(path: Path, scene: Scene) -> tuple[str, ...]:
     meshes: dict[str, bytes] = {}
     objects: dict[str, Any] = {}
     taken: dict[str, int] = {}
-    for row, material, faces in group_triangles(scene):
-        if not has_area(scene.vertex_positions, scene.faces[faces]).any():
+    for row, material, triangles in group_triangles(scene):
+        mesh = mesh_of_triangles(scene, triangles)
+        if not has_area(mesh.positions, mesh.faces).any():
             continue  # readers refuse a mesh without an area
         # it becomes the name of a file, whose case some systems ignore
         name = unique_name(_name(scene, row, material), taken, str.casefold)
-        normals = scene.vertex_normals[scene.faces[faces]]
         mesh_path = _mesh_path(scene, row, material, path.stem)
-        meshes[mesh_path] = _obj(scene, faces)
-        smooth = _is_smooth(scene, faces, normals)
+        meshes[mesh_path] = _encode_obj(mesh)
+        smooth = is_smooth(mesh, _FLAT)
         objects[name] = _object_entry(mesh_path, scene.materials[material], smooth)
-        if smooth and not _is_reproduced(scene, faces, normals):
+        if smooth and not _is_reproduced(mesh):
             lost.append(f"{name}: shading normals, which readers compute again")
     if not any(max(entry["material"]["emissive"]) > 0 for entry in objects.values()):
         raise TrilightError("scene: no emitter has an area; a scene file needs at least one.")
@@ -247,8 +208,8 @@ def write_renderformer_json(path: Path, scene: Scene) -> tuple[str, ...]:
     ).encode()
     require_at_most({"objects of one material": (len(objects), MAX_OBJECTS)})
     read_renderformer_json(data, path.name)  # raises for anything that readers would refuse
-    for mesh_path, mesh in meshes.items():
-        write_atomically(path.parent / mesh_path, mesh)
+    for mesh_path, obj in meshes.items():
+        write_atomically(path.parent / mesh_path, obj)
     write_atomically(path, data)  # last, so that the files that it names exist
     return (*_losses(scene), *lost)
 
@@ -271,12 +232,11 @@ def _mesh_path(scene: Scene, row: int, material: int, stem: str) -> str:
     return f"{folder}{safe_stem}/{row}_{plain}_{material}.obj"
 
 
-def _obj(scene: Scene, faces: NDArray[np.intp]) -> bytes:
-    """Return triangles as an OBJ file whose numbers round-trip to the same float32."""
-    rows, corners = np.unique(scene.faces[faces], return_inverse=True)
-    lines = [f"v {x:.9g} {y:.9g} {z:.9g}" for x, y, z in scene.vertex_positions[rows].tolist()]
-    lines += [f"vn {x:.9g} {y:.9g} {z:.9g}" for x, y, z in scene.vertex_normals[rows].tolist()]
-    triangles = corners.reshape(-1, 3) + 1
+def _encode_obj(mesh: ShadedMesh) -> bytes:
+    """Return a mesh as an OBJ file whose numbers round-trip to the same float32."""
+    lines = [f"v {x:.9g} {y:.9g} {z:.9g}" for x, y, z in mesh.positions.tolist()]
+    lines += [f"vn {x:.9g} {y:.9g} {z:.9g}" for x, y, z in mesh.normals.tolist()]
+    triangles = mesh.faces.astype(np.int64) + 1
     lines += [f"f {a}//{a} {b}//{b} {c}//{c}" for a, b, c in triangles.tolist()]
     return ("\n".join(lines) + "\n").encode()
 
@@ -312,22 +272,12 @@ def camera_entry(c2w: NDArray[np.float32], fov_deg: float) -> dict[str, Any]:
     }
 
 
-def _is_smooth(scene: Scene, faces: NDArray[np.intp], normals: NDArray[np.float32]) -> bool:
-    with np.errstate(invalid="ignore", divide="ignore"):
-        flat = face_normals(scene.vertex_positions, scene.faces[faces])
-    off = np.abs(normals - flat[:, None])
-    return bool((off[np.isfinite(off)] > _FLAT).any())
-
-
-def _is_reproduced(scene: Scene, faces: NDArray[np.intp], normals: NDArray[np.float32]) -> bool:
+def _is_reproduced(mesh: ShadedMesh) -> bool:
     """Return whether the smoothing of a reader computes the same normals."""
-    rows, corners = np.unique(scene.faces[faces], return_inverse=True)
-    positions = scene.vertex_positions[rows]
-    triangles = corners.reshape(-1, 3).astype(np.uint32)
-    if not has_area(positions, triangles).all():
+    if not has_area(mesh.positions, mesh.faces).all():
         return False
-    made = smooth_shaded(positions, triangles, SMOOTH_ANGLE_DEG)
-    return bool((np.abs(made.normals[made.faces] - normals) <= _CLOSE).all())
+    made = shade(mesh.positions, mesh.faces, is_smooth=True)
+    return bool((np.abs(made.normals[made.faces] - mesh.normals[mesh.faces]) <= _CLOSE).all())
 
 
 def _losses(scene: Scene) -> list[str]:

@@ -15,13 +15,14 @@ import numpy as np
 from pipeline.assets.settings import AssetSettings
 from pipeline.exchange.from_description import (
     AlbedoOverOne,
+    CameraFile,
     Cameras,
     LoadedMesh,
     SceneDescription,
     build_cameras,
     scene_from_description,
 )
-from pipeline.exchange.renderformer_json import MAX_BYTES, read_cameras, read_renderformer_json
+from pipeline.exchange.renderformer_json import MAX_BYTES, read_record, read_renderformer_json
 from pipeline.foreign.material_files import find_in_any_case
 from storage.digests import sha256_hex
 from storage.errors import EnvironmentFailure, Rejected, TrilightError
@@ -117,7 +118,8 @@ def read_scene_cameras(root: Path, name: str) -> Cameras:
     Raises:
         TrilightError: the file or a camera in it is unusable; the message names it.
     """
-    return build_cameras(read_cameras(_read_scene_file(root, name), name), name)
+    file = read_record(CameraFile, _read_scene_file(root, name), name)
+    return build_cameras(file.cameras, name)
 
 
 def build_scene(
@@ -143,10 +145,11 @@ def build_scene(
     """
     data = _read_scene_file(root, name)
     description = read_renderformer_json(data, name)
+    objects = description.objects.values()
     num_views = len(description.cameras) if num_views is None else num_views
     digests = {name: sha256_hex(data)}
     meshes: dict[tuple[str, int | None], LoadedMesh] = {}
-    for described in description.objects:
+    for described in objects:
         key = (described.mesh_path, described.remesh_faces)
         if key not in meshes:
             where = f"{name}: objects.{described.name}.mesh_path"
@@ -161,7 +164,7 @@ def build_scene(
                 notes += (f"{uid}: {text}" for text in meshes[key].unread)
     scene = scene_from_description(
         description,
-        [meshes[described.mesh_path, described.remesh_faces] for described in description.objects],
+        [meshes[described.mesh_path, described.remesh_faces] for described in objects],
         num_views=num_views,
         albedo_over_one=albedo_over_one,
         provenance={

@@ -16,7 +16,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from pipeline.scenes.pieces import ScenePiece, concatenate_pieces
-from pipeline.scenes.shading_normals import ShadedMesh, flat_shaded
+from pipeline.scenes.shading_normals import ShadedMesh, face_normals, flat_shaded
 from storage.conventions import linear_from_srgb8, look_at_c2w, srgb8
 from storage.errors import TrilightError, prefix_errors
 from storage.records.lookup import texture_values
@@ -193,6 +193,25 @@ def group_triangles(scene: Scene) -> list[tuple[int, int, NDArray[np.intp]]]:
     ]
 
 
+def mesh_of_triangles(scene: Scene, triangles: NDArray[Any]) -> ShadedMesh:
+    """Return triangles of a scene, by their rows or a mask [T], with the vertices that they use."""
+    rows, corners = np.unique(scene.faces[triangles], return_inverse=True)
+    faces = corners.reshape(-1, 3).astype(np.uint32)
+    return ShadedMesh(
+        positions=scene.vertex_positions[rows],
+        normals=scene.vertex_normals[rows],
+        faces=faces,
+        groups=np.zeros(len(faces), np.int64),
+    )
+
+
+def is_smooth(mesh: ShadedMesh, tolerance: float) -> bool:
+    """Return whether a normal differs by more than a tolerance from that of its triangle."""
+    with np.errstate(invalid="ignore", divide="ignore"):
+        flat = face_normals(mesh.positions, mesh.faces)  # not finite without an area
+        return bool((np.abs(mesh.normals[mesh.faces] - flat[:, None]) > tolerance).any())
+
+
 class SceneParts:
     """Collects the objects of a scene under unique names, within limits."""
 
@@ -357,20 +376,21 @@ def is_constant(values: Map) -> bool:
 
 
 def resample_to_largest(*maps: Map) -> tuple[Map, ...]:
-    """Resample all maps but constants to the size of the largest in each direction."""
-    sizes = [values.shape[:2] for values in maps if not is_constant(values)]
-    if len(set(sizes)) < 2:
+    """Interpolate all maps but constants to the size of the largest in each direction.
+
+    The values at the texel centers are those of texture look-ups.
+    """
+    sizes = {values.shape[:2] for values in maps if not is_constant(values)}
+    if len(sizes) < 2:
         return maps
-    height, width = (max(size[axis] for size in sizes) for axis in range(2))
+    size = tuple(map(max, zip(*sizes, strict=True)))
     return tuple(
-        values if is_constant(values) else resample_map(values, height, width) for values in maps
+        values if is_constant(values) or values.shape[:2] == size else _resample(values, *size)
+        for values in maps
     )
 
 
-def resample_map(values: Map, height: int, width: int) -> Map:
-    """Interpolate a map at the texel centers of another size, as texture look-ups do."""
-    if values.shape[:2] == (height, width):
-        return values
+def _resample(values: Map, height: int, width: int) -> Map:
     texture = Texture(texels=values)
     u, v = ((np.arange(count) + 0.5) / count for count in (width, height))
     resampled = np.zeros((height, width, values.shape[2]), np.float32)

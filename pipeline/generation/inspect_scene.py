@@ -11,8 +11,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from pipeline.exchange.reader import SceneReader, SceneSource, unconfined_child
-from pipeline.isolation import ChildFailed, call_with_retries
+from pipeline.exchange.reader import LIMITS, SceneReader, SceneSource
+from pipeline.isolation import ChildFailed, IsolatedChild, call_with_retries
 from pipeline.renders.mitsuba_variant import Variant, activate, choose_variant
 from pipeline.renders.settings import RenderSettings
 from storage.atomic import write_atomically
@@ -57,7 +57,9 @@ def inspect_scene(
             from pipeline.documents.png import encode_png
 
             variant = choose_variant("auto")
-            with contextlib.closing(unconfined_child(variant.address_space)) as renderer:
+            memory_bytes = variant.address_space(LIMITS.memory_bytes)
+            limits = dataclasses.replace(LIMITS, memory_bytes=memory_bytes)
+            with contextlib.closing(IsolatedChild(limits=limits)) as renderer:
                 sheet = call_with_retries(renderer, _turntable, loaded.scene, variant)
             write_atomically(turntable, encode_png(sheet))
             if variant.note:

@@ -21,7 +21,7 @@ from pipeline.assets.stage import PreparedObject
 from pipeline.documents.figures import Panel, draw_panels
 from pipeline.documents.pages import data_uri, render_page
 from pipeline.documents.rights import encode_attribution
-from pipeline.exchange.gltf.write_gltf import encode_mesh_glb
+from pipeline.exchange.gltf import encode_mesh_glb
 from pipeline.foreign.mesh import TriangleMesh
 from pipeline.generation.prepare_isolated import (
     UnreadNotes,

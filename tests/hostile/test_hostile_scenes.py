@@ -295,7 +295,7 @@ def test_no_handler_cites_what_a_library_raised() -> None:
                 names = [text.value for text in texts if isinstance(text.value, ast.Name)]
                 if not kinds <= OWN and any(name.id == handler.name for name in names):
                     cited.append(f"{path.relative_to(ROOT)}:{handler.lineno}")
-    assert len(paths) > 100 and cited == []
+    assert len(paths) > 80 and cited == []
 
 
 READERS: list[Callable[[Path], object]] = [

@@ -17,7 +17,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from infra.render.held_out_scenes import first_composed
-from pipeline.exchange.gltf.read_gltf import SUFFIXES as GLTF_SUFFIXES
+from pipeline.exchange.gltf import SUFFIXES as GLTF_SUFFIXES
 from pipeline.exchange.reader import load_source, scene_source
 from pipeline.isolation import IsolatedChild
 from pipeline.objects.builtin.surfaces import superquadric

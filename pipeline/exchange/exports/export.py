@@ -81,7 +81,6 @@ def _write_sample(form: str, sample: Sample, folder: Path) -> Sequence[str]:
         for view, radiance_rgb in enumerate(sample.radiance_rgb):
             write_atomically(folder / picture_name(sample.key, view), encode_exr(radiance_rgb))
         return ()
-    folder.mkdir(parents=True, exist_ok=True)
     target = folder / f"{sample.key}{SCENE_SUFFIXES[form]}"
     return write_scene(target, sample.scene, sample.radiance_rgb)
 
@@ -206,7 +205,7 @@ def write_energon(
     Raises:
         TrilightError: there is no such shard, or its bytes are not those of the manifest.
     """
-    shards = [shard for shard in dataset.manifest.shards if split in (None, shard.split)]
+    shards = dataset.shards_of(split)
     if not shards:
         raise TrilightError(
             f"{dataset.display_name}: no shard in split {split}; expected one of "
@@ -231,7 +230,6 @@ def _copy_shard(
     dataset: Dataset, shard: ShardEntry, out: Path, done: Callable[[int], None]
 ) -> None:
     target = out / shard.name
-    target.parent.mkdir(parents=True, exist_ok=True)
     with dataset.open_stream(shard, checked=True) as stream:
         with atomic_writer(target) as copy:
             shutil.copyfileobj(stream, copy)

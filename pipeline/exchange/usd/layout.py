@@ -18,7 +18,6 @@ Prims and attributes are written straight into a layer, with a hundredth of the 
 
 import dataclasses
 import functools
-import json
 from collections.abc import Callable, Mapping, Sequence
 from typing import Any
 
@@ -26,7 +25,9 @@ import numpy as np
 from pxr import Sdf
 
 from storage.digests import canonical_json
+from storage.errors import TrilightError
 from storage.records.texture import MapSource
+from storage.typed_json import read_json
 
 NAMESPACE = "trilight:"
 ROOT = "/Scene"
@@ -49,11 +50,7 @@ VERTEX_ROWS = NAMESPACE + "vertexRows"
 FACE_ROWS = NAMESPACE + "faceRows"
 VISIBLE_TO_CAMERA = NAMESPACE + "visibleToCamera"
 OBJECT_TEXTS = {
-    "name": NAMESPACE + "name",
-    "kind": NAMESPACE + "kind",
-    "uid": NAMESPACE + "uid",
-    "licence": NAMESPACE + "licence",
-    "attribution": NAMESPACE + "attribution",
+    **{name: NAMESPACE + name for name in ("name", "kind", "uid", "licence", "attribution")},
     "source_url": NAMESPACE + "sourceUrl",
 }
 """Attributes of a mesh: row of its object, rows of vertices and faces, fields of SceneObject."""
@@ -127,13 +124,10 @@ def format_map(sha256: str, source: MapSource) -> str:
 def parse_map_text(text: Any) -> tuple[str, MapSource] | None:
     """Parse a line of `format_map` to digest and source; return None for other text."""
     try:
-        fields = json.loads(text)
-        sha256 = fields.pop("sha256")
-        source = MapSource(**fields)
-    except (TypeError, ValueError, KeyError, AttributeError):
+        fields = read_json(str(text), dict[str, str], "")
+        return fields.pop("sha256"), MapSource(**fields)
+    except (TrilightError, TypeError, KeyError):
         return None
-    texts = (sha256, *dataclasses.astuple(source))
-    return (sha256, source) if all(isinstance(each, str) for each in texts) else None
 
 
 def material_name(row: int) -> str:

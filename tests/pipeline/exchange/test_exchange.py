@@ -12,7 +12,7 @@ import trimesh
 
 from infra.bench.workloads.named_scenes import cost_scene
 from pipeline.exchange.convert import convert_scene, within_budget, write_scene
-from pipeline.exchange.formats import FORMATS, LoadedScene, list_lost_members
+from pipeline.exchange.formats import FORMATS, list_lost_members
 from pipeline.exchange.reader import SceneSource, load_source, scene_source
 from pipeline.isolation import ChildLimits, IsolatedChild
 from pipeline.presets.registry import preset_settings
@@ -279,10 +279,10 @@ def test_a_scene_that_only_its_sky_lights_is_not_written_dark(tmp_path: Path, fo
 
 def test_a_smaller_budget_says_that_textures_go() -> None:
     scene = textured_scene(environment=sky())
-    reduced = within_budget(LoadedScene(scene=scene, notes=()), 3)
+    reduced = within_budget(scene, 3)
     assert not reduced.scene.textures and reduced.scene.environment is scene.environment
     assert any("textures became their means" in note for note in reduced.notes)
-    plain = within_budget(LoadedScene(scene=tiny_scene(), notes=()), 3)
+    plain = within_budget(tiny_scene(), 3)
     assert not any("textures" in note for note in plain.notes)
 
 

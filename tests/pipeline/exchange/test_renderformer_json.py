@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 import trimesh
 
-from pipeline.exchange.from_description import DescribedObject, scaled_albedo_notes
+from pipeline.exchange.from_description import scaled_albedo_notes
 from pipeline.exchange.renderformer_json import (
     MAX_BYTES,
     read_renderformer_json,
@@ -47,7 +47,7 @@ def test_the_example_scenes_hold_no_unknown_field(shared: Path, name: str) -> No
     data = (shared / "renderformer_scenes" / f"{name}.json").read_bytes()
     described = read_renderformer_json(data, name)
     assert described.unknown_fields == ()
-    assert [entry.name for entry in described.objects] == list(json.loads(data)["objects"])
+    assert list(described.objects) == list(json.loads(data)["objects"])
     assert len(described.cameras) == 1
 
 
@@ -56,13 +56,14 @@ def test_what_may_be_missing_has_the_published_default() -> None:
     del scene["objects"]["box"]["transform"]["normalize"]
     for name in ("rand_tri_diffuse_seed", "random_diffuse_max", "random_diffuse_type"):
         del scene["objects"]["box"]["material"][name]
-    (box,) = read_renderformer_json(json.dumps(scene).encode(), "a.json").objects
+    (box,) = read_renderformer_json(json.dumps(scene).encode(), "a.json").objects.values()
     assert box.transform.normalize
     assert box.material.rand_tri_diffuse_seed is None
     assert box.material.random_diffuse_max == 1
     assert box.material.random_diffuse_type == "per-shading-group"
     assert (box.remesh, box.remesh_target_face_num) == (False, 2048)
-    (box,) = read_renderformer_json(changed(*MATERIAL, rand_tri_diffuse_seed=0), "a.json").objects
+    data = changed(*MATERIAL, rand_tri_diffuse_seed=0)
+    (box,) = read_renderformer_json(data, "a.json").objects.values()
     assert box.material.rand_tri_diffuse_seed == 0
 
 
@@ -87,7 +88,7 @@ REFUSED = [
     # the second name is what a message calls the first
     (changed(objects={"a\n": OBJECT, repr("a\n"): OBJECT}), "is 'a\\n'; expected a printable name"),
     (changed(cameras=[]), "0 cameras; expected 1 to 1000"),
-    (changed(scene_name=...), "scene_name is missing; add it"),
+    (changed(scene_name=...), "scene_name is missing; expected printable"),
     (changed(*BOX, mesh_path="a\0b"), "objects.box.mesh_path is 'a\\x00b'; expected printable"),
     (changed(*BOX, mesh_path="\ud800"), "all of it is not JSON (unexpected end"),
     (
@@ -126,7 +127,7 @@ REFUSED = [
     ('{"a": 1}'.encode("utf-16"), "not readable as JSON in UTF-8"),
     (b'{"a":' * 100_000, "a.json: "),
     (b"[" * 100_000, "a.json: "),
-    (b"[]", "the file is []; expected a JSON object"),
+    (b"[]", "all of it is []; expected names with values"),
     (b'{"a": NaN}', "NaN is no JSON number"),
     (b'{"a": 1' + b"0" * 5000 + b"}", "not readable as JSON"),
     (b'{"a": 1, "a": 2}', "the name 'a' stands twice"),
@@ -389,8 +390,8 @@ def test_of_random_colours_only_those_beyond_one_are_scaled(emissive: list[float
 
 def test_names_of_emitters_may_not_meet_other_names() -> None:
     description = described()
-    box, light = description.objects
-    renamed: tuple[DescribedObject, ...] = (dataclasses.replace(box, name="light.0"), light)
+    box, light = description.objects.values()
+    renamed = {"box": dataclasses.replace(box, name="light.0"), "light": light}
     lit = loaded(trimesh.creation.box(), "light.obj")
     with pytest.raises(TrilightError, match="'light.0' twice"):
         built(dataclasses.replace(description, objects=renamed), light=lit)

@@ -14,8 +14,7 @@ import trimesh
 from numpy.typing import NDArray
 
 from pipeline.exchange.convert import convert_scene, write_scene
-from pipeline.exchange.gltf.read_gltf import read_gltf
-from pipeline.exchange.gltf.write_gltf import encode_mesh_glb, encode_scene_glb
+from pipeline.exchange.gltf import encode_mesh_glb, encode_scene_glb, read_gltf
 from pipeline.exchange.reader import load_source, scene_source
 from pipeline.exchange.textured_triangles import LoadedScene
 from storage.conventions import linear_from_srgb8

@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 
 from pipeline.assets.settings import OwnMaterialSettings
 from pipeline.assets.source_materials.skin import _parts
-from pipeline.exchange.gltf.read_gltf import read_gltf
+from pipeline.exchange.gltf import read_gltf
 from pipeline.exchange.textured_triangles import LoadedScene
 from pipeline.foreign.limits import ReadLimits
 from pipeline.foreign.material import SourceMaterial, source_columns
