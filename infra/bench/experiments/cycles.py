@@ -79,8 +79,7 @@ def _measure(kind: str, context: BenchContext, trial: str) -> Figures:
         render_shot, scene, adaptive_settings(USUAL_FLOOR_DB, RESOLUTION, spp)
     )
     pictures, core_s = render_with_cycles(scene, RESOLUTION, spp, seeds=(0, 1))
-    a_rgb, b_rgb = (picture.astype(np.float64) for picture in pictures)
-    theirs = RawReference(a_rgb=a_rgb, b_rgb=b_rgb)
+    theirs = np.stack(pictures).astype(np.float64)
     true_db = {
         f"to_{name}_db": true_error_db(view.radiance_rgb, reference, log10_radiance)[0]
         for name, reference in (("ours", ours), ("theirs", theirs))
@@ -112,10 +111,10 @@ def _measure_object(context: BenchContext, trial: str) -> Figures:
     for view in views:
         camera = pixel_camera(scene.c2w[view], scene.fov_deg[view], px)
         raw = context.child.call(raw_reference, scene, camera, OUR_SHARE * spp, view)
-        a_rgb, b_rgb = (picture.astype(np.float64) for picture in raws[2 * view : 2 * view + 2])
+        theirs = np.stack(raws[2 * view : 2 * view + 2]).astype(np.float64)
         if view == 0:
-            agreement = agreement_figures(raw, RawReference(a_rgb=a_rgb, b_rgb=b_rgb))
-        both = RawReference(a_rgb=(raw.a_rgb + raw.b_rgb) / 2, b_rgb=(a_rgb + b_rgb) / 2)
+            agreement = agreement_figures(raw, theirs)
+        both = np.stack([raw.mean(axis=0), theirs.mean(axis=0)])
         figures["stated_objects_db"].append(ours[view].object_noise_floor_db)
         for name, picture in (("ours_db", ours[view].radiance_rgb), ("theirs_db", filtered[view])):
             error_db, _ = true_error_db(picture, both, log10_radiance, ours[view].hits)
@@ -135,23 +134,21 @@ def agreement_figures(ours: RawReference, theirs: RawReference) -> dict[str, flo
     All pictures have one exposure, so that nine tenths of the pixels are below EXPOSED; values
     above 1 count as 1.
     """
-    level = float(np.quantile((theirs.a_rgb + theirs.b_rgb).mean(axis=-1) / 2, 0.9))
+    level = float(np.quantile(theirs.mean(axis=0).mean(axis=-1), 0.9))
     exposure = EXPOSED / level if level > 0 else 1.0
-    one = theirs.a_rgb * exposure
-    other = theirs.b_rgb * exposure
-    ours = RawReference(a_rgb=ours.a_rgb * exposure, b_rgb=ours.b_rgb * exposure)
-    theirs = RawReference(a_rgb=one, b_rgb=other)
-    pixels_db = _linear_db(0.5 * (ours.a_rgb + ours.b_rgb), one)
-    seeds_db = _linear_db(one, other)
-    blocks = len(ours.a_rgb) // _BLOCK_PX
+    ours = ours * exposure
+    theirs = theirs * exposure
+    pixels_db = _linear_db(ours.mean(axis=0), theirs[0])
+    seeds_db = _linear_db(*theirs)
+    blocks = ours.shape[1] // _BLOCK_PX
     coarse = shrink_reference(ours, blocks), shrink_reference(theirs, blocks)
     return {
         "pixels_db": pixels_db,
         "seeds_db": seeds_db,
         "margin_db": pixels_db - min(AIM_DB, seeds_db - 1),
-        "blocks_db": _linear_db(*(0.5 * (half.a_rgb + half.b_rgb) for half in coarse)),
+        "blocks_db": _linear_db(*(each.mean(axis=0) for each in coarse)),
         "noiseless_db": difference_db(ours, theirs, clamped_radiance),
-        "brightness": 100 * float((ours.a_rgb + ours.b_rgb).mean() / (one + other).mean() - 1),
+        "brightness": 100 * float(ours.mean() / theirs.mean() - 1),
     }
 
 

@@ -208,9 +208,8 @@ def plain_figures(level: Image, reference: RawReference) -> dict[str, float]:
 def worst_pixel_share(picture_rgb: NDArray[np.float32], reference: RawReference) -> float:
     """Return which share of a picture's squared error (log) its worst pixel has, at most 1."""
     picture = picture_rgb.astype(np.float64)
-    mean = 0.5 * (reference.a_rgb + reference.b_rgb)
-    weight = np.square(secant_slope(log10_radiance, picture, mean))
-    squared = (weight * (picture - reference.a_rgb) * (picture - reference.b_rgb)).mean(axis=-1)
+    weight = np.square(secant_slope(log10_radiance, picture, reference.mean(axis=0)))
+    squared = (weight * (picture - reference).prod(axis=0)).mean(axis=-1)
     worst = float(squared.max())
     return worst / max(float(squared.sum()), worst, LEAST_ERROR)
 

@@ -102,7 +102,7 @@ def judged_figures(renderer: Renderer, scene: Scene, reference: RawReference) ->
     picture = time_scene(renderer, scene, "scene", ROUNDS)
     radiance_rgb = picture.radiance_rgb
     hits = first_hits(scene, resolution=len(radiance_rgb)).met
-    mean = 0.5 * (reference.a_rgb + reference.b_rgb)
+    mean = reference.mean(axis=0)
     return {
         "core_s": picture.price.first_s,
         "view_s": picture.price.further_s,

@@ -5,7 +5,6 @@ pictures and their references are sums of the same lights with the same gains.
 """
 
 import dataclasses
-from collections.abc import Sequence
 from functools import partial
 
 import numpy as np
@@ -64,26 +63,20 @@ def _measure(target_db: float, context: BenchContext, trial: str) -> Figures:
         return true_error_db(picture, reference, log10_radiance)[0]
 
     gains = MOST_GAIN ** rng_for(index, "gains").uniform(-1, 1, (len(references), 1, 1, 3))
+    of_relit = (gains[:, None] * references).sum(axis=0)
     lights = zip(view.light_floors, view.lights_rgb, references, strict=True)
     excess = np.array([floor.log_db - error_db(light, raw) for floor, light, raw in lights])
     relit = (gains * view.lights_rgb).sum(axis=0).astype(np.float32)
     return {
         "core_s": view.core_s,
         "lights": len(references),
-        "relit_db": error_db(relit, _sum(references, gains)),
+        "relit_db": error_db(relit, of_relit),
         "stated_db": view.noise_floor_db,
-        "true_db": error_db(view.radiance_rgb, _sum(references, np.ones_like(gains))),
+        "true_db": error_db(view.radiance_rgb, references.sum(axis=0)),
         "missed": float((excess > _ALLOWED_DB).mean()),
         "excess_db": float(excess.max()),
         "caution_db": float(np.median(-excess)),
     }
-
-
-def _sum(references: Sequence[RawReference], gains: NDArray[np.float64]) -> RawReference:
-    """Return the reference of lights that are scaled by gains [L, 1, 1, 3] and added."""
-    a_rgb = (gains * np.stack([each.a_rgb for each in references])).sum(axis=0)
-    b_rgb = (gains * np.stack([each.b_rgb for each in references])).sum(axis=0)
-    return RawReference(a_rgb=a_rgb, b_rgb=b_rgb)
 
 
 EXPERIMENT = Experiment(
