@@ -20,7 +20,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.optimize import lsq_linear
 
-from infra.bench.experiment import Store
+from infra.bench.experiment import read_runs
 from infra.bench.experiments.calibration import LOOKS, use_of
 from infra.bench.run_benchmark import ROOT
 from pipeline.renders.calibrated_error import (
@@ -256,7 +256,7 @@ def read_looks(path: Path) -> list[Look]:
     """
     versions = versions_of_pictures().items()
     looks = {}
-    for run in Store(path).runs():
+    for run in read_runs(path):
         if not versions <= run.plan["machine"]["versions"].items():
             continue
         for trial in run.whole_trials():
