@@ -13,7 +13,6 @@ from train.settings import WatchSettings
 if TYPE_CHECKING:
     from train.progress import TrainProgress
     from train.run_training import TrainResult
-    from train.settings import TrainSettings
 
 
 def train_network(
@@ -67,31 +66,20 @@ def train_network(
         lpips=None if lpips is None else os.fspath(lpips),
     )
     start.check(settings)
-    return _train_alone(
+    from train.loop.distributed import DistributedContext, choose_device
+    from train.run_training import run_training
+
+    result = run_training(
         settings,
-        [data] if isinstance(data, str | os.PathLike) else data,
-        device=device,
+        data=[
+            os.fspath(root) for root in ([data] if isinstance(data, str | os.PathLike) else data)
+        ],
         out=Path(out),
         start=start,
+        dist_context=DistributedContext(device=choose_device(device)),
         workers=workers,
         watched=watched,
         progress=progress,
     )
-
-
-def _train_alone(
-    settings: "TrainSettings",
-    roots: Sequence[str | os.PathLike[str]],
-    *,
-    device: str | None,
-    **options: Any,
-) -> "TrainResult":
-    """Run `train.run_training.run_training` in this process as the only rank."""
-    from train.loop.distributed import DistributedContext, choose_device
-    from train.run_training import run_training
-
-    data = [os.fspath(root) for root in roots]
-    dist_context = DistributedContext(device=choose_device(device))
-    result = run_training(settings, data=data, dist_context=dist_context, **options)
     assert result is not None  # rank 0 returns a result
     return result
