@@ -42,10 +42,11 @@ Result = TypeVar("Result")
 Closable = TypeVar("Closable", IsolatedChild, RenderChild)
 
 
-class BenchContext:
-    """Shared resources of an experiment's trials, until `close`."""
+class BenchContext(contextlib.ExitStack):
+    """Shared resources of an experiment's trials; its end closes children and deletes folders."""
 
     def __init__(self, scale: BenchScale, options: BenchOptions) -> None:
+        super().__init__()
         # before any child: pymeshlab takes a second to import, and would be counted as work
         preload_mesh_libraries()
         self.scale = scale
@@ -53,12 +54,7 @@ class BenchContext:
         self.notes: list[str] = []
         """Notes that belong to the result."""
         self.cores = os.cpu_count() or 1
-        self._stack = contextlib.ExitStack()
         self._cache: dict[Any, Any] = {}
-
-    def close(self) -> None:
-        """End the children, and delete their folders."""
-        self._stack.close()
 
     def get_or_make(self, key: Any, make: Callable[[], Result]) -> Result:
         """Return the value of a key, made by `make` at its first use."""
@@ -73,19 +69,19 @@ class BenchContext:
             self.notes.append(text)
 
     def folder(self) -> Path:
-        """Return an empty folder, which `close` deletes."""
-        return Path(self._stack.enter_context(tempfile.TemporaryDirectory()))
+        """Return an empty folder, which the end deletes."""
+        return Path(self.enter_context(tempfile.TemporaryDirectory()))
 
     def render_child(
         self, settings: DatasetSettings, objects: str, threads: int | None = None
     ) -> IsolatedChild:
-        """Return a child that composes scenes of a preset and renders them, until `close`."""
+        """Return a child that composes scenes of a preset and renders them, until the end."""
         allowed = dataclasses.replace(settings, allowed_licences=self.options.allowed_licences)
         return self.until_closed(composing_child(allowed, objects, self.folder(), threads))
 
     def until_closed(self, child: Closable) -> Closable:
-        """Return a child that `close` closes, too."""
-        return self._stack.enter_context(contextlib.closing(child))
+        """Return a child that the end closes, too."""
+        return self.enter_context(contextlib.closing(child))
 
     @functools.cached_property
     def child(self) -> IsolatedChild:

@@ -4,7 +4,6 @@ Machines drift. The points of an experiment are therefore measured alternately (
 only ratios within one run are meaningful.
 """
 
-import contextlib
 import dataclasses
 import importlib.util
 import os
@@ -87,7 +86,7 @@ def run(
     began = time.perf_counter()
     missing = current.missing_trials()
     total = len(plan["trials"])
-    with contextlib.closing(BenchContext(scale, options)) as context:
+    with BenchContext(scale, options) as context:
         for number, trial in enumerate(missing, total - len(missing) + 1):
             try:
                 for point in points:

@@ -19,6 +19,7 @@ import torch
 from numpy.typing import NDArray
 
 from infra.bench.workloads.named_scenes import cost_scene
+from infra.render.plan import orbit
 from model.config import SIZES, ModelConfig
 from model.costs import Workload, training_flops
 from model.hits.tracing import with_traced
@@ -26,8 +27,8 @@ from model.inference import NeuralRenderer
 from model.precision import fast_float32_products
 from model.scene_tensors import SceneTensors, batch_scenes, scene_tensors
 from pipeline.renders.mitsuba_variant import query_gpus
-from storage.conventions import look_at_c2w
 from storage.metrics import psnr_log_db
+from storage.renderer import Camera
 from train.data.buckets import TrainingBatch
 from train.loop.distributed import DistributedContext
 from train.loop.step import Stepper
@@ -183,19 +184,9 @@ def workloads(settings: TrainSettings, scenes: int) -> list[Workload]:
 def scene_of(workload: Workload) -> SceneTensors:
     """Return two objects in a room with an exact number of triangles, and cameras around them."""
     scene = cost_scene(math.ceil(1.3 * workload.triangles) + 32, LIGHTS)
-    poses = [
-        look_at_c2w(
-            eye=(1.4 + math.cos(6 * angle), math.sin(6 * angle) - 2.2, 1.3),
-            target=(0, 0, 0.35),
-            up=(0, 0, 1),
-        )
-        for angle in np.linspace(0, 1, workload.views, endpoint=False)
-    ]
-    tensors = scene_tensors(
-        scene.with_cameras(
-            np.stack(poses).astype(np.float32), np.full(workload.views, 40.0, np.float32)
-        )
-    )
+    cameras = orbit(scene, Camera.of_scene(scene, 0), workload.views, arc_deg=60)
+    c2w = np.stack([camera.c2w for camera in cameras])
+    tensors = scene_tensors(scene.with_cameras(c2w, scene.fov_deg.repeat(len(cameras))))
     # rows spread over the scene, the room first and the lights last
     rows = torch.linspace(0, tensors.num_triangles - 1, workload.triangles).round().long()
     return dataclasses.replace(
