@@ -13,11 +13,12 @@ from pathlib import Path
 from typing import Any, TypeVar
 
 from infra.bench.experiment import BenchScale
-from infra.bench.workloads.named_scenes import given_scenes, preset_scene, read_given
+from infra.bench.workloads.named_scenes import given_scenes, preset_scene
 from infra.bench_options import BenchOptions
 from infra.planning import measure_scenes
 from infra.render.held_out_scenes import composing_child
 from infra.render.path_tracer import RenderChild
+from pipeline.exchange.reader import SceneReader
 from pipeline.generation.generate_options import GenerateOptions
 from pipeline.generation.prepare_isolated import preload_mesh_libraries
 from pipeline.isolation import ChildLimits, IsolatedChild
@@ -29,6 +30,7 @@ from storage.dataset.shard import write_shard
 from storage.dataset.splits import shard_name
 from storage.dataset.staging import read_staged_scene
 from storage.dataset.training_data import TrainingData, open_training_data
+from storage.errors import Rejected, TrilightError
 from storage.records.sample import sample_key
 from storage.records.scene import Scene
 
@@ -98,10 +100,14 @@ class BenchContext(contextlib.ExitStack):
         """Return the scene of the trial `sampled N`, or the user's scene of that name."""
 
         def make() -> Scene:
-            path = given_scenes(self.options.scenes).get(trial)
-            if path is not None:
-                return self.child.call(read_given, path)
-            return preset_scene(self.child, smoke(), int(trial.split()[-1]))
+            source = given_scenes(self.options.scenes).get(trial)
+            if source is None:
+                return preset_scene(self.child, smoke(), int(trial.split()[-1]))
+            try:
+                with SceneReader() as reader:
+                    return reader.load(source).scene
+            except TrilightError as error:
+                raise Rejected("no_scene", str(error)) from error
 
         return self.get_or_make(("scene", trial), make)
 

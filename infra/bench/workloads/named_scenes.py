@@ -7,7 +7,6 @@ surfaces, materials and camera always agree.
 """
 
 import dataclasses
-import json
 import math
 from collections.abc import Mapping, Sequence
 from pathlib import Path
@@ -17,8 +16,8 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from infra.render.held_out_scenes import first_composed
-from pipeline.exchange.gltf.read_gltf import SUFFIXES as GLTF_SUFFIXES
-from pipeline.exchange.reader import load_source, scene_source
+from pipeline.exchange.formats import SceneSource
+from pipeline.exchange.reader import SceneReader
 from pipeline.isolation import IsolatedChild
 from pipeline.objects.builtin.surfaces import superquadric
 from pipeline.presets.settings import DatasetSettings
@@ -33,7 +32,6 @@ from pipeline.scenes.pieces import (
 from scene_templates.layout import Emitter, ShellPart, SurfaceLook
 from scene_templates.settings import SceneSettings
 from storage.conventions import look_at_c2w
-from storage.errors import TrilightError
 from storage.records.scene import Scene, SceneObject
 from storage.seeds import rng_for
 from storage.settings.overrides import apply_overrides
@@ -57,27 +55,15 @@ _CALM = {
 """Changes that leave out mirrors, whose caustics would be too noisy for a comparison."""
 
 
-def given_scenes(folder: Path | None) -> Mapping[str, Path]:
-    """Return the RenderFormer and glTF files of a folder by the name of their scene.
+def given_scenes(folder: Path | None) -> Mapping[str, SceneSource]:
+    """Return the scenes in the files of a folder by their names.
 
     Raises:
-        TrilightError: the folder holds neither a glTF file nor a JSON file of a scene.
+        TrilightError: the folder holds no file of a scene.
     """
-    if folder is None:
-        return {}
-    root = folder.resolve()
-    trees = [path for suffix in GLTF_SUFFIXES for path in sorted(root.glob(f"*{suffix}"))]
-    described = [path for path in sorted(root.glob("*.json")) if _holds_a_scene(path)]
-    if not described and not trees:
-        raise TrilightError(
-            f"--scenes {folder}: it holds no scene; expected RenderFormer scenes (*.json) or glTF."
-        )
-    return {path.name: path for path in trees} | {path.stem: path for path in described}
-
-
-def read_given(path: Path) -> Scene:
-    """Return the scene of a file, as `trilight render` reads it; runs in a render child."""
-    return load_source(scene_source(str(path))).scene
+    with SceneReader() as reader:
+        sources = reader.list_scenes(str(folder)) if folder else []
+    return {source.name: source for source in sources}
 
 
 def preset_scene(
@@ -114,15 +100,6 @@ def mapped_scene(child: IsolatedChild, name: str) -> Scene:
         }
         settings = apply_overrides(settings, sky)
     return first_composed(child, settings, number, seed=_MAPPED_SEED)
-
-
-def _holds_a_scene(path: Path) -> bool:
-    """Return whether a file has objects and a camera, which templates lack."""
-    try:
-        record = json.loads(path.read_bytes())
-    except ValueError:
-        return False
-    return isinstance(record, dict) and bool(record.get("objects")) and bool(record.get("cameras"))
 
 
 _TOTAL_EMISSION = 3750.0
