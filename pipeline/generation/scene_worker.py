@@ -134,19 +134,22 @@ class SceneWorker:
         return SceneAttempt(sample=sample, failures=failures)
 
     def compose_first(
-        self, settings: SceneSettings, scene_index: int, seed: int, split: str
-    ) -> Scene | None:
-        """Compose the first accepted attempt at a scene without the user's maps; None if none is.
+        self, settings: SceneSettings, scene_index: int, seed: int = 0, split: str = "train"
+    ) -> Scene:
+        """Compose the first accepted attempt at a scene without the user's maps.
 
         Args:
             settings: the ranges to draw from, which may differ from the dataset's.
+
+        Raises:
+            Rejected: every attempt at it was rejected.
         """
         for attempt in range(MAX_ATTEMPTS):
             with contextlib.suppress(Rejected):
                 return compose_scene(
                     settings, self._pool(split), SceneKey(seed, scene_index, attempt)
                 )
-        return None
+        raise Rejected("no_scene", f"scene {scene_index}: every attempt at it was rejected")
 
     def _render_input(
         self, split: str, scene_index: int, attempt: int, from_file: Scene | None

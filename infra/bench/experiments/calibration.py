@@ -22,8 +22,8 @@ from infra.bench.workloads.traced_pictures import (
     shrink_reference,
 )
 from infra.bench_options import BenchOptions
-from infra.render.held_out_scenes import first_composed
 from infra.render.raw_references import RawReference, first_camera, true_error
+from pipeline.generation.scene_worker import SceneWorker
 from pipeline.isolation import IsolatedChild
 from pipeline.objects.generated import BENCHMARK, PREFIX
 from pipeline.presets.training import smoke
@@ -216,7 +216,7 @@ def _scene(child: IsolatedChild, index: int, kind: str) -> Scene:
         dataclasses.replace(smoke().scenes, num_views=1, families_in_turn=True),
         shares.get(kind, {}),
     )
-    return first_composed(child, settings, index, seed=SEED, split=JUDGED_SPLIT)
+    return child.call_method(SceneWorker.compose_first, settings, index, SEED, JUDGED_SPLIT)
 
 
 EXPERIMENT = Experiment(

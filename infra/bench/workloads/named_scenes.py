@@ -15,9 +15,9 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from infra.render.held_out_scenes import first_composed
 from pipeline.exchange.formats import SceneSource
 from pipeline.exchange.reader import SceneReader
+from pipeline.generation.scene_worker import SceneWorker
 from pipeline.isolation import IsolatedChild
 from pipeline.objects.builtin.surfaces import superquadric
 from pipeline.presets.settings import DatasetSettings
@@ -75,7 +75,7 @@ def preset_scene(
         Rejected: every attempt at it was rejected.
     """
     settings = dataclasses.replace(preset.scenes, num_views=num_views)
-    return first_composed(child, settings, scene_index)
+    return child.call_method(SceneWorker.compose_first, settings, scene_index)
 
 
 def mapped_scene(child: IsolatedChild, name: str) -> Scene:
@@ -99,7 +99,7 @@ def mapped_scene(child: IsolatedChild, name: str) -> Scene:
             "skies.maps.height": _SKY_ROWS,
         }
         settings = apply_overrides(settings, sky)
-    return first_composed(child, settings, number, seed=_MAPPED_SEED)
+    return child.call_method(SceneWorker.compose_first, settings, number, _MAPPED_SEED)
 
 
 _TOTAL_EMISSION = 3750.0
