@@ -135,8 +135,6 @@ class Experiment:
 
     name: str
     title: str
-    about: str
-    """Description of the measurement in one sentence."""
     cost: Column
     """First column of the table; above 0."""
     points: Callable[[BenchScale, BenchOptions], Sequence[Point]]

@@ -222,8 +222,6 @@ def _scene(child: IsolatedChild, index: int, kind: str) -> Scene:
 EXPERIMENT = Experiment(
     name="calibration",
     title="How far true errors are from what the halves of a picture say",
-    about="Pictures of layouts of their own at three widths, with what their halves say at every "
-    "look and their true error, held against raw samples in two halves.",
     cost=Column("samples", "spp"),
     columns=(
         Column("true, median millionths", "log_true"),

@@ -1,4 +1,8 @@
-"""Experiment `cycles`: Trilight's pictures compared with raw ones of Blender's Cycles."""
+"""Experiment `cycles`: Trilight's pictures compared with raw ones of Blender's Cycles.
+
+Scenes are sampled ones, such with procedural surfaces, such below skies, objects alone, and those
+of `--scenes`. The first run installs Blender (GPL-3, 380 MB) in an environment of its own.
+"""
 
 import dataclasses
 from functools import partial
@@ -159,9 +163,6 @@ def _linear_db(one: NDArray[np.float64], other: NDArray[np.float64]) -> float:
 EXPERIMENT = Experiment(
     name="cycles",
     title="Plain, textured and sky-lit scenes compared with Blender's Cycles",
-    about="Raw samples of ours and a denoised picture against raw samples of Cycles, of sampled "
-    "scenes, of scenes with procedural surfaces, of scenes below skies, of objects alone, and "
-    "of those in `--scenes`; the first run installs Blender (GPL-3, 380 MB) in an environment.",
     cost=Column("core-seconds of Cycles", "core_s"),
     error=Column("agreement without noise, linear dB", "noiseless_db"),
     better="higher",

@@ -256,8 +256,6 @@ _WRONG = tuple(
 EXPERIMENT = Experiment(
     name="frontier",
     title="Cost at equal error compared with plain Mitsuba, and stated errors",
-    about="Our stated errors and Mitsuba's `path` integrator, raw or with one OIDN and our guide "
-    "pictures, whichever is better, scene by scene, held against raw samples in two halves.",
     cost=Column("core-seconds a view", "core_s", over="mean"),
     error=Column("psnr_log_db, dB", "db"),
     better="higher",

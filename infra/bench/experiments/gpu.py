@@ -1,4 +1,7 @@
-"""Experiment `gpu`: throughput, correct pictures, and steps of every training preset on a GPU."""
+"""Experiment `gpu`: throughput, correct pictures, and steps of every training preset on a GPU.
+
+Without a GPU it measures the same at toy sizes, which shows that it works.
+"""
 
 import itertools
 from collections.abc import Sequence
@@ -74,9 +77,6 @@ def _measure(work: Sequence[str], context: BenchContext, trial: str) -> Figures:
 EXPERIMENT = Experiment(
     name="gpu",
     title="The GPU: products, copies, pictures and steps",
-    about="Large products and copies, pictures of the built-in networks against those of the "
-    "processor, and steps of the training presets at their own sizes; without a GPU the same at "
-    "toy sizes, which shows that it works.",
     cost=Column("ms", "ms"),
     columns=(
         Column("TFLOP/s", "teraflop_per_s"),

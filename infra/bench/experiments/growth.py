@@ -198,8 +198,6 @@ def _folder_with_sample(context: BenchContext) -> Path:
 EXPERIMENT = Experiment(
     name="growth",
     title="Time and memory against the size of the work",
-    about="Datasets of more scenes at 16 pixels, meshes of more objects, views of more triangles "
-    "at 64 pixels, and more shards of one scene: each in a fresh process that did a small one.",
     cost=Column("seconds", "seconds"),
     columns=(Column("MB at most", "peak_bytes", then=lambda size: size / 1e6),),
     also_cost=("MB at most",),

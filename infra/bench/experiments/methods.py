@@ -1,4 +1,8 @@
-"""Experiment `methods`: cost against true error, from pure networks to the path tracer."""
+"""Experiment `methods`: cost against true error, from pure networks to the path tracer.
+
+It renders one view each of held-out scenes (infra.render.held_out_scenes) on one thread, when
+everything is warm.
+"""
 
 from collections.abc import Mapping
 from functools import partial
@@ -9,7 +13,7 @@ from infra.bench.context import BenchContext
 from infra.bench.experiment import BenchScale, Column, Experiment, Figures, Point
 from infra.bench.workloads.traced_pictures import load_or_render_reference
 from infra.bench_options import BenchOptions
-from infra.render.held_out_scenes import TRIANGLES, held_out_scene, held_out_settings
+from infra.render.held_out_scenes import held_out_scene, held_out_settings
 from infra.render.methods import (
     BUILTIN_NETWORKS,
     DIRECT_LIGHT,
@@ -118,8 +122,6 @@ def judged_figures(renderer: Renderer, scene: Scene, reference: RawReference) ->
 EXPERIMENT = Experiment(
     name="methods",
     title="Methods to a picture: what is traced and what is learned",
-    about=f"One view each of scenes of `{BENCHMARK}`, which no network was trained on, of at most "
-    f"{TRIANGLES} triangles, at 64 and 256 pixels; one thread, everything warm.",
     cost=Column("a scene's first view, core-s", "core_s"),
     error=Column("psnr_log_db, dB", "db"),
     better="higher",

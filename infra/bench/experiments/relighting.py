@@ -1,5 +1,6 @@
 """Experiment `relighting`: stated errors of single lights, and the true error of relit pictures.
 
+Scenes are those of the preset `olat`, and the gains of each light and channel are random.
 The reference of each light is raw samples of that light alone in two independent halves. Relit
 pictures and their references are sums of the same lights with the same gains.
 """
@@ -82,8 +83,6 @@ def _measure(target_db: float, context: BenchContext, trial: str) -> Figures:
 EXPERIMENT = Experiment(
     name="relighting",
     title="Scenes with one light at a time: stated errors of lights, true errors of relit pictures",
-    about="Scenes of the preset `olat`; each light is compared with raw samples of it alone, and "
-    "pictures with random gains of every light and channel with the same sums of raw samples.",
     cost=Column("core-seconds a view", "core_s"),
     error=Column("relit, true error, dB", "relit_db"),
     better="higher",

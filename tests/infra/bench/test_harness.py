@@ -85,7 +85,6 @@ def experiment(*trials: str) -> Experiment:
     return Experiment(
         name="made-up",
         title="Made up",
-        about="Nothing real.",
         cost=Column(name="core-seconds", figure="core_s", over="mean"),
         error=Column(name="psnr_log_db, dB", figure="db"),
         better="higher",
@@ -140,7 +139,7 @@ def test_every_declaration_is_whole() -> None:
         with case(name):
             columns = [column.name for column in columns_of(one)]
             assert len(set(columns)) == len(columns) and set(one.also_cost) <= set(columns)
-            assert one.about.endswith(".") and one.title
+            assert one.title
             for scale in (FULL, QUICK, TINY):
                 points = one.points(scale, BenchOptions())
                 names = {point.name for point in points}
