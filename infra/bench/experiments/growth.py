@@ -107,11 +107,7 @@ def session_bytes(session: int) -> int:
 def _run_command(*words: str) -> None:
     from infra.cli.commands import app
 
-    try:
-        app(words)
-    except SystemExit as end:
-        if end.code:
-            raise
+    app(words)
 
 
 def _generate(num_scenes: int, folder: Path) -> None:
