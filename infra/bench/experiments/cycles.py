@@ -14,7 +14,7 @@ from infra.bench.context import BenchContext
 from infra.bench.experiment import BenchScale, Column, Experiment, Figures, Point, percent
 from infra.bench.experiments.frontier import adaptive_settings
 from infra.bench.workloads.cycles import render_with_cycles
-from infra.bench.workloads.named_scenes import SKIES, given_scenes, mapped_scene, preset_scene
+from infra.bench.workloads.named_scenes import given_scenes, preset_scene
 from infra.bench.workloads.traced_pictures import (
     difference_db,
     render_shot,
@@ -23,13 +23,16 @@ from infra.bench.workloads.traced_pictures import (
 )
 from infra.bench_options import BenchOptions
 from infra.render.raw_references import RawReference, first_camera, raw_reference, true_error_db
-from pipeline.presets.training import object_views
+from pipeline.generation.scene_worker import SceneWorker
+from pipeline.presets.training import object_views, textured_256
 from pipeline.renders.noise_floor import clamped_radiance
 from pipeline.renders.settings import USUAL_FLOOR_DB
 from pipeline.renders.tracer import pixel_camera
+from scene_templates.settings import SceneSettings
 from storage.conventions import log10_radiance
 from storage.metrics import psnr_linear_db
 from storage.records.scene import Scene
+from storage.settings.overrides import apply_overrides
 
 PLAIN = "plain"
 TEXTURED = "textured"
@@ -52,6 +55,24 @@ OBJECT_VIEWS = 4
 SCRIPT_SPP = 128
 """Samples of the denoised pictures of objects, as scripts for Blender have it: no stated error."""
 
+SKIES = ("sun_and_sky", "clouds", "softboxes", "night")
+"""Families of skies; the first has a sharp sun."""
+
+_SEEN = ("sun_and_sky", "softboxes")
+"""Families of skies that are visible to cameras."""
+
+_MAPPED_SEED = 20_261_125
+_SKY_ROWS = 128
+
+_ROUGH = (0.4, 1.0)
+_CALM = {
+    "num_views": 1,
+    "textures.share": 0.8,
+    "textures.surfaces.roughness_clip": _ROUGH,
+    "materials.roughness_clip": _ROUGH,
+}
+"""Changes that leave out mirrors, whose caustics would be too noisy for a comparison."""
+
 _BLOCK_PX = 8
 _MOST_SCENES = 10
 
@@ -70,8 +91,19 @@ def _scene(context: BenchContext, kind: str, index: int) -> Scene:
     if kind == GIVEN:
         names = list(given_scenes(context.options.scenes))
         return context.scene(names[index % len(names)])
-    name = f"surfaces {index}" if kind == TEXTURED else f"sky {SKIES[index % len(SKIES)]}"
-    return mapped_scene(context.child, name)
+    settings: SceneSettings = apply_overrides(textured_256().scenes, _CALM)
+    if kind == SKY:
+        row = index % len(SKIES)
+        sky = {
+            "skies.share": 1.0,
+            "skies.over_lamps_log": (2.0, 2.0),
+            "skies.seen_share": float(SKIES[row] in _SEEN),
+            "skies.maps.families": (SKIES[row],),
+            "skies.maps.height": _SKY_ROWS,
+        }
+        settings = apply_overrides(settings, sky)
+        index = 10 + row
+    return context.child.call_method(SceneWorker.compose_first, settings, index, _MAPPED_SEED)
 
 
 def _measure(kind: str, context: BenchContext, trial: str) -> Figures:

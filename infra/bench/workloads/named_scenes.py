@@ -1,4 +1,4 @@
-"""Scenes of the experiments: fixed ones, plain or mapped, those of the user, and one for costs.
+"""Scenes of the experiments: those of presets and of the user, and one for costs.
 
 In the scene for costs one quantity at a time can be changed. Two built-in objects, a mirror and a
 rough body, are in an open room of three quads under small lights. More or fewer triangles of the
@@ -21,7 +21,6 @@ from pipeline.generation.scene_worker import SceneWorker
 from pipeline.isolation import IsolatedChild
 from pipeline.objects.builtin.surfaces import superquadric
 from pipeline.presets.settings import DatasetSettings
-from pipeline.presets.training import textured_256
 from pipeline.scenes.pieces import (
     ScenePiece,
     concatenate_pieces,
@@ -30,29 +29,9 @@ from pipeline.scenes.pieces import (
     surface_piece,
 )
 from scene_templates.layout import Emitter, ShellPart, SurfaceLook
-from scene_templates.settings import SceneSettings
 from storage.conventions import look_at_c2w
 from storage.records.scene import Scene, SceneObject
 from storage.seeds import rng_for
-from storage.settings.overrides import apply_overrides
-
-SKIES = ("sun_and_sky", "clouds", "softboxes", "night")
-"""Families of skies; the first has a sharp sun."""
-
-_SEEN = ("sun_and_sky", "softboxes")
-"""Families of skies that are visible to cameras."""
-
-_MAPPED_SEED = 20_261_125
-_SKY_ROWS = 128
-
-_ROUGH = (0.4, 1.0)
-_CALM = {
-    "num_views": 1,
-    "textures.share": 0.8,
-    "textures.surfaces.roughness_clip": _ROUGH,
-    "materials.roughness_clip": _ROUGH,
-}
-"""Changes that leave out mirrors, whose caustics would be too noisy for a comparison."""
 
 
 def given_scenes(folder: Path | None) -> Mapping[str, SceneSource]:
@@ -76,30 +55,6 @@ def preset_scene(
     """
     settings = dataclasses.replace(preset.scenes, num_views=num_views)
     return child.call_method(SceneWorker.compose_first, settings, scene_index)
-
-
-def mapped_scene(child: IsolatedChild, name: str) -> Scene:
-    """Return the scene of a name, with one camera.
-
-    Args:
-        name: `surfaces N`, a scene of `textured-256`, or `sky` and one of SKIES.
-
-    Raises:
-        Rejected: none can be composed.
-    """
-    kind, _, which = name.partition(" ")
-    number = int(which) if kind == "surfaces" else 10 + SKIES.index(which)
-    settings: SceneSettings = apply_overrides(textured_256().scenes, _CALM)
-    if kind == "sky":
-        sky = {
-            "skies.share": 1.0,
-            "skies.over_lamps_log": (2.0, 2.0),
-            "skies.seen_share": float(which in _SEEN),
-            "skies.maps.families": (which,),
-            "skies.maps.height": _SKY_ROWS,
-        }
-        settings = apply_overrides(settings, sky)
-    return child.call_method(SceneWorker.compose_first, settings, number, _MAPPED_SEED)
 
 
 _TOTAL_EMISSION = 3750.0
