@@ -22,7 +22,7 @@ from infra.bench.workloads.traced_pictures import (
     shrink_reference,
 )
 from infra.bench_options import BenchOptions
-from infra.render.raw_references import RawReference, first_camera, true_error
+from infra.render.raw_references import RawReference, true_error
 from pipeline.generation.scene_worker import SceneWorker
 from pipeline.isolation import IsolatedChild
 from pipeline.objects.generated import BENCHMARK, PREFIX
@@ -201,7 +201,7 @@ def _record(context: BenchContext, trial: str) -> dict[tuple[int, int], Figures]
     scene = _scene(child, index, KINDS[index % len(KINDS)])
     widest = 256 if has_wide(index) else 128
     reference_spp = _REFERENCE_TIMES * context.scale.reference_spp
-    reference = load_or_render_reference(child, scene, first_camera(scene, widest), reference_spp)
+    reference = load_or_render_reference(child, scene, widest, reference_spp)
     figures = dict[tuple[int, int], Figures]()
     for px in (px for px in LOOKS if px <= widest):
         renders = unreachable(smoke().renders, px, max(LOOKS[px]))

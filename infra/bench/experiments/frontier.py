@@ -33,11 +33,7 @@ from infra.bench.workloads.traced_pictures import (
 )
 from infra.bench_options import BenchOptions
 from infra.render.methods import SAMPLE_SEED
-from infra.render.raw_references import (
-    RawReference,
-    first_camera,
-    true_error_db,
-)
+from infra.render.raw_references import RawReference, true_error_db
 from pipeline.presets.training import pretrain_256
 from pipeline.renders.calibrated_error import LEAST_ERROR
 from pipeline.renders.noise_floor import clamped_radiance, secant_slope
@@ -165,9 +161,8 @@ def _measure_plain(sampler: str, spp: int, context: BenchContext, trial: str) ->
 
 
 def _reference(context: BenchContext, trial: str) -> RawReference:
-    scene = context.scene(trial)
-    camera = first_camera(scene, REFERENCE_PX)
-    return load_or_render_reference(context.child, scene, camera, context.scale.reference_spp)
+    spp = context.scale.reference_spp
+    return load_or_render_reference(context.child, context.scene(trial), REFERENCE_PX, spp)
 
 
 def _plain_levels(sampler: str, context: BenchContext, trial: str) -> dict[int, dict[str, float]]:

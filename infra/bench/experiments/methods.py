@@ -26,7 +26,7 @@ from infra.render.methods import (
     samples_name,
 )
 from infra.render.path_tracer import RenderChild
-from infra.render.raw_references import RawReference, first_camera, true_error_db
+from infra.render.raw_references import RawReference, true_error_db
 from pipeline.isolation import IsolatedChild
 from pipeline.objects.generated import BENCHMARK
 from pipeline.renders.mitsuba_variant import choose_variant
@@ -71,9 +71,7 @@ def _measure(px: int, name: str, context: BenchContext, trial: str) -> Figures:
     renderers, child = context.get_or_make("methods", lambda: _set_up(context))
     index = int(trial.split()[-1])
     scene = context.get_or_make(("scene", trial), lambda: held_out_scene(child, index))
-    reference = load_or_render_reference(
-        child, scene, first_camera(scene, px), 2 * context.scale.max_spp
-    )
+    reference = load_or_render_reference(child, scene, px, 2 * context.scale.max_spp)
     return judged_figures(renderers[px, name], scene, reference)
 
 

@@ -181,14 +181,16 @@ CURVES: Mapping[str, Curve] = {
 
 
 def load_or_render_reference(
-    child: IsolatedChild, scene: Scene, camera: PixelCamera, spp: int
+    child: IsolatedChild, scene: Scene, resolution: int, spp: int
 ) -> RawReference:
-    """Return two halves of raw samples of a view, from the cache or rendered by a child.
+    """Return two halves of raw samples of a scene's first view, from the cache or by a child.
 
     Args:
+        resolution: width in pixels.
         spp: samples per pixel of both halves together, a multiple of 128.
     """
-    view = [camera.c2w.tolist(), camera.fov_deg, camera.resolution, spp]
+    camera = first_camera(scene, resolution)
+    view = [camera.c2w.tolist(), camera.fov_deg, resolution, spp]
     name = sha256_hex(canonical_json([scene_digest(scene), *view]))
     path = cache_folder("raw-references") / f"{name}.safetensors"
     if not path.is_file():

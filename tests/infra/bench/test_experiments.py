@@ -30,7 +30,7 @@ from infra.bench.workloads.cycles import installed_python
 from infra.bench.workloads.gpu_steps import picture_figures, step_figures, step_settings
 from infra.bench.workloads.traced_pictures import load_or_render_reference
 from infra.bench_options import BenchOptions
-from infra.render.raw_references import RawReference, first_camera
+from infra.render.raw_references import RawReference
 from pipeline.isolation import IsolatedChild
 from storage.dataset.training_data import open_training_data
 from storage.errors import TrilightError
@@ -322,15 +322,15 @@ def test_a_view_is_rendered_once(tmp_path: Path, monkeypatch: pytest.MonkeyPatch
         return np.random.default_rng(len(calls)).random((2, 8, 8, 3))
 
     child, scene = cast(IsolatedChild, SimpleNamespace(call=make_up)), toy_scene(0)
-    first = load_or_render_reference(child, scene, first_camera(scene, 8), 128)
-    again = load_or_render_reference(child, scene, first_camera(scene, 8), 128)
+    first = load_or_render_reference(child, scene, 8, 128)
+    again = load_or_render_reference(child, scene, 8, 128)
     assert len(calls) == 1
     np.testing.assert_array_equal(first, again)
     assert first.dtype == np.float64 and not np.array_equal(*first)
     for other in (
-        (scene, first_camera(scene, 8), 256),
-        (scene, first_camera(scene, 16), 128),
-        (toy_scene(1), first_camera(scene, 8), 128),
+        (scene, 8, 256),
+        (scene, 16, 128),
+        (toy_scene(1), 8, 128),
     ):
         load_or_render_reference(child, *other)
     assert len(calls) == 4, "other samples, width or scene is another reference"
