@@ -53,7 +53,7 @@ def main(
     weights = folder.weights.read_bytes()
     about = json.loads(folder.settings.read_text())
     every = [json.loads((each / "evaluation.json").read_text()) for each in (evaluation, *also)]
-    judged, *others = every
+    judged, *other_evaluations = every
     _check(dataset, weights, about, judged["about"])
     for each in every:
         if each["about"]["network sha256"] != network_digest(decode_weights(weights)):
@@ -63,7 +63,7 @@ def main(
         name=name,
         dataset=dataset,
         judged=judged,
-        others=others,
+        others=other_evaluations,
         summary=json.loads(folder.summary.read_text()),
         weights=weights,
         command=command,
