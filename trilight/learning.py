@@ -57,25 +57,17 @@ def train_network(
             already holds a run.
     """
     require_torch("train_network")
-    settings = override_training_preset(run, changes or {}, steps=steps)
-    start = StartOptions(
-        resume=resume,
-        branch=None if branch is None else os.fspath(branch),
-        decisions=decisions or {},
-        begin_with=None if begin_with is None else os.fspath(begin_with),
-        lpips=None if lpips is None else os.fspath(lpips),
-    )
-    start.check(settings)
     from train.loop.distributed import DistributedContext, choose_device
     from train.run_training import run_training
 
+    places = {"branch": branch, "begin_with": begin_with, "lpips": lpips}
+    named: dict[str, Any] = {k: os.fspath(v) for k, v in places.items() if v is not None}
+    roots = [data] if isinstance(data, str | os.PathLike) else data
     result = run_training(
-        settings,
-        data=[
-            os.fspath(root) for root in ([data] if isinstance(data, str | os.PathLike) else data)
-        ],
+        override_training_preset(run, changes or {}, steps=steps),
+        data=[os.fspath(root) for root in roots],
         out=Path(out),
-        start=start,
+        start=StartOptions(resume=resume, decisions=decisions or {}, **named),
         dist_context=DistributedContext(device=choose_device(device)),
         workers=workers,
         watched=watched,
