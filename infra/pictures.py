@@ -6,10 +6,7 @@ ground of its own, so that it stands on light and on dark pages. Data is made on
 
 import argparse
 import contextlib
-import re
 import shutil
-import subprocess
-import sys
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -22,6 +19,7 @@ from PIL import Image, ImageDraw, ImageFont
 from infra.cli.console import console
 from infra.render.path_tracer import PathTracer, RenderChild
 from infra.render.quality import measured_settings
+from infra.viewer.open_source import open_handlers
 from model.inference import NeuralRenderer
 from pipeline.assets.cleaning.clean import clean, normalize
 from pipeline.assets.cleaning.orient import orient_outward
@@ -207,32 +205,22 @@ class Pictures:
             )
             return
         from tests.end_to_end.browser_kit import browser  # a checkout has it, and a wheel has not
+        from tests.infra.viewer.served_kit import served
 
         self._room()
         shard = self.data / "rooms" / f"train-{self.room // 4:06d}.tar"
-        command = [sys.executable, "-m", "trilight", "view", f"{shard}::{self.room:09d}"]
-        with subprocess.Popen(
-            [*command, "--no-browser"], stdout=subprocess.PIPE, text=True
-        ) as viewing:
-            try:
-                assert viewing.stdout is not None
-                said = (re.search(r"http://\S+", line) for line in viewing.stdout)
-                address = next(match[0] for match in said if match)
-                path = self.out / "viewer.png"
-                with browser("--hide-scrollbars") as page:
-                    page.show(1100, 1270)
-                    page.open(address)
-                    page.until(f"{_CARD} && !document.querySelector('.busy')")
-                    for kind in ("input", "change"):
-                        page.run(
-                            f"view.value = {self.view}; view.dispatchEvent(new Event('{kind}'))"
-                        )
-                    page.run(f"{_CARD}.click()")
-                    page.until(f"{_CARD}.innerText.includes('stated')")
-                    page.until("!document.querySelector('.busy')")
-                    page.picture(path)
-            finally:
-                viewing.terminate()
+        room = open_handlers(f"{shard}::{self.room:09d}", checkpoint=None, threads=None)
+        path = self.out / "viewer.png"
+        with served(room) as asker, browser("--hide-scrollbars") as page:
+            page.show(1100, 1270)
+            page.open(f"http://{asker.here}/{asker.word}/")
+            page.until(f"{_CARD} && !document.querySelector('.busy')")
+            for kind in ("input", "change"):
+                page.run(f"view.value = {self.view}; view.dispatchEvent(new Event('{kind}'))")
+            page.run(f"{_CARD}.click()")
+            page.until(f"{_CARD}.innerText.includes('stated')")
+            page.until("!document.querySelector('.busy')")
+            page.picture(path)
         self._write("viewer", np.asarray(Image.open(path).convert("RGB")))
         path.unlink()
 

@@ -13,7 +13,6 @@ from train.settings import WatchSettings
 if TYPE_CHECKING:
     from train.progress import TrainProgress
     from train.run_training import TrainResult
-    from train.settings import TrainSettings
 
 
 def train_network(
@@ -58,40 +57,21 @@ def train_network(
             already holds a run.
     """
     require_torch("train_network")
-    settings = override_training_preset(run, changes or {}, steps=steps)
-    start = StartOptions(
-        resume=resume,
-        branch=None if branch is None else os.fspath(branch),
-        decisions=decisions or {},
-        begin_with=None if begin_with is None else os.fspath(begin_with),
-        lpips=None if lpips is None else os.fspath(lpips),
-    )
-    start.check(settings)
-    return _train_alone(
-        settings,
-        [data] if isinstance(data, str | os.PathLike) else data,
-        device=device,
+    from train.loop.distributed import DistributedContext, choose_device
+    from train.run_training import run_training
+
+    places = {"branch": branch, "begin_with": begin_with, "lpips": lpips}
+    named: dict[str, Any] = {k: os.fspath(v) for k, v in places.items() if v is not None}
+    roots = [data] if isinstance(data, str | os.PathLike) else data
+    result = run_training(
+        override_training_preset(run, changes or {}, steps=steps),
+        data=[os.fspath(root) for root in roots],
         out=Path(out),
-        start=start,
+        start=StartOptions(resume=resume, decisions=decisions or {}, **named),
+        dist_context=DistributedContext(device=choose_device(device)),
         workers=workers,
         watched=watched,
         progress=progress,
     )
-
-
-def _train_alone(
-    settings: "TrainSettings",
-    roots: Sequence[str | os.PathLike[str]],
-    *,
-    device: str | None,
-    **options: Any,
-) -> "TrainResult":
-    """Run `train.run_training.run_training` in this process as the only rank."""
-    from train.loop.distributed import DistributedContext, choose_device
-    from train.run_training import run_training
-
-    data = [os.fspath(root) for root in roots]
-    dist_context = DistributedContext(device=choose_device(device))
-    result = run_training(settings, data=data, dist_context=dist_context, **options)
     assert result is not None  # rank 0 returns a result
     return result

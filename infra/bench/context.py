@@ -13,11 +13,12 @@ from pathlib import Path
 from typing import Any, TypeVar
 
 from infra.bench.experiment import BenchScale
-from infra.bench.workloads.named_scenes import given_scenes, preset_scene, read_given
+from infra.bench.workloads.named_scenes import given_scenes, preset_scene
 from infra.bench_options import BenchOptions
 from infra.planning import measure_scenes
 from infra.render.held_out_scenes import composing_child
 from infra.render.path_tracer import RenderChild
+from pipeline.exchange.reader import SceneReader
 from pipeline.generation.generate_options import GenerateOptions
 from pipeline.generation.prepare_isolated import preload_mesh_libraries
 from pipeline.isolation import ChildLimits, IsolatedChild
@@ -29,6 +30,7 @@ from storage.dataset.shard import write_shard
 from storage.dataset.splits import shard_name
 from storage.dataset.staging import read_staged_scene
 from storage.dataset.training_data import TrainingData, open_training_data
+from storage.errors import Rejected, TrilightError
 from storage.records.sample import sample_key
 from storage.records.scene import Scene
 
@@ -42,10 +44,11 @@ Result = TypeVar("Result")
 Closable = TypeVar("Closable", IsolatedChild, RenderChild)
 
 
-class BenchContext:
-    """Shared resources of an experiment's trials, until `close`."""
+class BenchContext(contextlib.ExitStack):
+    """Shared resources of an experiment's trials; its end closes children and deletes folders."""
 
     def __init__(self, scale: BenchScale, options: BenchOptions) -> None:
+        super().__init__()
         # before any child: pymeshlab takes a second to import, and would be counted as work
         preload_mesh_libraries()
         self.scale = scale
@@ -53,12 +56,7 @@ class BenchContext:
         self.notes: list[str] = []
         """Notes that belong to the result."""
         self.cores = os.cpu_count() or 1
-        self._stack = contextlib.ExitStack()
         self._cache: dict[Any, Any] = {}
-
-    def close(self) -> None:
-        """End the children, and delete their folders."""
-        self._stack.close()
 
     def get_or_make(self, key: Any, make: Callable[[], Result]) -> Result:
         """Return the value of a key, made by `make` at its first use."""
@@ -73,19 +71,19 @@ class BenchContext:
             self.notes.append(text)
 
     def folder(self) -> Path:
-        """Return an empty folder, which `close` deletes."""
-        return Path(self._stack.enter_context(tempfile.TemporaryDirectory()))
+        """Return an empty folder, which the end deletes."""
+        return Path(self.enter_context(tempfile.TemporaryDirectory()))
 
     def render_child(
         self, settings: DatasetSettings, objects: str, threads: int | None = None
     ) -> IsolatedChild:
-        """Return a child that composes scenes of a preset and renders them, until `close`."""
+        """Return a child that composes scenes of a preset and renders them, until the end."""
         allowed = dataclasses.replace(settings, allowed_licences=self.options.allowed_licences)
         return self.until_closed(composing_child(allowed, objects, self.folder(), threads))
 
     def until_closed(self, child: Closable) -> Closable:
-        """Return a child that `close` closes, too."""
-        return self._stack.enter_context(contextlib.closing(child))
+        """Return a child that the end closes, too."""
+        return self.enter_context(contextlib.closing(child))
 
     @functools.cached_property
     def child(self) -> IsolatedChild:
@@ -102,10 +100,14 @@ class BenchContext:
         """Return the scene of the trial `sampled N`, or the user's scene of that name."""
 
         def make() -> Scene:
-            path = given_scenes(self.options.scenes).get(trial)
-            if path is not None:
-                return self.child.call(read_given, path)
-            return preset_scene(self.child, smoke(), int(trial.split()[-1]))
+            source = given_scenes(self.options.scenes).get(trial)
+            if source is None:
+                return preset_scene(self.child, smoke(), int(trial.split()[-1]))
+            try:
+                with SceneReader() as reader:
+                    return reader.load(source).scene
+            except TrilightError as error:
+                raise Rejected("no_scene", str(error)) from error
 
         return self.get_or_make(("scene", trial), make)
 

@@ -135,8 +135,6 @@ class Experiment:
 
     name: str
     title: str
-    about: str
-    """Description of the measurement in one sentence."""
     cost: Column
     """First column of the table; above 0."""
     points: Callable[[BenchScale, BenchOptions], Sequence[Point]]
@@ -161,15 +159,6 @@ class Experiment:
     and commits; None where figures are of one machine, one commit and all options."""
     needs: tuple[Literal["torch", "blender", "data"], ...] = ()
     """Requirements on the machine or the options."""
-
-
-def missing_need(experiment: Experiment, options: BenchOptions) -> str:
-    """Return the missing requirement of an experiment as text; empty if none is missing."""
-    if "torch" in experiment.needs and importlib.util.find_spec("torch") is None:
-        return "torch is not installed; run `make setup-all`"
-    if "data" in experiment.needs and not options.data:
-        return "--data is not given; expected the root of a finished dataset"
-    return ""
 
 
 def percent(fraction: float) -> float:
@@ -227,8 +216,10 @@ def experiment_of(name: str) -> Experiment:
 
 @dataclass(kw_only=True)
 class Run:
-    """Run of an experiment, finished or not."""
+    """Run of an experiment, finished or not; what is added is in its file at once."""
 
+    path: Path
+    """File with the runs of one experiment."""
     plan: Mapping[str, Any]
     """Everything that its figures depend on: points, trials, scale, options, machine."""
     date: str
@@ -265,58 +256,50 @@ class Run:
             self.seconds = record["seconds"]
             self.notes = record["notes"]
 
-
-class Store:
-    """File with the runs of one experiment."""
-
-    def __init__(self, path: Path) -> None:
-        self.path = path
-
-    def runs(self) -> list[Run]:
-        """Return all runs, oldest first; empty without a file.
-
-        Raises:
-            TrilightError: the file holds no runs.
-        """
-        data = self.path.read_bytes() if self.path.is_file() else b""
-        runs: list[Run] = []
-        try:
-            for record in read_json_lines(data, dict[str, Any], str(self.path), torn_end=True):
-                if "plan" in record:
-                    runs.append(Run(plan=record["plan"], date=record["date"]))
-                else:
-                    runs[-1].take(record)
-        except (ValueError, LookupError, TypeError) as error:
-            raise TrilightError(
-                f"{self.path}: no rows of `trilight bench` ({error}); expected a file that it "
-                "wrote. Name another one by --out."
-            ) from error
-        return runs
-
-    def newest(self) -> Run | None:
-        """Return the last finished run, or None."""
-        return next((run for run in reversed(self.runs()) if run.seconds is not None), None)
-
-    def begin(self, plan: Mapping[str, Any]) -> Run:
-        """Return the last run if it is unfinished and has this plan, else a new run."""
-        plain = json.loads(json.dumps(plan))
-        runs = self.runs()
-        if runs and runs[-1].seconds is None and runs[-1].plan == plain:
-            return runs[-1]
-        today = datetime.date.today().isoformat()
-        self._append({"plan": plain, "date": today})
-        return Run(plan=plain, date=today)
-
-    def add(self, run: Run, trial: str, point: str, figures: Figures) -> None:
-        """Write the figures of one point in one trial; values alone if the plan names them."""
-        names = run.plan.get("figures")
+    def add(self, trial: str, point: str, figures: Figures) -> None:
+        """Add the figures of one point in one trial; values alone if the plan names them."""
+        names = self.plan.get("figures")
         stored = dict(figures) if names is None else [figures[name] for name in names if figures]
-        self.write(run, trial=trial, point=point, figures=stored)
+        self.write(trial=trial, point=point, figures=stored)
 
-    def write(self, run: Run, **record: Any) -> None:
-        """Write a record of a run: why a trial counts for no point, or that the run has ended."""
-        self._append(record)
-        run.take(record)
+    def write(self, **record: Any) -> None:
+        """Add a record: why a trial counts for no point, or that the run has ended."""
+        _append(self.path, record)
+        self.take(record)
 
-    def _append(self, record: Mapping[str, Any]) -> None:
-        append_line(self.path, json.dumps(record, sort_keys=True, allow_nan=False), durable=True)
+
+def read_runs(path: Path) -> list[Run]:
+    """Return all runs of a file, oldest first; empty without a file.
+
+    Raises:
+        TrilightError: the file holds no runs.
+    """
+    data = path.read_bytes() if path.is_file() else b""
+    runs: list[Run] = []
+    try:
+        for record in read_json_lines(data, dict[str, Any], str(path), torn_end=True):
+            if "plan" in record:
+                runs.append(Run(path=path, plan=record["plan"], date=record["date"]))
+            else:
+                runs[-1].take(record)
+    except (ValueError, LookupError, TypeError) as error:
+        raise TrilightError(
+            f"{path}: no rows of `trilight bench` ({error}); expected a file that it wrote. Name "
+            "another one by --out."
+        ) from error
+    return runs
+
+
+def begin_run(path: Path, plan: Mapping[str, Any]) -> Run:
+    """Return the last run of a file if it is unfinished and has this plan, else a new run."""
+    plain = json.loads(json.dumps(plan))
+    runs = read_runs(path)
+    if runs and runs[-1].seconds is None and runs[-1].plan == plain:
+        return runs[-1]
+    today = datetime.date.today().isoformat()
+    _append(path, {"plan": plain, "date": today})
+    return Run(path=path, plan=plain, date=today)
+
+
+def _append(path: Path, record: Mapping[str, Any]) -> None:
+    append_line(path, json.dumps(record, sort_keys=True, allow_nan=False), durable=True)

@@ -4,15 +4,15 @@ Machines drift. The points of an experiment are therefore measured alternately (
 only ratios within one run are meaningful.
 """
 
-import contextlib
 import dataclasses
+import importlib.util
 import os
 import platform
 import shutil
 import subprocess
 import time
 from collections import Counter
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from importlib import metadata
 from pathlib import Path
 from typing import Any
@@ -23,9 +23,8 @@ from infra.bench.experiment import (
     Experiment,
     Point,
     Run,
-    Store,
+    begin_run,
     device_of,
-    missing_need,
     public_options,
 )
 from infra.bench.rows import plot
@@ -40,9 +39,6 @@ RESULTS = ROOT / "docs" / "results" / "bench"
 _LIBRARIES = ("trilight", "mitsuba", "drjit", "pyoidn", "numpy", "torch", "pymeshlab",
               "wasmtime", "libigl", "OpenEXR", "h5py")  # fmt: skip
 
-TrialDone = Callable[[int, int], None]
-"""Callback with the number of finished trials and of all trials."""
-
 
 def results_path(name: str, scale: BenchScale) -> Path:
     """Return the default file of an experiment's results."""
@@ -55,41 +51,56 @@ def run(
     scale: BenchScale,
     options: BenchOptions,
     out: Path,
-    trial_done: TrialDone = lambda done, total: None,
+    trial_done: Callable[[int, int], None] = lambda done, total: None,
 ) -> Run:
     """Measure the missing trials of an experiment, draw its plot next to `out`; return its run.
 
     An interrupted run of the same plan resumes. Only its interrupted trial is measured again.
 
+    Args:
+        trial_done: called with the number of finished trials and of all trials.
+
     Raises:
         TrilightError: a requirement of the experiment is missing, or no trial could be measured.
     """
-    if lack := missing_need(experiment, options):
-        raise TrilightError(f"bench {experiment.name}: {lack}.")
+    name = experiment.name
+    if "torch" in experiment.needs and importlib.util.find_spec("torch") is None:
+        raise TrilightError(f"bench {name}: torch is not installed; run `make setup-all`.")
+    if "data" in experiment.needs and not options.data:
+        raise TrilightError(
+            f"bench {name}: --data is not given; expected the root of a finished dataset."
+        )
     if "blender" in experiment.needs:
         from infra.bench.workloads.cycles import blender_python
 
         blender_python()  # before anything is measured
     points = _points_of(experiment, scale, options)
     plan = {
-        "experiment": experiment.name,
+        "experiment": name,
         **_conditions(experiment, scale, options),
         "points": [point.record() for point in points],
         "trials": list(experiment.trials(scale, options)),
         **({"figures": list(experiment.figures)} if experiment.figures else {}),
     }
-    store = Store(out)
-    current = store.begin(plan)
+    current = begin_run(out, plan)
     began = time.perf_counter()
-    with contextlib.closing(BenchContext(scale, options)) as context:
-        _measure_missing(points, current, store, context, trial_done)
-        notes = list(context.notes)
+    missing = current.missing_trials()
+    total = len(plan["trials"])
+    with BenchContext(scale, options) as context:
+        for number, trial in enumerate(missing, total - len(missing) + 1):
+            try:
+                for point in points:
+                    if point.measure:
+                        current.add(trial, point.name, point.measure(context, trial))
+            except (Rejected, ChildFailed) as error:
+                current.write(trial=trial, left_out=str(error))
+            trial_done(number, total)
     if not current.whole_trials():
         reasons = "; ".join(sorted(set(current.left_out.values())))
-        raise TrilightError(f"bench {experiment.name}: no trial could be measured: {reasons}.")
+        raise TrilightError(f"bench {name}: no trial could be measured: {reasons}.")
     # before the end is stored: a run that cannot be drawn is unfinished
     plot(experiment, current, out.with_suffix(".png"))
-    store.write(current, seconds=time.perf_counter() - began, notes=notes)
+    current.write(seconds=time.perf_counter() - began, notes=context.notes)
     return current
 
 
@@ -114,26 +125,6 @@ def _points_of(experiment: Experiment, scale: BenchScale, options: BenchOptions)
             "folders of different names."
         )
     return points
-
-
-def _measure_missing(
-    points: Sequence[Point],
-    current: Run,
-    store: Store,
-    context: BenchContext,
-    trial_done: TrialDone,
-) -> None:
-    """Measure the trials that a run lacks."""
-    missing = current.missing_trials()
-    measures = [(point.name, point.measure) for point in points if point.measure]
-    total = len(current.plan["trials"])
-    for number, trial in enumerate(missing, total - len(missing) + 1):
-        try:
-            for name, measure in measures:
-                store.add(current, trial, name, measure(context, trial))
-        except (Rejected, ChildFailed) as error:
-            store.write(current, trial=trial, left_out=str(error))
-        trial_done(number, total)
 
 
 def machine_record(device: str) -> dict[str, Any]:

@@ -20,7 +20,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.optimize import lsq_linear
 
-from infra.bench.experiment import Store
+from infra.bench.experiment import read_runs
 from infra.bench.experiments.calibration import LOOKS, use_of
 from infra.bench.run_benchmark import ROOT
 from pipeline.renders.calibrated_error import (
@@ -133,10 +133,15 @@ def fit_weights(metric: str, looks: Sequence[Look]) -> MetricStatement:
     )
 
 
-def centers_db(metric: str, statement: MetricStatement, looks: Sequence[Look]) -> Values:
-    """Return what a statement says of each look without its shifts, in dB."""
-    taken = [(look.measures(metric), look.px, look.figures["spp"]) for look in looks]
-    return np.array([statement.center_db(*each) for each in taken])
+def stated_by(metric: str, statement: MetricStatement, looks: Sequence[Look]) -> Values:
+    """Return the bound of each look in dB; of a statement without shifts its center."""
+    return np.array(
+        [
+            statement.center_db(look.measures(metric), look.px, look.figures["spp"])
+            + (statement.bound[group_of(look.px)] if statement.bound else 0.0)
+            for look in looks
+        ]
+    )
 
 
 def cross_fitted(metric: str, looks: Sequence[Look]) -> Values:
@@ -146,7 +151,7 @@ def cross_fitted(metric: str, looks: Sequence[Look]) -> Values:
     for fold in np.unique(folds):
         mine = folds == fold
         fitted = fit_weights(metric, list(compress(looks, ~mine)))
-        stated[mine] = centers_db(metric, fitted, list(compress(looks, mine)))
+        stated[mine] = stated_by(metric, fitted, list(compress(looks, mine)))
     return stated
 
 
@@ -236,12 +241,6 @@ def fit_metric(metric: str, looks: Sequence[Look]) -> MetricStatement:
     return replace(statement, judged=judged)
 
 
-def stated_by(metric: str, statement: MetricStatement, looks: Sequence[Look]) -> Values:
-    """Return the bound of each look in dB."""
-    shifts: Values = np.array([statement.bound[group_of(look.px)] for look in looks])
-    return centers_db(metric, statement, looks) + shifts
-
-
 ROWS = ROOT / "docs" / "results" / "stated-errors.jsonl"
 
 _LEAST_LAYOUTS = 8
@@ -256,7 +255,7 @@ def read_looks(path: Path) -> list[Look]:
     """
     versions = versions_of_pictures().items()
     looks = {}
-    for run in Store(path).runs():
+    for run in read_runs(path):
         if not versions <= run.plan["machine"]["versions"].items():
             continue
         for trial in run.whole_trials():

@@ -39,7 +39,13 @@ _COLUMNS = 8
 @command("names", has_json=False)
 def bench(run_options: BenchRunOptions, options: BenchOptions) -> None:
     try:
-        from infra.bench.experiment import FULL, QUICK, Store, every_experiment, experiment_of
+        from infra.bench.experiment import (
+            FULL,
+            QUICK,
+            every_experiment,
+            experiment_of,
+            read_runs,
+        )
         from infra.bench.run_benchmark import results_path, run
     except ModuleNotFoundError as error:
         if ".bench" not in (error.name or ""):
@@ -61,10 +67,10 @@ def bench(run_options: BenchRunOptions, options: BenchOptions) -> None:
     scale = QUICK if run_options.quick else FULL
     out = run_options.out or results_path(experiment.name, scale)
     if run_options.show:
-        newest = Store(out).newest()
-        if newest is None:
+        finished = [each for each in read_runs(out) if each.seconds is not None]
+        if not finished:
             raise TrilightError(f"{out}: it has no finished run; leave --show out to measure one.")
-        _print_run(experiment, newest)
+        _print_run(experiment, finished[-1])
         return
     first_words(f"Measuring {experiment.name}: {experiment.title}")
     with progress("trials") as on_trial:

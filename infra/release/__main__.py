@@ -38,12 +38,10 @@ from storage.dataset.manifest import ShardEntry
 from storage.dataset.verify import verify_dataset
 from storage.errors import TrilightError
 from storage.markdown import front_matter
+from storage.metrics import psnr_log_db
 from storage.records.objects import read_objects_lock
 from storage.renderer import Camera, Renderer
-from train.evaluation.evaluate import judge_view
-from train.evaluation.metrics import METRIC
 from train.evaluation.sheet import ERROR_WHITE, error_picture
-from train.evaluation.validation import validation_scene
 
 FREE = {"CC0-1.0"}
 """Licences under which pictures are published."""
@@ -239,14 +237,14 @@ def compare_scenes(
                 each.name: each.load(sample.scene, sample.key).render(camera).radiance_rgb
                 for each in by_width[width]
             }
-            row = judge_view(sample, validation_scene(sample, width), 0, pictures, None)
+            template = sample.scene.provenance.get("template", "unknown")
             yield SceneComparison(
-                key=row.key,
-                caption=f"{shard.split}, {row.template}, {row.num_triangles} triangles",
+                key=sample.key,
+                caption=f"{shard.split}, {template}, {sample.scene.num_triangles} triangles",
                 target_rgb=target,
-                floor_db=row.floors[METRIC],
+                floor_db=sample.views[0].noise_floor_db,
                 pictures_rgb=pictures,
-                psnr_db={name: scores[METRIC] or 0.0 for name, scores in row.scores.items()},
+                psnr_db={name: psnr_log_db(picture, target) for name, picture in pictures.items()},
             )
             done()
 

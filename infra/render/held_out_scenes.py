@@ -16,7 +16,6 @@ from pipeline.presets.settings import DatasetSettings
 from pipeline.presets.training import smoke
 from pipeline.renders.mitsuba_variant import Variant, choose_variant, environment
 from pipeline.shards.pack_shards import PublishedShards
-from scene_templates.settings import SceneSettings
 from storage.dataset.layout import DatasetFolder
 from storage.dataset.splits import JUDGED_SPLIT
 from storage.machine import available_cores
@@ -76,20 +75,4 @@ def held_out_scene(child: IsolatedChild, index: int) -> Scene:
         Rejected: every attempt at it was rejected.
     """
     settings = dataclasses.replace(held_out_settings().scenes, num_views=1)
-    return first_composed(child, settings, index, seed=_SEED, split=JUDGED_SPLIT)
-
-
-def first_composed(
-    child: IsolatedChild,
-    settings: SceneSettings,
-    scene_index: int,
-    *,
-    seed: int = 0,
-    split: str = "train",
-) -> Scene:
-    """Return the first accepted attempt at a scene, composed in a render child.
-
-    Raises:
-        Rejected: every attempt at it was rejected.
-    """
-    return child.call_method(SceneWorker.compose_first, settings, scene_index, seed, split)
+    return child.call_method(SceneWorker.compose_first, settings, index, _SEED, JUDGED_SPLIT)

@@ -22,14 +22,8 @@ TRACED_LIGHT = "all traced light, no network"
 BUILTIN_NETWORKS = ("builtin:", "builtin:tokens")
 """Networks of every comparison: the hybrid one (more accurate), and the pure one."""
 
-SAMPLES: tuple[tuple[int, Filtered], ...] = (
-    (1, "fast"),
-    (1, "high"),
-    (4, "fast"),
-    (4, "high"),
-    (16, "fast"),
-    (16, "high"),
-)
+FILTERS: tuple[Filtered, ...] = ("fast", "high")
+SAMPLES = tuple((spp, each) for spp in (1, 4, 16) for each in FILTERS)
 """Pairs of samples per pixel and filter of Open Image Denoise."""
 
 KINDS = ("network", "traced light, no network", "path tracer, denoised")

@@ -7,7 +7,7 @@ half needs to be converged. Errors in a tone curve are multiplied by the slope o
 between the picture and the mean of both halves, as in pipeline.renders.noise_floor.
 """
 
-from dataclasses import dataclass
+import itertools
 from typing import Any
 
 import numpy as np
@@ -25,14 +25,8 @@ _SEED = 20_261_124
 """Seed of the references' samples; no dataset preset and no run uses it."""
 
 
-@dataclass(frozen=True, kw_only=True, eq=False)
-class RawReference:
-    """Two independent halves of raw samples."""
-
-    a_rgb: NDArray[np.float64]
-    """[R, R, 3] mean of the first half."""
-    b_rgb: NDArray[np.float64]
-    """[R, R, 3] mean of the second half."""
+RawReference = NDArray[np.float64]
+"""[2, R, R, 3] linear radiance: the means of two independent halves of raw samples."""
 
 
 def first_camera(scene: Scene, resolution: int) -> PixelCamera:
@@ -50,25 +44,22 @@ def raw_reference(scene: Scene, camera: PixelCamera, spp: int, *name: int) -> Ra
     return _reference(load_tracer(scene), camera, spp, *name)
 
 
-def light_references(scene: Scene, camera: PixelCamera, spp: int) -> list[RawReference]:
-    """Return a `raw_reference` of each light alone (storage.records.lights)."""
+def light_references(scene: Scene, camera: PixelCamera, spp: int) -> NDArray[np.float64]:
+    """Return the `raw_reference` of each light alone (storage.records.lights), [L, 2, R, R, 3]."""
     tracer = load_tracer(scene)
     rows: list[int | None] = list(light_rows(scene))
     rows += [None] * (num_light_pictures(scene) - len(rows))
-    return [_reference(tracer.only_light(row), camera, spp) for row in rows]
+    return np.stack([_reference(tracer.only_light(row), camera, spp) for row in rows])
 
 
 def _reference(tracer: Any, camera: PixelCamera, spp: int, *name: int) -> RawReference:
     size = PASS_SPP[0]
-    halves = []
-    for half in range(2):
-        total = np.zeros((camera.resolution, camera.resolution, 3))
-        passes = spp // (2 * size)
-        for number in range(passes):
-            seed = seed_for(_SEED, "reference", *name, half, number)
-            total += tracer.radiance(camera, seed=seed, spp=size)
-        halves.append(total / passes)
-    return RawReference(a_rgb=halves[0], b_rgb=halves[1])
+    passes = spp // (2 * size)
+    halves = np.zeros((2, camera.resolution, camera.resolution, 3))
+    for half, number in itertools.product(range(2), range(passes)):
+        seed = seed_for(_SEED, "reference", *name, half, number)
+        halves[half] += tracer.radiance(camera, seed=seed, spp=size)
+    return halves / passes
 
 
 def true_error(
@@ -88,8 +79,8 @@ def true_error(
         pixels: [R, R] mask of the pixels that count, at least one.
     """
     picture = picture_rgb.astype(np.float64)
-    mean = 0.5 * (reference.a_rgb + reference.b_rgb)
-    noise = 0.5 * (reference.a_rgb - reference.b_rgb)
+    mean = reference.mean(axis=0)
+    noise = 0.5 * (reference[0] - reference[1])
     weight = np.square(secant_slope(curve, picture, mean)) * pixels[..., None] / (3 * pixels.sum())
     error = float((weight * (np.square(picture - mean) - np.square(noise))).sum())
     # With M = T + m the mean of both halves, A = M + n and B = M - n, where m and n are independent

@@ -9,12 +9,13 @@ The training data must have only objects under CC0, and the weights must be smal
 """
 
 import json
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Annotated, Any
 
 import cyclopts
 from cyclopts import Parameter
+from jinja2 import Environment, FileSystemLoader, StrictUndefined
 from PIL import Image
 
 from model.open import BUILTIN_NETWORKS, open_network
@@ -32,25 +33,8 @@ from train.folder import RunFolder
 MOST_BYTES = 10_000_000
 """Maximum size of the weights, since every clone of the project holds them."""
 
-_HEADS = {
-    "builtin:hits": (
-        "What `trilight render --engine neural` uses where no other is named: first hits, direct "
-        "light and one bounce are traced, and the network filters what is noisy and learns what is "
-        "left out. Small enough to ship and to train on two processor cores in an hour."
-    ),
-    "builtin:tokens": (
-        "RenderFormer as published, small enough to ship and to train on two processor cores, and "
-        "as blurred as that makes it. It shows that everything works, and is something to beat; it "
-        "does not replace the path tracer."
-    ),
-}
-"""Introduction of each built-in network's card, by its name."""
-
 _SHEETS = ("median", "worst")
 """Sheets of the evaluation that the card shows."""
-
-WORST = 5
-"""Number of worst views on the card."""
 
 ALLOWED_LICENCES = {"CC0-1.0"}
 
@@ -76,26 +60,20 @@ def main(
         if each["about"]["network sha256"] != digest:
             raise TrilightError("builtin network: another network was judged.")
     place = BUILTIN_NETWORKS[name]
-    summary = json.loads(folder.summary.read_text())
-    lines = [f"# The network `{name}`", "", _HEADS[name], ""]
-    lines += _card(dataset, about, judged, summary, weights, command)
+    card = card_text(
+        name=name,
+        dataset=dataset,
+        judged=judged,
+        others=other_evaluations,
+        summary=json.loads(folder.summary.read_text()),
+        weights=weights,
+        command=command,
+        settings=about["settings"],
+    )
     for sheet in _SHEETS:
         Image.open(evaluation / f"{sheet}.png").save(place.with_name(f"{sheet}.webp"), quality=80)
-        lines += [
-            "",
-            f"![Views of {sheet} error, beside the path tracer in equal time]({sheet}.webp)",
-        ]
-    for each in other_evaluations:
-        lines += ["", *_scores(each)]
-    lines += [
-        "",
-        "```json",
-        json.dumps(about["settings"], indent=1, sort_keys=True),
-        "```",
-        "",
-    ]
     write_atomically(place, weights)
-    write_atomically(place.with_name("README.md"), "\n".join(lines).encode())
+    write_atomically(place.with_name("README.md"), card.encode())
 
 
 def _check(
@@ -117,72 +95,25 @@ def _check(
             raise TrilightError(f"builtin network: {complaint}.")
 
 
-def _card(
-    dataset: Dataset,
-    about: Mapping[str, Any],
-    judged: Mapping[str, Any],
-    summary: Mapping[str, Any],
-    weights: bytes,
-    command: str,
-) -> list[str]:
-    settings = about["settings"]
-    model = about["settings"]["model"]
-    most = dataset.manifest.settings["scenes"]["max_triangles"]
-    by_hits = model.get("view_stage") == "hits"
-    encoder = model["encoder_layers"] if model.get("scene_tokens", True) else 0
-    shape = (
-        f"{summary['num_parameters']} parameters ({encoder} and "
-        f"{model['decoder_layers']} layers, {model['width']} wide, {model['head']} head)"
+def card_text(**values: Any) -> str:
+    """Return the model card, network_card.jinja with its values filled in."""
+    environment = Environment(
+        loader=FileSystemLoader(Path(__file__).parent),
+        undefined=StrictUndefined,
+        trim_blocks=True,
+        lstrip_blocks=True,
+        keep_trailing_newline=True,
     )
-    px = settings["resolution"]
-    limits = f"at most {most} triangles" + ("" if by_hits else f" and pictures of {px} pixels")
-    return [
-        f"- weights: `model.safetensors`, {len(weights)} bytes, sha256 `{sha256_hex(weights)}`",
-        f"- size: {shape}",
-        "- licence: Trilight's (MIT); its data was made from built-in objects, all CC0-1.0",
-        f"- data: {dataset.manifest.num_scenes} scenes, dataset digest `{dataset.digest}`, by",
-        "",
-        f"      {command}",
-        "",
-        f"- training: `trilight train {settings['run']}`, {summary['num_steps']} steps of "
-        f"{settings['scenes_per_step']} scenes and {settings['views_per_scene']} views, "
-        f"{px} x {px} pixels; all settings below",
-        f"- range: {limits}; beyond that it warns and gets worse",
-        "",
-        *_scores(judged),
-    ]
-
-
-def _scores(judged: Mapping[str, Any]) -> list[str]:
-    all_scores = judged["contestants"]
-    about = judged["about"]
-    ordered = {NETWORK: all_scores[NETWORK]} | all_scores  # the file has them by their names
-    traced = judged["path tracer"] or {}
-    lines = [
-        f"Scores on {about['scenes']} scenes of split {about['split']} of build {about['build']}, "
-        f"{len(judged['views'])} views of {about['resolution']} pixels, objects that it has not "
-        f"seen (`{about['data']}`, dataset digest {about['data digest'][:8]}); medians, in "
-        "brackets the worse 5 %:",
-        "",
-        scores_table(ordered),
-    ]
-    if traced:
-        lines += ["", " ".join(sentences(traced))]
-    if swapped := judged["swapped scenes"]:
-        lines += ["", swapped_text(swapped)]
-    return [*lines, "", _worst(judged["views"])]
-
-
-def _worst(views: Sequence[Mapping[str, Any]]) -> str:
-    """Return a sentence on the views with the greatest error."""
-    by_error = sorted(views, key=lambda view: view["scores"][NETWORK]["psnr_log_db"])
-    each = [
-        f"{view['key']} ({view['scores'][NETWORK]['psnr_log_db']:.1f} dB, {view['template']}, "
-        f"{view['num_lights']} light{'s' * (view['num_lights'] != 1)}, "
-        f"mean roughness {view['roughness']:.2f})"
-        for view in by_error[:WORST]
-    ]
-    return f"Worst views, by scene: {'; '.join(each)}."
+    return environment.get_template("network_card.jinja").render(
+        **values,
+        # the network first: a report has the methods by their names
+        contestants_table=lambda scores: scores_table({NETWORK: scores[NETWORK], **scores}),
+        json=json,
+        sentences=sentences,
+        sha256_hex=sha256_hex,
+        sheets=_SHEETS,
+        swapped_text=swapped_text,
+    )
 
 
 if __name__ == "__main__":

@@ -19,7 +19,7 @@ import numpy as np
 
 from infra.render.held_out_scenes import composing_child, held_out_scene, held_out_settings
 from infra.render.machine_costs import PROBES
-from infra.render.methods import SAMPLE_SEED
+from infra.render.methods import FILTERS, SAMPLE_SEED
 from infra.render.networks import NetworkRenderer
 from infra.render.path_tracer import PathTracer, RenderChild
 from infra.render.preview_table import (
@@ -108,8 +108,7 @@ def main() -> None:
 def ladder(px: int) -> tuple[Method, ...]:
     """Return the samples and filters that are measured at a width."""
     steps = range(WIDTHS[px][0].bit_length())
-    filters: tuple[Filtered, ...] = ("fast", "high")
-    return tuple((1 << step, each) for step in steps for each in filters)
+    return tuple((1 << step, each) for step in steps for each in FILTERS)
 
 
 def part_names() -> tuple[str, ...]:

@@ -23,7 +23,8 @@ from numpy.typing import NDArray
 
 from infra.render.path_tracer import PathTracer, RenderChild
 from infra.viewer.open_source import scene_list
-from infra.viewer.scene_handlers import SceneHandlers, handlers_of_scene
+from infra.viewer.page_renderers import page_renderers
+from infra.viewer.scene_handlers import SceneHandlers
 from infra.viewer.server import (
     NotFound,
     Request,
@@ -364,8 +365,9 @@ class DatasetHandlers(SceneListHandlers):
         floors = [view.noise_floor_db for view in sample.views]
         loaded = LoadedScene(scene=sample.scene, notes=(), radiance_rgb=sample.radiance_rgb)
         place = f"{Path(self._source) / shard.name}::{key}" if self._dataset.local else ""
+        renderers = page_renderers(loaded, self._child, self._checkpoint, floors)
         name = f"scene {key}, {shard.split}"
-        return handlers_of_scene(name, loaded, place, self._child, self._checkpoint, floors)
+        return SceneHandlers(name=name, loaded=loaded, renderers=renderers, source=place)
 
 
 THUMBNAIL_PX = 128
@@ -456,5 +458,6 @@ class FolderHandlers(SceneListHandlers):
         number = self._row(key)
         name = self._names[number]
         loaded = self._load(number)
+        renderers = page_renderers(loaded, self._child, self._checkpoint)
         place = str(self._root / name)
-        return handlers_of_scene(name, loaded, place, self._child, self._checkpoint)
+        return SceneHandlers(name=name, loaded=loaded, renderers=renderers, source=place)

@@ -106,7 +106,8 @@ def open_handlers(source: str, *, checkpoint: str | None, threads: int | None) -
     """
     from infra.render.path_tracer import RenderChild
     from infra.viewer.list_handlers import DatasetHandlers, FolderHandlers
-    from infra.viewer.scene_handlers import handlers_of_scene
+    from infra.viewer.page_renderers import page_renderers
+    from infra.viewer.scene_handlers import SceneHandlers
     from pipeline.exchange.reader import SceneReader, scene_source
     from pipeline.renders.mitsuba_variant import choose_variant
     from storage.dataset.dataset import open_dataset
@@ -120,6 +121,10 @@ def open_handlers(source: str, *, checkpoint: str | None, threads: int | None) -
     file = scene_source(source)
     with SceneReader() as reader:
         loaded = reader.load(file, pictures=True)
-    room = handlers_of_scene(file.name, loaded, source, child, checkpoint)
-    room.child = child
-    return room
+    return SceneHandlers(
+        name=file.name,
+        loaded=loaded,
+        renderers=page_renderers(loaded, child, checkpoint),
+        source=source,
+        child=child,
+    )

@@ -132,7 +132,7 @@ class StoredPictures(RendererHere):
 
 
 def page_renderers(
-    loaded: LoadedScene, child: RenderChild, checkpoint: str | None, errors_db: Sequence[float]
+    loaded: LoadedScene, child: RenderChild, checkpoint: str | None, errors_db: Sequence[float] = ()
 ) -> Mapping[str, PageRenderer]:
     """Return the renderers of a scene by name, in the order of the page.
 

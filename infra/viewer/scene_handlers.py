@@ -9,7 +9,7 @@ import shlex
 import struct
 import tempfile
 import threading
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -26,7 +26,6 @@ from infra.viewer.page_renderers import (
     RenderJob,
     RenderQueue,
     agreement_db,
-    page_renderers,
 )
 from infra.viewer.picture_options import (
     parse_picture_options,
@@ -208,25 +207,6 @@ class SceneHandlers:
             data = path.read_bytes()
         said = "; ".join(lost).encode("ascii", "replace").decode()[:800]
         return Response(body=data, kind=_OCTETS, headers={"X-Lost": said} if said else {})
-
-
-def handlers_of_scene(
-    name: str,
-    loaded: LoadedScene,
-    source: str,
-    child: RenderChild,
-    checkpoint: str | None,
-    errors_db: Sequence[float] = (),
-) -> SceneHandlers:
-    """Return the handlers of a loaded scene; they do not close the render child.
-
-    Args:
-        source: scene as `trilight render` takes it; empty where it cannot.
-        child, checkpoint: render child and network of the page.
-        errors_db: stated errors of the pictures as psnr_log_db.
-    """
-    renderers = page_renderers(loaded, child, checkpoint, errors_db)
-    return SceneHandlers(name=name, loaded=loaded, renderers=renderers, source=source)
 
 
 def _job_record(job: RenderJob, reference: RenderJob | None) -> Mapping[str, Any]:

@@ -134,7 +134,7 @@ class SceneWorker:
         return SceneAttempt(sample=sample, failures=failures)
 
     def compose_first(
-        self, settings: SceneSettings, scene_index: int, seed: int, split: str
+        self, settings: SceneSettings, scene_index: int, seed: int = 0, split: str = "train"
     ) -> Scene:
         """Compose the first accepted attempt at a scene without the user's maps.
 

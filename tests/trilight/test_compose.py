@@ -178,7 +178,7 @@ def test_no_name_is_one_that_a_wheel_needs() -> None:
 
 
 def test_each_path_of_a_training_may_be_a_path() -> None:
-    with mock.patch("trilight.learning._train_alone") as train:
+    with mock.patch("train.run_training.run_training") as train:
         trilight.train_network("tiny", data="set", out="run", branch=Path("old"), lpips=Path("vgg"))
     start = train.call_args.kwargs["start"]
     assert (start.branch, start.lpips) == ("old", "vgg")

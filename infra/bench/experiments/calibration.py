@@ -22,8 +22,8 @@ from infra.bench.workloads.traced_pictures import (
     shrink_reference,
 )
 from infra.bench_options import BenchOptions
-from infra.render.held_out_scenes import first_composed
-from infra.render.raw_references import RawReference, first_camera, true_error
+from infra.render.raw_references import RawReference, true_error
+from pipeline.generation.scene_worker import SceneWorker
 from pipeline.isolation import IsolatedChild
 from pipeline.objects.generated import BENCHMARK, PREFIX
 from pipeline.presets.training import smoke
@@ -201,7 +201,7 @@ def _record(context: BenchContext, trial: str) -> dict[tuple[int, int], Figures]
     scene = _scene(child, index, KINDS[index % len(KINDS)])
     widest = 256 if has_wide(index) else 128
     reference_spp = _REFERENCE_TIMES * context.scale.reference_spp
-    reference = load_or_render_reference(child, scene, first_camera(scene, widest), reference_spp)
+    reference = load_or_render_reference(child, scene, widest, reference_spp)
     figures = dict[tuple[int, int], Figures]()
     for px in (px for px in LOOKS if px <= widest):
         renders = unreachable(smoke().renders, px, max(LOOKS[px]))
@@ -216,14 +216,12 @@ def _scene(child: IsolatedChild, index: int, kind: str) -> Scene:
         dataclasses.replace(smoke().scenes, num_views=1, families_in_turn=True),
         shares.get(kind, {}),
     )
-    return first_composed(child, settings, index, seed=SEED, split=JUDGED_SPLIT)
+    return child.call_method(SceneWorker.compose_first, settings, index, SEED, JUDGED_SPLIT)
 
 
 EXPERIMENT = Experiment(
     name="calibration",
     title="How far true errors are from what the halves of a picture say",
-    about="Pictures of layouts of their own at three widths, with what their halves say at every "
-    "look and their true error, held against raw samples in two halves.",
     cost=Column("samples", "spp"),
     columns=(
         Column("true, median millionths", "log_true"),

@@ -1,4 +1,8 @@
-"""Experiment `cycles`: Trilight's pictures compared with raw ones of Blender's Cycles."""
+"""Experiment `cycles`: Trilight's pictures compared with raw ones of Blender's Cycles.
+
+Scenes are sampled ones, such with procedural surfaces, such below skies, objects alone, and those
+of `--scenes`. The first run installs Blender (GPL-3, 380 MB) in an environment of its own.
+"""
 
 import dataclasses
 from functools import partial
@@ -10,7 +14,7 @@ from infra.bench.context import BenchContext
 from infra.bench.experiment import BenchScale, Column, Experiment, Figures, Point, percent
 from infra.bench.experiments.frontier import adaptive_settings
 from infra.bench.workloads.cycles import render_with_cycles
-from infra.bench.workloads.named_scenes import SKIES, given_scenes, mapped_scene, preset_scene
+from infra.bench.workloads.named_scenes import given_scenes, preset_scene
 from infra.bench.workloads.traced_pictures import (
     difference_db,
     render_shot,
@@ -19,13 +23,16 @@ from infra.bench.workloads.traced_pictures import (
 )
 from infra.bench_options import BenchOptions
 from infra.render.raw_references import RawReference, first_camera, raw_reference, true_error_db
-from pipeline.presets.training import object_views
+from pipeline.generation.scene_worker import SceneWorker
+from pipeline.presets.training import object_views, textured_256
 from pipeline.renders.noise_floor import clamped_radiance
 from pipeline.renders.settings import USUAL_FLOOR_DB
 from pipeline.renders.tracer import pixel_camera
+from scene_templates.settings import SceneSettings
 from storage.conventions import log10_radiance
 from storage.metrics import psnr_linear_db
 from storage.records.scene import Scene
+from storage.settings.overrides import apply_overrides
 
 PLAIN = "plain"
 TEXTURED = "textured"
@@ -48,6 +55,24 @@ OBJECT_VIEWS = 4
 SCRIPT_SPP = 128
 """Samples of the denoised pictures of objects, as scripts for Blender have it: no stated error."""
 
+SKIES = ("sun_and_sky", "clouds", "softboxes", "night")
+"""Families of skies; the first has a sharp sun."""
+
+_SEEN = ("sun_and_sky", "softboxes")
+"""Families of skies that are visible to cameras."""
+
+_MAPPED_SEED = 20_261_125
+_SKY_ROWS = 128
+
+_ROUGH = (0.4, 1.0)
+_CALM = {
+    "num_views": 1,
+    "textures.share": 0.8,
+    "textures.surfaces.roughness_clip": _ROUGH,
+    "materials.roughness_clip": _ROUGH,
+}
+"""Changes that leave out mirrors, whose caustics would be too noisy for a comparison."""
+
 _BLOCK_PX = 8
 _MOST_SCENES = 10
 
@@ -66,8 +91,19 @@ def _scene(context: BenchContext, kind: str, index: int) -> Scene:
     if kind == GIVEN:
         names = list(given_scenes(context.options.scenes))
         return context.scene(names[index % len(names)])
-    name = f"surfaces {index}" if kind == TEXTURED else f"sky {SKIES[index % len(SKIES)]}"
-    return mapped_scene(context.child, name)
+    settings: SceneSettings = apply_overrides(textured_256().scenes, _CALM)
+    if kind == SKY:
+        row = index % len(SKIES)
+        sky = {
+            "skies.share": 1.0,
+            "skies.over_lamps_log": (2.0, 2.0),
+            "skies.seen_share": float(SKIES[row] in _SEEN),
+            "skies.maps.families": (SKIES[row],),
+            "skies.maps.height": _SKY_ROWS,
+        }
+        settings = apply_overrides(settings, sky)
+        index = 10 + row
+    return context.child.call_method(SceneWorker.compose_first, settings, index, _MAPPED_SEED)
 
 
 def _measure(kind: str, context: BenchContext, trial: str) -> Figures:
@@ -79,8 +115,7 @@ def _measure(kind: str, context: BenchContext, trial: str) -> Figures:
         render_shot, scene, adaptive_settings(USUAL_FLOOR_DB, RESOLUTION, spp)
     )
     pictures, core_s = render_with_cycles(scene, RESOLUTION, spp, seeds=(0, 1))
-    a_rgb, b_rgb = (picture.astype(np.float64) for picture in pictures)
-    theirs = RawReference(a_rgb=a_rgb, b_rgb=b_rgb)
+    theirs = np.stack(pictures).astype(np.float64)
     true_db = {
         f"to_{name}_db": true_error_db(view.radiance_rgb, reference, log10_radiance)[0]
         for name, reference in (("ours", ours), ("theirs", theirs))
@@ -112,10 +147,10 @@ def _measure_object(context: BenchContext, trial: str) -> Figures:
     for view in views:
         camera = pixel_camera(scene.c2w[view], scene.fov_deg[view], px)
         raw = context.child.call(raw_reference, scene, camera, OUR_SHARE * spp, view)
-        a_rgb, b_rgb = (picture.astype(np.float64) for picture in raws[2 * view : 2 * view + 2])
+        theirs = np.stack(raws[2 * view : 2 * view + 2]).astype(np.float64)
         if view == 0:
-            agreement = agreement_figures(raw, RawReference(a_rgb=a_rgb, b_rgb=b_rgb))
-        both = RawReference(a_rgb=(raw.a_rgb + raw.b_rgb) / 2, b_rgb=(a_rgb + b_rgb) / 2)
+            agreement = agreement_figures(raw, theirs)
+        both = np.stack([raw.mean(axis=0), theirs.mean(axis=0)])
         figures["stated_objects_db"].append(ours[view].object_noise_floor_db)
         for name, picture in (("ours_db", ours[view].radiance_rgb), ("theirs_db", filtered[view])):
             error_db, _ = true_error_db(picture, both, log10_radiance, ours[view].hits)
@@ -135,23 +170,21 @@ def agreement_figures(ours: RawReference, theirs: RawReference) -> dict[str, flo
     All pictures have one exposure, so that nine tenths of the pixels are below EXPOSED; values
     above 1 count as 1.
     """
-    level = float(np.quantile((theirs.a_rgb + theirs.b_rgb).mean(axis=-1) / 2, 0.9))
+    level = float(np.quantile(theirs.mean(axis=0).mean(axis=-1), 0.9))
     exposure = EXPOSED / level if level > 0 else 1.0
-    one = theirs.a_rgb * exposure
-    other = theirs.b_rgb * exposure
-    ours = RawReference(a_rgb=ours.a_rgb * exposure, b_rgb=ours.b_rgb * exposure)
-    theirs = RawReference(a_rgb=one, b_rgb=other)
-    pixels_db = _linear_db(0.5 * (ours.a_rgb + ours.b_rgb), one)
-    seeds_db = _linear_db(one, other)
-    blocks = len(ours.a_rgb) // _BLOCK_PX
+    ours = ours * exposure
+    theirs = theirs * exposure
+    pixels_db = _linear_db(ours.mean(axis=0), theirs[0])
+    seeds_db = _linear_db(*theirs)
+    blocks = ours.shape[1] // _BLOCK_PX
     coarse = shrink_reference(ours, blocks), shrink_reference(theirs, blocks)
     return {
         "pixels_db": pixels_db,
         "seeds_db": seeds_db,
         "margin_db": pixels_db - min(AIM_DB, seeds_db - 1),
-        "blocks_db": _linear_db(*(0.5 * (half.a_rgb + half.b_rgb) for half in coarse)),
+        "blocks_db": _linear_db(*(each.mean(axis=0) for each in coarse)),
         "noiseless_db": difference_db(ours, theirs, clamped_radiance),
-        "brightness": 100 * float((ours.a_rgb + ours.b_rgb).mean() / (one + other).mean() - 1),
+        "brightness": 100 * float(ours.mean() / theirs.mean() - 1),
     }
 
 
@@ -162,9 +195,6 @@ def _linear_db(one: NDArray[np.float64], other: NDArray[np.float64]) -> float:
 EXPERIMENT = Experiment(
     name="cycles",
     title="Plain, textured and sky-lit scenes compared with Blender's Cycles",
-    about="Raw samples of ours and a denoised picture against raw samples of Cycles, of sampled "
-    "scenes, of scenes with procedural surfaces, of scenes below skies, of objects alone, and "
-    "of those in `--scenes`; the first run installs Blender (GPL-3, 380 MB) in an environment.",
     cost=Column("core-seconds of Cycles", "core_s"),
     error=Column("agreement without noise, linear dB", "noiseless_db"),
     better="higher",

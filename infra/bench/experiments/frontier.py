@@ -33,11 +33,7 @@ from infra.bench.workloads.traced_pictures import (
 )
 from infra.bench_options import BenchOptions
 from infra.render.methods import SAMPLE_SEED
-from infra.render.raw_references import (
-    RawReference,
-    first_camera,
-    true_error_db,
-)
+from infra.render.raw_references import RawReference, true_error_db
 from pipeline.presets.training import pretrain_256
 from pipeline.renders.calibrated_error import LEAST_ERROR
 from pipeline.renders.noise_floor import clamped_radiance, secant_slope
@@ -165,9 +161,8 @@ def _measure_plain(sampler: str, spp: int, context: BenchContext, trial: str) ->
 
 
 def _reference(context: BenchContext, trial: str) -> RawReference:
-    scene = context.scene(trial)
-    camera = first_camera(scene, REFERENCE_PX)
-    return load_or_render_reference(context.child, scene, camera, context.scale.reference_spp)
+    spp = context.scale.reference_spp
+    return load_or_render_reference(context.child, context.scene(trial), REFERENCE_PX, spp)
 
 
 def _plain_levels(sampler: str, context: BenchContext, trial: str) -> dict[int, dict[str, float]]:
@@ -208,9 +203,8 @@ def plain_figures(level: Image, reference: RawReference) -> dict[str, float]:
 def worst_pixel_share(picture_rgb: NDArray[np.float32], reference: RawReference) -> float:
     """Return which share of a picture's squared error (log) its worst pixel has, at most 1."""
     picture = picture_rgb.astype(np.float64)
-    mean = 0.5 * (reference.a_rgb + reference.b_rgb)
-    weight = np.square(secant_slope(log10_radiance, picture, mean))
-    squared = (weight * (picture - reference.a_rgb) * (picture - reference.b_rgb)).mean(axis=-1)
+    weight = np.square(secant_slope(log10_radiance, picture, reference.mean(axis=0)))
+    squared = (weight * (picture - reference).prod(axis=0)).mean(axis=-1)
     worst = float(squared.max())
     return worst / max(float(squared.sum()), worst, LEAST_ERROR)
 
@@ -257,8 +251,6 @@ _WRONG = tuple(
 EXPERIMENT = Experiment(
     name="frontier",
     title="Cost at equal error compared with plain Mitsuba, and stated errors",
-    about="Our stated errors and Mitsuba's `path` integrator, raw or with one OIDN and our guide "
-    "pictures, whichever is better, scene by scene, held against raw samples in two halves.",
     cost=Column("core-seconds a view", "core_s", over="mean"),
     error=Column("psnr_log_db, dB", "db"),
     better="higher",

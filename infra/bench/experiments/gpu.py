@@ -1,4 +1,7 @@
-"""Experiment `gpu`: throughput, correct pictures, and steps of every training preset on a GPU."""
+"""Experiment `gpu`: throughput, correct pictures, and steps of every training preset on a GPU.
+
+Without a GPU it measures the same at toy sizes, which shows that it works.
+"""
 
 import itertools
 from collections.abc import Sequence
@@ -49,7 +52,7 @@ def _measure(work: Sequence[str], context: BenchContext, trial: str) -> Figures:
     """Measure a work; one that fails has no figures, and a note with the reason."""
     import torch
 
-    from infra.bench.gpu import steps
+    from infra.bench.workloads import gpu_steps as steps
 
     device = torch.device(device_of(context.options))
     context.note(steps.device_facts(device))
@@ -61,7 +64,7 @@ def _measure(work: Sequence[str], context: BenchContext, trial: str) -> Figures:
             case "copy", way:
                 figures = steps.copy_figures(device, way, _COPIED_BYTES[device.type])
             case "picture", network, precision:
-                figures = steps.twin_figures(network, precision, device)
+                figures = steps.picture_figures(network, precision, device)
             case "step", run:
                 figures = steps.step_figures(run, _STEPS[context.scale.name], device)
                 if not figures:
@@ -74,20 +77,17 @@ def _measure(work: Sequence[str], context: BenchContext, trial: str) -> Figures:
 EXPERIMENT = Experiment(
     name="gpu",
     title="The GPU: products, copies, pictures and steps",
-    about="Large products and copies, pictures of the built-in networks against stored ones, and "
-    "steps of the training presets at their own sizes; without a GPU the same at toy sizes, which "
-    "shows that it works.",
     cost=Column("ms", "ms"),
     columns=(
         Column("TFLOP/s", "teraflop_per_s"),
         Column("GB/s", "gigabyte_per_s"),
-        Column("to the stored picture, dB", "db"),
+        Column("to the processor's picture, dB", "db"),
         Column("views/s", "views_per_s"),
         Column("scenes a pass", "scenes"),
         Column("not compiled, ms", "plain_ms"),
         Column("GiB", "peak_gib"),
     ),
-    because="Pictures below 40 dB of the stored ones are wrong: believe no time then. The file "
+    because="Pictures below 40 dB are wrong: believe no time then. The file "
     "names no host, user or folder; to send it, attach it to an issue.",
     points=_points,
     trials=lambda scale, options: ["round 1"],

@@ -159,8 +159,6 @@ def read_figures(data: TrainingData, count: int, threads: int) -> Figures:
 EXPERIMENT = Experiment(
     name="loader",
     title="Samples a second and bytes a sample",
-    about="Whole samples of `smoke`, four views each, unpacked from our profiles and from the "
-    "published HDF5 layout, and shards that become batches of 64 pixels by threads.",
     cost=Column("ms a sample", "sample_ms"),
     columns=(
         Column("samples a second", "sample_ms", then=lambda ms: 1000 / ms),

@@ -251,10 +251,6 @@ def _number(trial: str) -> int:
 EXPERIMENT = Experiment(
     name="meshes",
     title="Coarser meshes: methods and budgets",
-    about=f"Objects of {LARGE} triangles or more, simplified by each of our methods and by the "
-    "reference recipe (isotropic remeshing at 0.5 %, then quadric collapse), and by `faithful` to "
-    "several budgets. The largest few are also path traced beside their source, on a floor under "
-    "a lamp.",
     cost=Column("core-seconds an object", "cpu_s"),
     error=Column("distance to the source, p99, % of the diagonal", "error_p99", then=percent),
     columns=(

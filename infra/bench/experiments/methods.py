@@ -1,4 +1,8 @@
-"""Experiment `methods`: cost against true error, from pure networks to the path tracer."""
+"""Experiment `methods`: cost against true error, from pure networks to the path tracer.
+
+It renders one view each of held-out scenes (infra.render.held_out_scenes) on one thread, when
+everything is warm.
+"""
 
 from collections.abc import Mapping
 from functools import partial
@@ -9,7 +13,7 @@ from infra.bench.context import BenchContext
 from infra.bench.experiment import BenchScale, Column, Experiment, Figures, Point
 from infra.bench.workloads.traced_pictures import load_or_render_reference
 from infra.bench_options import BenchOptions
-from infra.render.held_out_scenes import TRIANGLES, held_out_scene, held_out_settings
+from infra.render.held_out_scenes import held_out_scene, held_out_settings
 from infra.render.methods import (
     BUILTIN_NETWORKS,
     DIRECT_LIGHT,
@@ -22,7 +26,7 @@ from infra.render.methods import (
     samples_name,
 )
 from infra.render.path_tracer import RenderChild
-from infra.render.raw_references import RawReference, first_camera, true_error_db
+from infra.render.raw_references import RawReference, true_error_db
 from pipeline.isolation import IsolatedChild
 from pipeline.objects.generated import BENCHMARK
 from pipeline.renders.mitsuba_variant import choose_variant
@@ -67,9 +71,7 @@ def _measure(px: int, name: str, context: BenchContext, trial: str) -> Figures:
     renderers, child = context.get_or_make("methods", lambda: _set_up(context))
     index = int(trial.split()[-1])
     scene = context.get_or_make(("scene", trial), lambda: held_out_scene(child, index))
-    reference = load_or_render_reference(
-        child, scene, first_camera(scene, px), 2 * context.scale.max_spp
-    )
+    reference = load_or_render_reference(child, scene, px, 2 * context.scale.max_spp)
     return judged_figures(renderers[px, name], scene, reference)
 
 
@@ -102,7 +104,7 @@ def judged_figures(renderer: Renderer, scene: Scene, reference: RawReference) ->
     picture = time_scene(renderer, scene, "scene", ROUNDS)
     radiance_rgb = picture.radiance_rgb
     hits = first_hits(scene, resolution=len(radiance_rgb)).met
-    mean = 0.5 * (reference.a_rgb + reference.b_rgb)
+    mean = reference.mean(axis=0)
     return {
         "core_s": picture.price.first_s,
         "view_s": picture.price.further_s,
@@ -118,8 +120,6 @@ def judged_figures(renderer: Renderer, scene: Scene, reference: RawReference) ->
 EXPERIMENT = Experiment(
     name="methods",
     title="Methods to a picture: what is traced and what is learned",
-    about=f"One view each of scenes of `{BENCHMARK}`, which no network was trained on, of at most "
-    f"{TRIANGLES} triangles, at 64 and 256 pixels; one thread, everything warm.",
     cost=Column("a scene's first view, core-s", "core_s"),
     error=Column("psnr_log_db, dB", "db"),
     better="higher",

@@ -96,8 +96,6 @@ def _train(context: BenchContext, side: str, seed: int) -> Sequence[Figures]:
 EXPERIMENT = Experiment(
     name="paired-training",
     title="Two trainings, side by side",
-    about="A training preset with the changes of --set-a and with those of --set-b, from the same "
-    "seeds, judged on scenes of the validation split of `--data`.",
     cost=Column("seconds of a training", "seconds", over="mean"),
     error=Column("held-out log L1, thousandths", "log_l1", over="mean", then=lambda l1: 1000 * l1),
     columns=(

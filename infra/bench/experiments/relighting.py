@@ -1,11 +1,11 @@
 """Experiment `relighting`: stated errors of single lights, and the true error of relit pictures.
 
+Scenes are those of the preset `olat`, and the gains of each light and channel are random.
 The reference of each light is raw samples of that light alone in two independent halves. Relit
 pictures and their references are sums of the same lights with the same gains.
 """
 
 import dataclasses
-from collections.abc import Sequence
 from functools import partial
 
 import numpy as np
@@ -64,33 +64,25 @@ def _measure(target_db: float, context: BenchContext, trial: str) -> Figures:
         return true_error_db(picture, reference, log10_radiance)[0]
 
     gains = MOST_GAIN ** rng_for(index, "gains").uniform(-1, 1, (len(references), 1, 1, 3))
+    of_relit = (gains[:, None] * references).sum(axis=0)
     lights = zip(view.light_floors, view.lights_rgb, references, strict=True)
     excess = np.array([floor.log_db - error_db(light, raw) for floor, light, raw in lights])
     relit = (gains * view.lights_rgb).sum(axis=0).astype(np.float32)
     return {
         "core_s": view.core_s,
         "lights": len(references),
-        "relit_db": error_db(relit, _sum(references, gains)),
+        "relit_db": error_db(relit, of_relit),
         "stated_db": view.noise_floor_db,
-        "true_db": error_db(view.radiance_rgb, _sum(references, np.ones_like(gains))),
+        "true_db": error_db(view.radiance_rgb, references.sum(axis=0)),
         "missed": float((excess > _ALLOWED_DB).mean()),
         "excess_db": float(excess.max()),
         "caution_db": float(np.median(-excess)),
     }
 
 
-def _sum(references: Sequence[RawReference], gains: NDArray[np.float64]) -> RawReference:
-    """Return the reference of lights that are scaled by gains [L, 1, 1, 3] and added."""
-    a_rgb = (gains * np.stack([each.a_rgb for each in references])).sum(axis=0)
-    b_rgb = (gains * np.stack([each.b_rgb for each in references])).sum(axis=0)
-    return RawReference(a_rgb=a_rgb, b_rgb=b_rgb)
-
-
 EXPERIMENT = Experiment(
     name="relighting",
     title="Scenes with one light at a time: stated errors of lights, true errors of relit pictures",
-    about="Scenes of the preset `olat`; each light is compared with raw samples of it alone, and "
-    "pictures with random gains of every light and channel with the same sums of raw samples.",
     cost=Column("core-seconds a view", "core_s"),
     error=Column("relit, true error, dB", "relit_db"),
     better="higher",

@@ -1,4 +1,4 @@
-"""Scenes of the experiments: fixed ones, plain or mapped, those of the user, and one for costs.
+"""Scenes of the experiments: those of presets and of the user, and one for costs.
 
 In the scene for costs one quantity at a time can be changed. Two built-in objects, a mirror and a
 rough body, are in an open room of three quads under small lights. More or fewer triangles of the
@@ -7,7 +7,6 @@ surfaces, materials and camera always agree.
 """
 
 import dataclasses
-import json
 import math
 from collections.abc import Mapping, Sequence
 from pathlib import Path
@@ -16,13 +15,12 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from infra.render.held_out_scenes import first_composed
-from pipeline.exchange.gltf import SUFFIXES as GLTF_SUFFIXES
-from pipeline.exchange.reader import load_source, scene_source
+from pipeline.exchange.formats import SceneSource
+from pipeline.exchange.reader import SceneReader
+from pipeline.generation.scene_worker import SceneWorker
 from pipeline.isolation import IsolatedChild
 from pipeline.objects.builtin.surfaces import superquadric
 from pipeline.presets.settings import DatasetSettings
-from pipeline.presets.training import textured_256
 from pipeline.scenes.pieces import (
     ScenePiece,
     concatenate_pieces,
@@ -31,53 +29,20 @@ from pipeline.scenes.pieces import (
     surface_piece,
 )
 from scene_templates.layout import Emitter, ShellPart, SurfaceLook
-from scene_templates.settings import SceneSettings
 from storage.conventions import look_at_c2w
-from storage.errors import TrilightError
 from storage.records.scene import Scene, SceneObject
 from storage.seeds import rng_for
-from storage.settings.overrides import apply_overrides
-
-SKIES = ("sun_and_sky", "clouds", "softboxes", "night")
-"""Families of skies; the first has a sharp sun."""
-
-_SEEN = ("sun_and_sky", "softboxes")
-"""Families of skies that are visible to cameras."""
-
-_MAPPED_SEED = 20_261_125
-_SKY_ROWS = 128
-
-_ROUGH = (0.4, 1.0)
-_CALM = {
-    "num_views": 1,
-    "textures.share": 0.8,
-    "textures.surfaces.roughness_clip": _ROUGH,
-    "materials.roughness_clip": _ROUGH,
-}
-"""Changes that leave out mirrors, whose caustics would be too noisy for a comparison."""
 
 
-def given_scenes(folder: Path | None) -> Mapping[str, Path]:
-    """Return the RenderFormer and glTF files of a folder by the name of their scene.
+def given_scenes(folder: Path | None) -> Mapping[str, SceneSource]:
+    """Return the scenes in the files of a folder by their names.
 
     Raises:
-        TrilightError: the folder holds neither a glTF file nor a JSON file of a scene.
+        TrilightError: the folder holds no file of a scene.
     """
-    if folder is None:
-        return {}
-    root = folder.resolve()
-    trees = [path for suffix in GLTF_SUFFIXES for path in sorted(root.glob(f"*{suffix}"))]
-    described = [path for path in sorted(root.glob("*.json")) if _holds_a_scene(path)]
-    if not described and not trees:
-        raise TrilightError(
-            f"--scenes {folder}: it holds no scene; expected RenderFormer scenes (*.json) or glTF."
-        )
-    return {path.name: path for path in trees} | {path.stem: path for path in described}
-
-
-def read_given(path: Path) -> Scene:
-    """Return the scene of a file, as `trilight render` reads it; runs in a render child."""
-    return load_source(scene_source(str(path))).scene
+    with SceneReader() as reader:
+        sources = reader.list_scenes(str(folder)) if folder else []
+    return {source.name: source for source in sources}
 
 
 def preset_scene(
@@ -89,40 +54,7 @@ def preset_scene(
         Rejected: every attempt at it was rejected.
     """
     settings = dataclasses.replace(preset.scenes, num_views=num_views)
-    return first_composed(child, settings, scene_index)
-
-
-def mapped_scene(child: IsolatedChild, name: str) -> Scene:
-    """Return the scene of a name, with one camera.
-
-    Args:
-        name: `surfaces N`, a scene of `textured-256`, or `sky` and one of SKIES.
-
-    Raises:
-        Rejected: none can be composed.
-    """
-    kind, _, which = name.partition(" ")
-    number = int(which) if kind == "surfaces" else 10 + SKIES.index(which)
-    settings: SceneSettings = apply_overrides(textured_256().scenes, _CALM)
-    if kind == "sky":
-        sky = {
-            "skies.share": 1.0,
-            "skies.over_lamps_log": (2.0, 2.0),
-            "skies.seen_share": float(which in _SEEN),
-            "skies.maps.families": (which,),
-            "skies.maps.height": _SKY_ROWS,
-        }
-        settings = apply_overrides(settings, sky)
-    return first_composed(child, settings, number, seed=_MAPPED_SEED)
-
-
-def _holds_a_scene(path: Path) -> bool:
-    """Return whether a file has objects and a camera, which templates lack."""
-    try:
-        record = json.loads(path.read_bytes())
-    except ValueError:
-        return False
-    return isinstance(record, dict) and bool(record.get("objects")) and bool(record.get("cameras"))
+    return child.call_method(SceneWorker.compose_first, settings, scene_index)
 
 
 _TOTAL_EMISSION = 3750.0

@@ -181,23 +181,24 @@ CURVES: Mapping[str, Curve] = {
 
 
 def load_or_render_reference(
-    child: IsolatedChild, scene: Scene, camera: PixelCamera, spp: int
+    child: IsolatedChild, scene: Scene, resolution: int, spp: int
 ) -> RawReference:
-    """Return two halves of raw samples of a view, from the cache or rendered by a child.
+    """Return two halves of raw samples of a scene's first view, from the cache or by a child.
 
     Args:
+        resolution: width in pixels.
         spp: samples per pixel of both halves together, a multiple of 128.
     """
-    view = [camera.c2w.tolist(), camera.fov_deg, camera.resolution, spp]
+    camera = first_camera(scene, resolution)
+    view = [camera.c2w.tolist(), camera.fov_deg, resolution, spp]
     name = sha256_hex(canonical_json([scene_digest(scene), *view]))
     path = cache_folder("raw-references") / f"{name}.safetensors"
     if not path.is_file():
         made = child.call(raw_reference, scene, camera, spp)
-        halves = {"a": made.a_rgb.astype(np.float32), "b": made.b_rgb.astype(np.float32)}
         path.parent.mkdir(parents=True, exist_ok=True)
-        write_atomically(path, save(halves))
+        write_atomically(path, save(dict(zip("ab", made.astype(np.float32), strict=True))))
     stored = load(path.read_bytes())
-    return RawReference(a_rgb=stored["a"].astype(np.float64), b_rgb=stored["b"].astype(np.float64))
+    return np.stack([stored["a"], stored["b"]]).astype(np.float64)
 
 
 def figures(view: RenderedView, reference: RawReference) -> dict[str, float]:
@@ -232,15 +233,13 @@ def difference_db(ours: RawReference, theirs: RawReference, curve: Curve) -> flo
     The squared difference is the mean of (A - C) (B - D), with halves A and B of one and C and D of
     the other. It may be below 0 by chance, which counts as no difference.
     """
-    means = (0.5 * (one.a_rgb + one.b_rgb) for one in (ours, theirs))
-    weight = np.square(secant_slope(curve, *means))
-    product = (ours.a_rgb - theirs.a_rgb) * (ours.b_rgb - theirs.b_rgb)
+    weight = np.square(secant_slope(curve, ours.mean(axis=0), theirs.mean(axis=0)))
+    product = (ours - theirs).prod(axis=0)
     return float(-10 * np.log10(max((weight * product).mean(), LEAST_ERROR)))
 
 
 def shrink_reference(reference: RawReference, resolution: int) -> RawReference:
     """Return a reference of a smaller width, which divides the reference's."""
-    halves = np.stack([reference.a_rgb, reference.b_rgb])
-    size = halves.shape[1] // resolution
-    blocks = halves.reshape(2, resolution, size, resolution, size, 3).mean(axis=(2, 4))
-    return RawReference(a_rgb=blocks[0], b_rgb=blocks[1])
+    size = reference.shape[1] // resolution
+    smaller: RawReference = reference.reshape(2, resolution, size, resolution, size, 3).mean((2, 4))
+    return smaller

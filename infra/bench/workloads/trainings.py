@@ -8,7 +8,6 @@ from functools import partial
 import numpy as np
 import torch
 
-from model.renderformer import RenderFormer
 from storage.dataset.shard_set import ShardSet
 from storage.dataset.training_data import open_training_data
 from storage.errors import TrilightError
@@ -54,7 +53,19 @@ def training_figures(
     `percent` is 100 times the logarithm of the error, so that differences are per cent of it.
     """
     began = time.perf_counter()
-    model = _trained_network(train, settings, device)
+    crew = DistributedContext(device=device)
+    state = new_state(settings, device, muon_precision=choose_muon_precision(crew))
+    stepper = Stepper(state, TrainingLoss(settings.loss, None), crew)
+    cost = partial(scene_flops, settings)
+    stream = load_batches(
+        train, settings, 0, rank_slice=crew, workers=1, unusable=state.bad_samples
+    )
+    with closing(stream) as batches:
+        for step in range(settings.num_steps):
+            buckets = bucket_scenes(next(batches), cost, settings.scenes_per_pass)
+            stepper.launch(buckets, learning_rate(step, settings))  # no step waits for its figures
+            state.step += 1
+    model = state.model.eval()
     seconds = time.perf_counter() - began
     views = iter(judge.judge(model).views)
     scores_by_view = []
@@ -67,26 +78,3 @@ def training_figures(
             figures |= {"log_l1": l1, "percent": 100 * float(np.log(l1)), "db": db}
         scores_by_view.append(figures)
     return scores_by_view
-
-
-def _trained_network(
-    shards: ShardSet, settings: TrainSettings, device: torch.device
-) -> RenderFormer:
-    crew = DistributedContext(device=device)
-    state = new_state(settings, device, muon_precision=choose_muon_precision(crew))
-    stepper = Stepper(state, TrainingLoss(settings.loss, None), crew)
-    cost = partial(scene_flops, settings)
-    stream = load_batches(
-        shards,
-        settings,
-        0,
-        rank_slice=crew,
-        workers=1,
-        unusable=state.bad_samples,
-    )
-    with closing(stream) as batches:
-        for step in range(settings.num_steps):
-            buckets = bucket_scenes(next(batches), cost, settings.scenes_per_pass)
-            stepper.launch(buckets, learning_rate(step, settings))  # no step waits for its figures
-            state.step += 1
-    return state.model.eval()

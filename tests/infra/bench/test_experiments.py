@@ -19,17 +19,18 @@ from infra.bench.experiments import methods
 from infra.bench.experiments.calibration import LOOKS
 from infra.bench.experiments.cycles import agreement_figures
 from infra.bench.experiments.frontier import cost_at_error
+from infra.bench.experiments.gpu import NETWORKS
 from infra.bench.experiments.growth import EXPERIMENT, WORK, measure_work, session_bytes
 from infra.bench.experiments.loader import LAYOUTS, read_figures, unpacking_figures
 from infra.bench.experiments.meshes import BUDGET_GROUP, CURVE, METHOD_GROUP
 from infra.bench.experiments.paired_training import SIDE_A, SIDE_B, scene_of, settings_of
-from infra.bench.gpu import steps
-from infra.bench.gpu.steps import NETWORKS, step_figures, step_settings, twin_figures
 from infra.bench.workloads import cycles as environment
+from infra.bench.workloads import gpu_steps
 from infra.bench.workloads.cycles import installed_python
+from infra.bench.workloads.gpu_steps import picture_figures, step_figures, step_settings
 from infra.bench.workloads.traced_pictures import load_or_render_reference
 from infra.bench_options import BenchOptions
-from infra.render.raw_references import RawReference, first_camera
+from infra.render.raw_references import RawReference
 from pipeline.isolation import IsolatedChild
 from storage.dataset.training_data import open_training_data
 from storage.errors import TrilightError
@@ -49,10 +50,10 @@ def test_noise_is_no_difference_and_another_picture_is() -> None:
     def noisy(picture: np.ndarray) -> np.ndarray:
         return np.maximum(picture + rng.normal(0, 0.01, picture.shape), 0)
 
-    ours = RawReference(a_rgb=noisy(truth), b_rgb=noisy(truth))
+    ours = np.stack([noisy(truth), noisy(truth)])
 
     def figures(theirs: np.ndarray) -> dict[str, float]:
-        return agreement_figures(ours, RawReference(a_rgb=noisy(theirs), b_rgb=noisy(theirs)))
+        return agreement_figures(ours, np.stack([noisy(theirs), noisy(theirs)]))
 
     same, mirrored = figures(truth), figures(truth[::-1])
     assert same["pixels_db"] > same["seeds_db"], "our mean of two is less noisy than one of theirs"
@@ -127,17 +128,24 @@ def test_every_preset_has_its_own_size_on_a_gpu_and_a_small_one_here() -> None:
 
 def test_too_little_memory_has_no_figures(monkeypatch: pytest.MonkeyPatch) -> None:
     drawn = mock.Mock(side_effect=torch.OutOfMemoryError("CUDA out of memory"))
-    monkeypatch.setattr(steps, "drawn_batch", drawn)
+    monkeypatch.setattr(gpu_steps, "drawn_batch", drawn)
     assert step_figures("smoke", 1, CPU) == {}
     assert drawn.call_args.args[1] == 1, "fewer scenes were tried, down to one"
 
 
 @pytest.mark.slow("benchmarks")
-def test_a_built_in_network_shows_its_stored_picture_here() -> None:
+def test_a_picture_is_near_the_processors_and_another_network_is_not(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
     for network in NETWORKS:
         with case(network):
-            found = twin_figures(network, "float32", CPU)
-            assert found["db"] > 55 and found["ms"] > 0, "float16 of what another processor made"
+            found = picture_figures(network, "bfloat16", CPU)
+            assert found["db"] > 45 and found["ms"] > 0, "rounded, as on a device"
+    wrong = mock.Mock(
+        side_effect=[gpu_steps._first_view(name, CPU, "float32") for name in NETWORKS]
+    )
+    monkeypatch.setattr(gpu_steps, "_first_view", wrong)
+    assert picture_figures("builtin:hits", "float32", CPU)["db"] < 40
 
 
 @pytest.mark.slow("benchmarks")
@@ -311,20 +319,18 @@ def test_a_view_is_rendered_once(tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 
     def make_up(*asked: Any) -> RawReference:
         calls.append(asked)
-        a, b = np.random.default_rng(len(calls)).random((2, 8, 8, 3))
-        return RawReference(a_rgb=a, b_rgb=b)
+        return np.random.default_rng(len(calls)).random((2, 8, 8, 3))
 
     child, scene = cast(IsolatedChild, SimpleNamespace(call=make_up)), toy_scene(0)
-    first = load_or_render_reference(child, scene, first_camera(scene, 8), 128)
-    again = load_or_render_reference(child, scene, first_camera(scene, 8), 128)
+    first = load_or_render_reference(child, scene, 8, 128)
+    again = load_or_render_reference(child, scene, 8, 128)
     assert len(calls) == 1
-    np.testing.assert_array_equal(first.a_rgb, again.a_rgb)
-    np.testing.assert_array_equal(first.b_rgb, again.b_rgb)
-    assert first.a_rgb.dtype == np.float64 and not np.array_equal(first.a_rgb, first.b_rgb)
+    np.testing.assert_array_equal(first, again)
+    assert first.dtype == np.float64 and not np.array_equal(*first)
     for other in (
-        (scene, first_camera(scene, 8), 256),
-        (scene, first_camera(scene, 16), 128),
-        (toy_scene(1), first_camera(scene, 8), 128),
+        (scene, 8, 256),
+        (scene, 16, 128),
+        (toy_scene(1), 8, 128),
     ):
         load_or_render_reference(child, *other)
     assert len(calls) == 4, "other samples, width or scene is another reference"

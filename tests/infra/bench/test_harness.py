@@ -25,10 +25,11 @@ from infra.bench.experiment import (
     Figures,
     Point,
     Run,
-    Store,
+    begin_run,
     columns_of,
     every_experiment,
     experiment_of,
+    read_runs,
 )
 from infra.bench.experiments.calibration import FIGURES, LOOKS, has_wide, use_of
 from infra.bench.rows import Row, plot, rows_of, table_of
@@ -84,7 +85,6 @@ def experiment(*trials: str) -> Experiment:
     return Experiment(
         name="made-up",
         title="Made up",
-        about="Nothing real.",
         cost=Column(name="core-seconds", figure="core_s", over="mean"),
         error=Column(name="psnr_log_db, dB", figure="db"),
         better="higher",
@@ -139,7 +139,7 @@ def test_every_declaration_is_whole() -> None:
         with case(name):
             columns = [column.name for column in columns_of(one)]
             assert len(set(columns)) == len(columns) and set(one.also_cost) <= set(columns)
-            assert one.about.endswith(".") and one.title
+            assert one.title
             for scale in (FULL, QUICK, TINY):
                 points = one.points(scale, BenchOptions())
                 names = {point.name for point in points}
@@ -194,7 +194,7 @@ def test_results_name_a_dataset_and_not_where_it_lies(tmp_path: Path) -> None:
 def test_a_killed_run_resumes_where_it_was(tmp_path: Path) -> None:
     with pytest.raises(KeyboardInterrupt):
         measured(tmp_path, "a", "killed", "c")
-    assert Store(tmp_path / "made-up.jsonl").newest() is None  # not ended
+    assert read_runs(tmp_path / "made-up.jsonl")[-1].seconds is None  # not ended
     calls.clear()
     with pytest.raises(KeyboardInterrupt):  # the same plan, which is killed again
         measured(tmp_path, "a", "killed", "c")
@@ -210,23 +210,23 @@ def test_whatever_is_left_of_a_file_can_be_resumed(
     cut: int, tmp_path_factory: pytest.TempPathFactory
 ) -> None:
     """A kill may cut the file anywhere; what was whole stays, and the run ends the same."""
-    store = Store(tmp_path_factory.mktemp("store") / "x.jsonl")
+    path = tmp_path_factory.mktemp("store") / "x.jsonl"
     wanted = {"a": {"p": {"x": 1.0}, "q": {"x": 2.0}}, "b": {"p": {"x": 3.0}, "q": {"x": 4.0}}}
-    _resume(store, wanted)
-    whole = store.path.read_bytes()
-    store.path.write_bytes(whole[: min(cut, len(whole) - 1)])
-    assert _resume(store, wanted).trials == wanted
-    assert [json.loads(line) for line in store.path.read_text().splitlines()]
+    _resume(path, wanted)
+    whole = path.read_bytes()
+    path.write_bytes(whole[: min(cut, len(whole) - 1)])
+    assert _resume(path, wanted).trials == wanted
+    assert [json.loads(line) for line in path.read_text().splitlines()]
 
 
-def _resume(store: Store, wanted: dict) -> Run:
-    current = store.begin({"points": [{"name": "p"}, {"name": "q"}], "trials": ["a", "b"]})
+def _resume(path: Path, wanted: dict) -> Run:
+    current = begin_run(path, {"points": [{"name": "p"}, {"name": "q"}], "trials": ["a", "b"]})
     for trial in current.missing_trials():
         for point, figures in wanted[trial].items():
-            store.add(current, trial, point, figures)
-    store.write(current, seconds=1.0, notes=["a note"])
-    found = store.newest()
-    assert found is not None and found.notes == ["a note"] and not found.missing_trials()
+            current.add(trial, point, figures)
+    current.write(seconds=1.0, notes=["a note"])
+    found = read_runs(path)[-1]
+    assert found.seconds == 1.0 and found.notes == ["a note"] and not found.missing_trials()
     return found
 
 
@@ -238,7 +238,7 @@ def test_another_file_is_refused(tmp_path: Path) -> None:
             with pytest.raises(
                 TrilightError, match="no rows of `trilight bench`.*expected a file that it wrote"
             ):
-                Store(path).runs()
+                read_runs(path)
 
 
 def test_the_table_has_every_point_and_the_plot_every_kind(tmp_path: Path) -> None:
@@ -285,7 +285,7 @@ def test_a_run_of_versions_resumes_on_other_machines_commits_and_options(
     assert resumed.trials["a"]["cheap"] == {"core_s": 1.0, "db": 30.0}
     other = dataclasses.replace(one, versions=lambda options: {"denoiser": "2"})
     assert run(other, TINY, BenchOptions(data="there"), out) is not resumed
-    assert len(Store(out).runs()) == 2
+    assert len(read_runs(out)) == 2
 
 
 def test_a_name_that_is_there_twice_and_what_is_missing_are_named(tmp_path: Path) -> None:
@@ -437,15 +437,15 @@ def _written(path: Path, looks: list[Look], versions: dict[str, str]) -> None:
         for look in looks
     }
     points = [f"{px} px, {spp} samples" for px, spps in LOOKS.items() for spp in spps]
-    store = Store(path)
-    run = store.begin(
+    run = begin_run(
+        path,
         {
             "experiment": "calibration",
             "machine": {"versions": versions},
             "figures": list(FIGURES),
             "points": [{"name": name} for name in points],
             "trials": list(trials.values()),
-        }
+        },
     )
     by_point = {
         (look.layout, f"{look.px} px, {look.figures['spp']:.0f} samples"): look for look in looks
@@ -453,7 +453,7 @@ def _written(path: Path, looks: list[Look], versions: dict[str, str]) -> None:
     for layout, trial in trials.items():
         for point in points:
             look = by_point.get((layout, point))
-            store.add(run, trial, point, look.figures if look else {})
+            run.add(trial, point, look.figures if look else {})
 
 
 def test_rows_come_to_a_file_that_pictures_are_stated_by_but_those_of_other_versions_do_not(

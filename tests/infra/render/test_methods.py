@@ -28,7 +28,7 @@ from infra.render.plan import (
     plan_render,
 )
 from infra.render.quality import measured_settings
-from infra.render.raw_references import RawReference, true_error, true_error_db
+from infra.render.raw_references import true_error, true_error_db
 from infra.render.run_render import Frame, flicker
 from model.config import SIZES
 from model.inference import NeuralRenderer
@@ -122,13 +122,13 @@ def test_noise_of_the_reference_does_not_count() -> None:
     """Halves with three times the picture's error: 12,288 values leave 0.4 dB open, here thrice."""
     rng = np.random.default_rng(0)
     picture = (_truth() + rng.normal(0, 0.01, (HALF_PX, HALF_PX, 3))).astype(np.float32)
-    halves = RawReference(a_rgb=_noisy(rng, 0.03), b_rgb=_noisy(rng, 0.03))
+    halves = np.stack([_noisy(rng, 0.03), _noisy(rng, 0.03)])
     for curve, metric in ((log10_radiance, psnr_log_db), (clamped_radiance, psnr_linear_db)):
         exact = metric(picture, _truth().astype(np.float32))
         found, open_db = true_error_db(picture, halves, curve, EVERYWHERE)
         assert found == pytest.approx(exact, abs=1.3)
         assert 0.2 < open_db < 0.8, "and it says how much that is"
-        plain = metric(picture, (0.5 * (halves.a_rgb + halves.b_rgb)).astype(np.float32))
+        plain = metric(picture, halves.mean(axis=0).astype(np.float32))
         assert plain < exact - 5, "the mean of the halves would have hidden the picture's error"
 
 
@@ -142,10 +142,8 @@ def test_what_a_reference_leaves_open_is_how_far_its_errors_spread(noise: float)
     picture = (_truth() + rng.normal(0, 0.01, (HALF_PX, HALF_PX, 3))).astype(np.float32)
     found, opens = [], []
     for _ in range(200):
-        a, b = (_truth() + rng.normal(0, noise, (HALF_PX, HALF_PX, 1)) for _ in range(2))
-        error, spread = true_error(
-            picture, RawReference(a_rgb=a, b_rgb=b), clamped_radiance, EVERYWHERE
-        )
+        halves = _truth() + rng.normal(0, noise, (2, HALF_PX, HALF_PX, 1))
+        error, spread = true_error(picture, halves, clamped_radiance, EVERYWHERE)
         found.append(error)
         opens.append(spread)
     assert np.mean(found) == pytest.approx(1e-4, rel=0.1)
@@ -155,13 +153,12 @@ def test_what_a_reference_leaves_open_is_how_far_its_errors_spread(noise: float)
 def test_two_renderers_without_noise() -> None:
     rng = np.random.default_rng(1)
     one, other = (
-        RawReference(a_rgb=factor * _noisy(rng, 0.05), b_rgb=factor * _noisy(rng, 0.05))
-        for factor in (1.0, 1.1)
+        factor * np.stack([_noisy(rng, 0.05), _noisy(rng, 0.05)]) for factor in (1.0, 1.1)
     )
     apart = log10_radiance(_truth()) - log10_radiance(1.1 * _truth())
     exact = -10 * np.log10(np.square(apart).mean())
     assert difference_db(one, other, log10_radiance) == pytest.approx(exact, abs=0.5)
-    same = RawReference(a_rgb=_noisy(rng, 0.05), b_rgb=_noisy(rng, 0.05))
+    same = np.stack([_noisy(rng, 0.05), _noisy(rng, 0.05)])
     assert difference_db(one, same, log10_radiance) > exact + 8
 
 

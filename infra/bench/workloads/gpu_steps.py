@@ -1,8 +1,7 @@
 """Throughput of a device, pictures by the built-in networks, and the steps of a training preset.
 
-Pictures are compared with stored ones of a processor, which finds a GPU with wrong results before
-any time is trusted. The stored ones belong to certain weights, named by their digest: after another
-training of a built-in network, `python -m infra.bench.gpu.steps` renders them again.
+Pictures are compared with those of this machine's processor, which finds a GPU with wrong results
+before any time is trusted.
 
 Batches are synthetic, since the content does not change the time. Where memory is too small, a step
 has fewer scenes. `trilight train --profile` says where the time of a step goes.
@@ -14,27 +13,22 @@ import math
 import statistics
 import time
 from collections.abc import Callable
-from pathlib import Path
-from typing import Any
 
 import numpy as np
 import torch
 from numpy.typing import NDArray
 
 from infra.bench.workloads.named_scenes import cost_scene
+from infra.render.plan import orbit
 from model.config import SIZES, ModelConfig
 from model.costs import Workload, training_flops
 from model.hits.tracing import with_traced
 from model.inference import NeuralRenderer
-from model.open import BUILTIN_NETWORKS
 from model.precision import fast_float32_products
 from model.scene_tensors import SceneTensors, batch_scenes, scene_tensors
 from pipeline.renders.mitsuba_variant import query_gpus
-from storage.conventions import log10_radiance, look_at_c2w, radiance_from_log10
-from storage.digests import sha256_hex
-from storage.errors import TrilightError
-from storage.installation import module_name
 from storage.metrics import psnr_log_db
+from storage.renderer import Camera
 from train.data.buckets import TrainingBatch
 from train.loop.distributed import DistributedContext
 from train.loop.step import Stepper
@@ -43,62 +37,34 @@ from train.loss.training_loss import BLOCKS, Lpips, TrainingLoss
 from train.presets import training_preset
 from train.settings import TrainSettings
 
-NETWORKS = ("builtin:tokens", "builtin:hits")
-STORED = Path(__file__).with_name("twin.npz")
-"""float16 log10(1 + radiance) [64, 64, 3] by network, and the digest of its weights."""
 TRIANGLES = 400
 LIGHTS = 4
 PX = 64
 MORE_VIEWS = 5
 
 
-def twin_figures(network: str, precision: str, device: torch.device) -> dict[str, float]:
-    """Return psnr_log_db of a network's picture to the stored one, and milliseconds of a view.
+def picture_figures(network: str, precision: str, device: torch.device) -> dict[str, float]:
+    """Return psnr_log_db of a network's picture to the processor's, and milliseconds of a view.
 
-    Raises:
-        TrilightError: the stored picture belongs to other weights than the built-in network's.
+    Args:
+        network: name of a built-in network.
+        precision: name of a precision (model.precision); the processor's picture is in float32.
     """
-    with np.load(STORED, allow_pickle=False) as stored:
-        digest = str(stored[f"{network} sha256"])
-        twin = radiance_from_log10(stored[network].astype(np.float64))
-    if digest != (now := _digest(network)):
-        raise TrilightError(
-            f"bench gpu: the stored picture of {network} is by weights of sha256 {digest[:8]}, "
-            f"and {now[:8]} is what this Trilight has; make it again: python -m "
-            f"{module_name('infra.bench.gpu.steps')}."
-        )
-    picture, seconds = _render(network, device, precision)
-    return {"ms": 1e3 * seconds, "db": psnr_log_db(picture, twin)}
+    expected = _first_view(network, torch.device("cpu"), "float32")()
+    view = _first_view(network, device, precision)
+    picture = view()
+    seconds = statistics.median(time_calls(view, device, MORE_VIEWS, warm_up=0))
+    return {"ms": 1e3 * seconds, "db": psnr_log_db(picture, expected)}
 
 
-def _digest(network: str) -> str:
-    return sha256_hex(BUILTIN_NETWORKS[network].read_bytes())
-
-
-def _render(
+def _first_view(
     network: str, device: torch.device, precision: str
-) -> tuple[NDArray[np.float64], float]:
-    """Return the first view of the scene, and the seconds of one more after the warm-up."""
+) -> Callable[[], NDArray[np.float32]]:
+    """Return a function that renders the first view of the scene, [R, R, 3]."""
     renderer = NeuralRenderer.load(network, device=str(device), precision=precision)
     scene = cost_scene(TRIANGLES, LIGHTS)
     prepared = renderer.prepare(scene)
-    pose = scene.c2w[0]
-    fov = float(scene.fov_deg[0])
-    picture = renderer.view(prepared, pose, fov, PX)
-    times = time_calls(
-        lambda: renderer.view(prepared, pose, fov, PX), device, MORE_VIEWS, warm_up=0
-    )
-    return np.asarray(picture, np.float64), float(np.median(times))
-
-
-def store(path: Path = STORED) -> None:
-    """Render the scene by each network on the processor, and write the pictures."""
-    stored_values: dict[str, Any] = {}
-    for network in NETWORKS:
-        picture, _ = _render(network, torch.device("cpu"), "float32")
-        stored_values[network] = log10_radiance(picture).astype(np.float16)
-        stored_values[f"{network} sha256"] = _digest(network)
-    np.savez_compressed(path, **stored_values)
+    return lambda: renderer.view(prepared, scene.c2w[0], float(scene.fov_deg[0]), PX)
 
 
 SHRUNK_PX = 32
@@ -218,19 +184,9 @@ def workloads(settings: TrainSettings, scenes: int) -> list[Workload]:
 def scene_of(workload: Workload) -> SceneTensors:
     """Return two objects in a room with an exact number of triangles, and cameras around them."""
     scene = cost_scene(math.ceil(1.3 * workload.triangles) + 32, LIGHTS)
-    poses = [
-        look_at_c2w(
-            eye=(1.4 + math.cos(6 * angle), math.sin(6 * angle) - 2.2, 1.3),
-            target=(0, 0, 0.35),
-            up=(0, 0, 1),
-        )
-        for angle in np.linspace(0, 1, workload.views, endpoint=False)
-    ]
-    tensors = scene_tensors(
-        scene.with_cameras(
-            np.stack(poses).astype(np.float32), np.full(workload.views, 40.0, np.float32)
-        )
-    )
+    cameras = orbit(scene, Camera.of_scene(scene, 0), workload.views, arc_deg=60)
+    c2w = np.stack([camera.c2w for camera in cameras])
+    tensors = scene_tensors(scene.with_cameras(c2w, scene.fov_deg.repeat(len(cameras))))
     # rows spread over the scene, the room first and the lights last
     rows = torch.linspace(0, tensors.num_triangles - 1, workload.triangles).round().long()
     return dataclasses.replace(
@@ -328,7 +284,3 @@ def time_calls(
             torch.cuda.synchronize(device)
         times.append(time.perf_counter() - began)
     return times[warm_up:]
-
-
-if __name__ == "__main__":
-    store()
