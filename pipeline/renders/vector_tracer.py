@@ -355,7 +355,9 @@ class DeviceSum:
         self._film = tracer._film(camera)
         kinds = [*[mi.Color3d] * tracer._parts.count, *[mi.Float64] * 3]
         self.sums: list[Any] = [dr.opaque(kind, 0, camera.resolution**2) for kind in kinds]
-        """Of each part (Color3d); the squares of `read_squares`; samples; passes (Float64)."""
+        """Sums by pixel: of each part (`split_lights`, Color3d), of samples times squared grey mean
+        over the passes, of samples, and of passes (Float64). Grey is the mean of the three channels
+        of all parts together; its squares give the spread between passes."""
 
     def add(
         self, *, seed: int, spp: int, chosen: Chosen = None, light_seed: int | None = None
@@ -385,21 +387,13 @@ class DeviceSum:
         """
         self._tracer = self._tracer.with_guide()
 
-    def read(self) -> NDArray[np.float64]:
-        """Return the sum over all samples of each part (`split_lights`), [Q, R, R, 3]; else Q = 1.
+    def read(self) -> list[NDArray[np.float64]]:
+        """Return `sums`, [R, R, 3] of each part and [R, R] of all else, once they are traced.
 
-        It is not finite where any sample was not. It waits until they are traced, and equals the
-        sum in float64 of the passes, one by one.
+        They are not finite where any sample was not, and equal sums of the passes, one by one.
         """
-        return np.stack([_picture(self._camera, total) for total in self.sums[:-3]])
-
-    def read_squares(self) -> NDArray[np.float64]:
-        """Return the sum over the passes of samples times squared grey mean, [R, R].
-
-        Grey is the mean of the three channels of all parts together. With `read` it gives the
-        spread between passes.
-        """
-        return read_back(self.sums[-3]).reshape(self._camera.resolution, self._camera.resolution)
+        parts = [_picture(self._camera, total) for total in self.sums[:-3]]
+        return [*parts, *(read_back(total).reshape(parts[0].shape[:2]) for total in self.sums[-3:])]
 
 
 def _learn_guide(record: Scene, scene: KernelScene) -> GuideTable | None:
