@@ -26,7 +26,7 @@ from numpy.typing import ArrayLike, NDArray
 from pipeline.renders.calibrated_error import first_spp
 from pipeline.renders.noise_floor import MeasuredFloor
 from pipeline.renders.pictures import ViewPictures
-from pipeline.renders.preview import FIRST_LOOKS_SPP, preview_steps, usual_filter
+from pipeline.renders.preview import FIRST_LOOKS_SPP, Preview, preview_steps, usual_filter
 from pipeline.renders.samples import (
     DualBuffer,
     Floors,
@@ -103,16 +103,14 @@ class RenderedView:
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
-class GrowingPicture(Sampling):
-    """A picture of the samples so far, for display while it improves."""
+class GrowingPicture(Sampling, Preview):
+    """A picture of the samples so far, for display while it improves.
 
-    radiance_rgb: NDArray[np.float32]
-    """[R, R, 3] linear radiance that half floats can hold."""
-    floor: MeasuredFloor | None
+    Its core-seconds are those of a picture as good as this one, without the looks before it.
+    """
+
+    floor: MeasuredFloor | None = None
     """Measured error of the picture; None if there are too few samples."""
-    core_s: float
-    """Core-seconds that a picture as good as this one takes, without the looks before it and
-    without loading the scene."""
 
 
 def run_to_end(steps: Iterator[Sampling | Result]) -> Result:
@@ -250,14 +248,8 @@ class SceneRenderer:
     def _first_looks(self, camera: PixelCamera, seed: int) -> Iterator[GrowingPicture]:
         for spp in FIRST_LOOKS_SPP:
             preview = run_to_end(preview_steps(self.tracer, camera, seed, spp, usual_filter(spp)))
-            yield GrowingPicture(
-                spp=preview.spp,
-                expected_spp=first_spp(self._settings),
-                missing_db=None,
-                radiance_rgb=preview.radiance_rgb,
-                floor=None,
-                core_s=preview.core_s,
-            )
+            expected = first_spp(self._settings)
+            yield GrowingPicture(**vars(preview), expected_spp=expected, missing_db=None)
 
     def _to_stored(self, pictures: NDArray[np.float32]) -> dict[str, Any]:
         """Return the pictures of a view by their fields: the sum of what is apart, as stored."""
