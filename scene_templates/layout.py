@@ -101,13 +101,3 @@ class Layout:
     """Placements in the order of the shapes."""
     emitters: tuple[Emitter, ...]
     """Outside the room, but for those that the settings put inside objects."""
-
-
-@dataclass(frozen=True, kw_only=True, eq=False)
-class CameraPose:
-    """One proposed camera."""
-
-    c2w: NDArray[np.float64]
-    """[4, 4] camera to world (storage.conventions)."""
-    fov_deg: float
-    """Full field of view in degrees."""

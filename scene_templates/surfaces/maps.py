@@ -77,24 +77,6 @@ class Finish:
         )
 
 
-def finish(base_rgb: ArrayLike, *, specular_share: float, roughness: float, metal: bool) -> Finish:
-    """Return the finish of a base colour.
-
-    Args:
-        base_rgb: [3] in [0, MOST_ALBEDO].
-        specular_share: of the light, what is reflected by the specular lobe.
-        roughness: of that lobe.
-        metal: whether the colour is that of the specular lobe; otherwise that is grey.
-    """
-    base = np.clip(np.asarray(base_rgb, np.float64), 0, MOST_ALBEDO)
-    share = min(specular_share, MOST_ALBEDO)
-    return Finish(
-        diffuse_rgb=(1 - share) * base,
-        specular_rgb=share * (base if metal else np.ones(3)),
-        roughness=np.asarray(roughness, np.float64),
-    )
-
-
 class GlossRanges(TypedDict):
     """Ranges that several finishes share."""
 
@@ -133,16 +115,25 @@ class SurfaceDraws(RecordedSampler):
         roughness: tuple[float, float],
         metal: bool = False,
     ) -> Finish:
-        """Return a finish; natural base colours lie between `low` and `high`."""
+        """Return a finish of one base colour.
+
+        Args:
+            name: of the finish.
+            low, high: ends between which natural base colours lie.
+            specular: range of the share of light that the specular lobe reflects.
+            roughness: range of that of the specular lobe.
+            metal: whether the base colour is that of the specular lobe; otherwise it is grey.
+        """
         least, most = self._albedo
         if self._natural:
             tint = self.colour(f"{name}: tint", (LEAST_TINT,) * 3, (1.0,) * 3)
             base = tint * self.shade(f"{name}: colour", low, high)
         else:
             base = self.colour(f"{name}: any colour", (least,) * 3, (most,) * 3)
-        return finish(
-            base,
-            specular_share=self.uniform(f"{name}: specular share", *specular),
-            roughness=self.uniform(f"{name}: roughness", *roughness),
-            metal=metal,
+        base = np.clip(base, 0, MOST_ALBEDO)
+        share = min(self.uniform(f"{name}: specular share", *specular), MOST_ALBEDO)
+        return Finish(
+            diffuse_rgb=(1 - share) * base,
+            specular_rgb=share * (base if metal else np.ones(3)),
+            roughness=np.asarray(self.uniform(f"{name}: roughness", *roughness)),
         )

@@ -12,8 +12,9 @@ import pytest
 from numpy.typing import NDArray
 
 from scene_templates.exact import Numbers
+from scene_templates.layout import RGB
 from scene_templates.scene_maps import TexturedLook, TextureSettings, draw_look
-from scene_templates.surfaces.maps import MOST_ALBEDO, Finish, SurfaceDraws, SurfaceMaps, finish
+from scene_templates.surfaces.maps import MOST_ALBEDO, Finish, SurfaceDraws, SurfaceMaps
 from scene_templates.surfaces.procedural_textures import (
     OUR_SURFACES,
     SURFACES,
@@ -215,8 +216,16 @@ def test_the_nearest_stone_is_the_nearest(jitter: float) -> None:
     assert (off > 1e-12).mean() < 0.02 and off.max() < 0.3
 
 
-RED = finish((0.8, 0.1, 0.0), specular_share=0.25, roughness=0.6, metal=False)
-GOLD = finish((0.9, 0.7, 0.3), specular_share=0.9, roughness=0.2, metal=True)
+def _finish(base: RGB, *, specular: float, roughness: float, metal: bool) -> Finish:
+    """Return the finish that is drawn with this base colour."""
+    draws = SurfaceDraws(np.random.default_rng(0), natural_share=0.0, albedo=(0.0, 1.0))
+    draws.colour = lambda *_: np.array(base)  # type: ignore[method-assign]
+    ranges = {"specular": (specular, specular), "roughness": (roughness, roughness)}
+    return draws.finish("it", low=base, high=base, metal=metal, **ranges)
+
+
+RED = _finish((0.8, 0.1, 0.0), specular=0.25, roughness=0.6, metal=False)
+GOLD = _finish((0.9, 0.7, 0.3), specular=0.9, roughness=0.2, metal=True)
 
 
 def test_finishes_are_grey_but_for_metal_mixed_by_area_and_toned() -> None:
@@ -225,7 +234,7 @@ def test_finishes_are_grey_but_for_metal_mixed_by_area_and_toned() -> None:
     np.testing.assert_allclose(RED.specular_rgb, [0.25, 0.25, 0.25], rtol=1e-15)
     np.testing.assert_allclose(GOLD.diffuse_rgb, [0.09, 0.07, 0.03], rtol=1e-14)
     np.testing.assert_allclose(GOLD.specular_rgb, [0.81, 0.63, 0.27], rtol=1e-15)
-    white = finish((1.0, 1.0, 2.0), specular_share=1.0, roughness=0.5, metal=False)
+    white = _finish((1.0, 1.0, 2.0), specular=1.0, roughness=0.5, metal=False)
     assert (white.diffuse_rgb + white.specular_rgb).max() < 1
     assert white.specular_rgb.max() == MOST_ALBEDO
     half = RED.covered(GOLD, np.array([[0.0, 1.0], [0.5, 0.5]]))
