@@ -10,7 +10,6 @@ from numpy.typing import NDArray
 from pipeline.renders import preview
 from pipeline.renders.preview import (
     FIRST_LOOKS_SPP,
-    Preview,
     PreviewRenderer,
     PreviewSettings,
     all_parts,
@@ -18,14 +17,14 @@ from pipeline.renders.preview import (
     timed_parts,
     usual_filter,
 )
-from pipeline.renders.renderer import GrowingPicture, RenderedView, SceneRenderer, run_to_end
+from pipeline.renders.renderer import RenderedView, SceneRenderer, run_to_end
 from pipeline.renders.settings import Filtered
 from pipeline.renders.tracer import PixelCamera
 from storage.denoiser import Features
 from storage.errors import Rejected, TrilightError
 from storage.metrics import psnr_log_db
 from storage.records.scene import Scene
-from storage.renderer import Sampling
+from storage.renderer import Image, Sampling
 from tests.pipeline.renders.sampling import Estimate, assert_agree, blocks_of, view_settings
 from tests.pipeline.renders.scene_kit import sampled_like_scene
 from tests.scenes_by_hand import tiny_scene
@@ -39,7 +38,8 @@ def loaded(scene: Scene, spp: int, **changes: Any) -> PreviewRenderer:
 def picture(renderer: PreviewRenderer, scene: Scene, seed: int = 0) -> NDArray[np.float32]:
     steps = renderer.view_steps(scene.c2w[0], float(scene.fov_deg[0]), seed)
     *told, found = steps
-    assert isinstance(found, Preview) and told[-1].spp == found.spp
+    assert isinstance(found, Image) and found.stated_error_db is None
+    assert isinstance(told[-1], Sampling) and told[-1].spp == found.samples
     assert all(isinstance(step, Sampling) and step.missing_db is None for step in told)
     return found.radiance_rgb
 
@@ -141,17 +141,19 @@ def test_the_first_looks_are_previews_and_the_last_picture_is_the_measured_one()
     *steps, last = SceneRenderer(scene, GROWING, shows_looks=True).view_steps(scene.c2w[0], 45.0, 7)
     assert isinstance(last, RenderedView) and last.noise_floor_db == view.noise_floor_db
     np.testing.assert_array_equal(last.radiance_rgb, view.radiance_rgb)
-    seen = [step for step in steps if isinstance(step, GrowingPicture)]
+    assert all(isinstance(step, Sampling) for step in steps)
+    seen = [step.image for step in steps if isinstance(step, Sampling) and step.image]
     few = len(FIRST_LOOKS_SPP)
     for look, spp in zip(seen[:few], FIRST_LOOKS_SPP, strict=True):
         renderer = loaded(scene, spp, denoiser=usual_filter(spp))
         alone = run_to_end(renderer.view_steps(scene.c2w[0], 45.0, 7))
         np.testing.assert_array_equal(look.radiance_rgb, alone.radiance_rgb)
-        assert (look.spp, look.floor) == (spp, None) and look.core_s > 0
+        assert (look.samples, look.stated_error_db) == (spp, None) and (look.cpu_seconds or 0) > 0
     measured = seen[few:]
-    assert measured and [look.spp for look in measured] == sorted({look.spp for look in measured})
-    assert all(look.floor is not None for look in measured)
+    counts = [look.samples or 0 for look in measured]
+    assert counts and counts == sorted(set(counts))
+    assert all(look.stated_error_db is not None for look in measured)
     errors_db = [psnr_log_db(look.radiance_rgb, view.radiance_rgb) for look in seen]
     assert errors_db[few] > errors_db[0] + 3
-    spent = [*(look.core_s for look in measured), last.core_s]
+    spent = [*(look.cpu_seconds or 0 for look in measured), last.core_s]
     assert spent == sorted(spent)
