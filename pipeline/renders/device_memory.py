@@ -97,7 +97,7 @@ def record_launches(function: Callable[..., Any]) -> Callable[..., Any]:
     """
 
     def call(inputs: KernelInputs, _: list[Any], *arguments: Any) -> Any:
-        return function(inputs.objects, *arguments)
+        return function(*inputs.objects, *arguments)
 
     frozen = dr.freeze(call, limit=_MOST_RECORDINGS, warn_after=1 << 30)
 

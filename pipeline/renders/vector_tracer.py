@@ -198,7 +198,7 @@ class VectorTracer:
             numbers = _PassNumbers(camera, seed, spp, self._light_paths)
             films = [self._film(each) for each in cameras]
             inputs = KernelInputs(self._scene, films, self._parts, self._unit, numbers)
-            landed: list[list[Any]] = _land(inputs, camera.resolution)
+            landed: list[list[Any]] = _land(inputs)
             return landed
 
         return self._landed.take(camera, (seed, spp, self._scene.guide is not None), land_on)
@@ -235,11 +235,13 @@ def _with_fields(loaded: _Loaded, **fields: Any) -> _Loaded:
 
 
 class _PassNumbers:
-    """The numbers of a pass, as kernels read them: seeds, and how many light paths there are."""
+    """The numbers of a pass, as kernels read them: its size, seeds, and how many light paths."""
 
     def __init__(self, camera: PixelCamera, seed: int, spp: int, light_paths: float) -> None:
         """Take the numbers of a seed; weights have `light_paths` for each camera path."""
         light_paths *= camera.resolution**2
+        self.resolution = camera.resolution
+        self.spp = spp
         self.count = int(LIGHT_PATHS * camera.resolution**2 * spp)
         self.camera_seed = dr.opaque(mi.UInt32, seed)
         self.light_seed = dr.opaque(mi.UInt32, seed_for(seed, "light paths"))
@@ -248,10 +250,11 @@ class _PassNumbers:
         self.share = dr.opaque(mi.Float64, light_paths / self.count)
 
 
-def land(objects: Any, resolution: int) -> list[list[Any]]:
+def land(
+    scene: Any, films: Sequence[Film], parts: Any, unit: SplatUnit, numbers: _PassNumbers
+) -> list[list[Any]]:
     """Return the light (Color3f) of each lobe that light paths throw on each picture."""
-    scene, films, parts, unit, numbers = objects
-    splats = [[Splats(resolution, unit) for _ in range(parts.num_lobes)] for _ in films]
+    splats = [[Splats(numbers.resolution, unit) for _ in range(parts.num_lobes)] for _ in films]
     record = CameraJoin(films, parts, numbers.light_paths, splats)
     _trace_light_paths(scene, numbers.light_seed, numbers.shifts, numbers.count, record)
     return [
@@ -272,12 +275,14 @@ _land = record_launches(land)
 
 
 @record_launches
-def _add_pass(objects: Any, pixels: Any, resolution: int, spp: int, sums: list[Any]) -> list[Any]:
+def _add_pass(
+    scene: Any, film: Any, parts: Any, light: Any, numbers: Any, pixels: Any, sums: list[Any]
+) -> list[Any]:
     """Return the sums of `DeviceSum` with those of a pass over some pixels.
 
     Light of whole pictures that was traced before (Color3f) is added to what camera paths find.
     """
-    scene, film, parts, light, numbers = objects
+    spp = numbers.spp
     pixel = dr.gather(mi.UInt32, pixels, dr.arange(mi.UInt32, len(pixels) * spp) // spp)
     dr.eval(pixel)  # from its size a replay reads how many lanes there are
     sampler = mi.load_dict({"type": "multijitter", "sample_count": spp})
@@ -290,7 +295,7 @@ def _add_pass(objects: Any, pixels: Any, resolution: int, spp: int, sums: list[A
     dr.eval(traced)  # all parts in one kernel
     means: list[Any] = [_pixel_means(spp, part) for part in traced]
     if not isinstance(light, list):
-        (light,) = land((scene, [film], parts, light, numbers), resolution)
+        (light,) = land(scene, [film], parts, light, numbers)
     gathered = [dr.gather(mi.Color3f, each, pixels) for each in light]
     means = [
         mi.Color3d(part + each)
@@ -306,13 +311,12 @@ def _add_pass(objects: Any, pixels: Any, resolution: int, spp: int, sums: list[A
 
 
 @record_launches
-def _settle(objects: Any) -> Any:
-    return objects[0].num_surfaces + 1
+def _settle(scene: KernelScene) -> Any:
+    return scene.num_surfaces + 1
 
 
 @record_launches
-def _features(objects: Any, resolution: int, spp: int) -> dict[str, Any]:
-    scene, film, parts = objects
+def _features(scene: Any, film: Film, parts: Any, resolution: int, spp: int) -> dict[str, Any]:
     hit, active = _first_hit(scene, film, resolution, spp)
     normal, lobes = scene.table.shading(hit, active)
     mapped = scene.table.mapped_normal(normal, hit, active)
@@ -324,8 +328,7 @@ def _features(objects: Any, resolution: int, spp: int) -> dict[str, Any]:
 
 
 @record_launches
-def _hits(objects: Any, resolution: int) -> Any:
-    scene, film = objects
+def _hits(scene: Any, film: Film, resolution: int) -> Any:
     _, is_met = _first_hit(scene, film, resolution, 1)
     return is_met
 
@@ -378,7 +381,7 @@ class DeviceSum:
         if chosen is not None:
             pixels = own_integers(np.flatnonzero(chosen))
         dr.eval(pixels)  # in memory even where they are all: one kernel serves any choice
-        self.sums = _add_pass(inputs, pixels, camera.resolution, spp, self.sums)
+        self.sums = _add_pass(inputs, pixels, self.sums)
 
     def guide(self) -> None:
         """Let the passes from now on be guided (pipeline.renders.guide_table), if they can be.

@@ -254,7 +254,7 @@ def test_old_scenes_are_not_freed_while_a_call_is_recorded() -> None:
     vars(old)["itself"] = old
     del old
 
-    def double(_: Any, values: Any) -> Any:
+    def double(values: Any) -> Any:
         if gc.isenabled():
             gc.collect()
         return 2 * values
