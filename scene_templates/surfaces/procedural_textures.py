@@ -23,8 +23,9 @@ from scene_templates.surfaces.maps import (
     GlossRanges,
     SurfaceDraws,
     SurfaceMaps,
+    Texels,
+    stones,
 )
-from scene_templates.surfaces.texels import Texels, stones
 from storage.registry import Registry
 from storage.settings.described import checked
 from storage.settings.ranges import Share, Within

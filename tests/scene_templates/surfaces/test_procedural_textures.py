@@ -14,7 +14,14 @@ from numpy.typing import NDArray
 from scene_templates.exact import Numbers
 from scene_templates.layout import RGB
 from scene_templates.scene_maps import TexturedLook, TextureSettings, draw_look
-from scene_templates.surfaces.maps import MOST_ALBEDO, Finish, SurfaceDraws, SurfaceMaps
+from scene_templates.surfaces.maps import (
+    MOST_ALBEDO,
+    Finish,
+    SurfaceDraws,
+    SurfaceMaps,
+    Texels,
+    stones,
+)
 from scene_templates.surfaces.procedural_textures import (
     OUR_SURFACES,
     SURFACES,
@@ -23,7 +30,6 @@ from scene_templates.surfaces.procedural_textures import (
     exceeded_by,
     lay_rows,
 )
-from scene_templates.surfaces.texels import Texels, stones
 from storage.seeds import rng_for
 from storage.settings.overrides import apply_overrides
 from tests.for_each import for_each
