@@ -16,7 +16,7 @@ from typing import Any
 from pipeline.isolation import ChildFailed, ChildLimits, IsolatedChild, Result, with_retries
 from pipeline.renders.mitsuba_variant import Variant, activate, environment
 from pipeline.renders.noise_floor import MeasuredFloor
-from pipeline.renders.preview import PreviewRenderer, PreviewSettings
+from pipeline.renders.preview import PreviewSettings, load_preview
 from pipeline.renders.renderer import RenderedView, SceneRenderer, few_samples_remark, set_threads
 from pipeline.renders.settings import RenderSettings
 from storage.errors import Rejected, Unrenderable
@@ -170,7 +170,7 @@ class RenderWorker:
     def __init__(self, variant: Variant, threads: int) -> None:
         activate(variant)
         set_threads(threads)
-        self._loaded = OrderedDict[int, SceneRenderer | PreviewRenderer]()
+        self._loaded = OrderedDict[int, Callable[..., Iterator[Sampling | RenderedView | Image]]]()
         self._steps: Iterator[Sampling | RenderedView | Image] = iter(())
 
     def wait(self) -> None:
@@ -188,9 +188,10 @@ class RenderWorker:
             self._loaded.popitem(last=False)
         began_s = time.process_time()
         if isinstance(settings, PreviewSettings):
-            self._loaded[number] = PreviewRenderer(scene, settings)
+            self._loaded[number] = load_preview(scene, settings)
         else:
-            self._loaded[number] = SceneRenderer(scene, settings, shows_looks=shows_looks)
+            renderer = SceneRenderer(scene, settings, shows_looks=shows_looks)
+            self._loaded[number] = renderer.view_steps
         return time.process_time() - began_s
 
     def begin_view(self, number: int, c2w: Any, fov_deg: float, seed: int) -> bool:
@@ -198,7 +199,7 @@ class RenderWorker:
         if number not in self._loaded:
             return False
         self._loaded.move_to_end(number)
-        self._steps = self._loaded[number].view_steps(c2w, fov_deg, seed)
+        self._steps = self._loaded[number](c2w, fov_deg, seed)
         return True
 
     def advance(self) -> Sampling | RenderedView | Image:

@@ -66,33 +66,33 @@ class PreviewSettings:
             )
 
 
-class PreviewRenderer:
-    """A scene loaded once, for previews of any of its views."""
+def load_preview(
+    scene: Scene, settings: PreviewSettings
+) -> Callable[[ArrayLike, float, int], Iterator[Sampling | Image]]:
+    """Return `preview_steps` of a pose, an angle and a seed, of a scene that is loaded once.
 
-    def __init__(self, scene: Scene, settings: PreviewSettings) -> None:
-        """Load a scene that passes `Scene.check`; `activate` must have been called.
+    The scene passes `Scene.check`; `activate` must have been called.
 
-        Raises:
-            Rejected: "unlit_scene" or "no_surfaces", as of `SceneRenderer`.
-        """
-        self._settings = settings
-        self._tracer = load_tracer(scene, max_depth=settings.max_depth, rr_depth=settings.rr_depth)
+    Raises:
+        Rejected: "unlit_scene" or "no_surfaces", as of `SceneRenderer`.
+    """
+    tracer = load_tracer(scene, max_depth=settings.max_depth, rr_depth=settings.rr_depth)
 
-    def view_steps(self, c2w: ArrayLike, fov_deg: float, seed: int) -> Iterator[Sampling | Image]:
-        """Yield after each pass, and last the picture; equal arguments give equal bits.
-
-        Raises:
-            Rejected: "nonfinite_radiance" or "radiance_overflow", as of `SceneRenderer`.
-        """
-        settings = self._settings
+    def view_steps(c2w: ArrayLike, fov_deg: float, seed: int) -> Iterator[Sampling | Image]:
         camera = pixel_camera(c2w, fov_deg, settings.resolution)
-        return preview_steps(self._tracer, camera, seed, settings.spp, settings.denoiser)
+        return preview_steps(tracer, camera, seed, settings.spp, settings.denoiser)
+
+    return view_steps
 
 
 def preview_steps(
     tracer: "VectorTracer", camera: PixelCamera, seed: int, spp: int, denoiser: Filtered
 ) -> Iterator[Sampling | Image]:
-    """Do what `PreviewRenderer.view_steps` does, for a scene that a tracer has loaded."""
+    """Yield after each pass, and last the picture; equal arguments give equal bits.
+
+    Raises:
+        Rejected: "nonfinite_radiance" or "radiance_overflow", as of `SceneRenderer`.
+    """
     began_s = time.process_time()
     total = np.zeros((camera.resolution, camera.resolution, 3))
     done = 0

@@ -23,7 +23,7 @@ from pipeline.renders.film import Film, Splats, SplatUnit
 from pipeline.renders.guide_table import GuideCells, GuideTable, PhotonRecords, learn
 from pipeline.renders.kernel_scene import KernelParts, KernelScene, hit_of
 from pipeline.renders.light_tables import EmitterTable, SkyTable
-from pipeline.renders.path_kernel import CameraJoin, trace, trace_light
+from pipeline.renders.path_kernel import join_to_cameras, trace, trace_light
 from pipeline.renders.tracer import Chosen, PixelCamera, split_triangles
 from storage.denoiser import Features
 from storage.records.lights import shining_sky
@@ -255,7 +255,7 @@ def land(
 ) -> list[list[Any]]:
     """Return the light (Color3f) of each lobe that light paths throw on each picture."""
     splats = [[Splats(numbers.resolution, unit) for _ in range(parts.num_lobes)] for _ in films]
-    record = CameraJoin(films, parts, numbers.light_paths, splats)
+    record = functools.partial(join_to_cameras, films, parts, numbers.light_paths, splats)
     _trace_light_paths(scene, numbers.light_seed, numbers.shifts, numbers.count, record)
     return [
         [mi.Color3f(total.picture() * numbers.share) for total in of_film] for of_film in splats
