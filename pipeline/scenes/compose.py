@@ -196,9 +196,9 @@ def _with_sky(
     )
     provenance = dict(scene.provenance)
     if sky is not None:
-        scene = dataclasses.replace(scene, environment=sky.environment)
-        provenance["sky"] = sky.origin
-        uids = uids | ({sky.uid} if sky.uid else set())
+        environment, provenance["sky"], uid = sky
+        scene = dataclasses.replace(scene, environment=environment)
+        uids = uids | ({uid} if uid else set())
     if uids:
         provenance["maps"] = sorted(uids)
     return scene.with_provenance(provenance)

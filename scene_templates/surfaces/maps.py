@@ -6,7 +6,7 @@ of a map with N rows is centred on u = (j + 0.5) / N and v = 1 - (i + 0.5) / N. 
 Mitsuba's arrays have their first row there too; what flips is v, at the border of each format.
 """
 
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 from typing import TypedDict
 
 import numpy as np
@@ -151,16 +151,14 @@ of both albedos stays below 1 by far more than float32 rounds."""
 class SurfaceMaps:
     """A surface that repeats in both directions, in linear colour. What is drawn is square."""
 
-    family: str
-    """Name of the family that it was drawn from, or title of a user's own."""
     diffuse_rgb: NDArray[np.float32]
     """[H, W, 3] diffuse albedo; with the specular one at most 1 in each channel."""
     specular_rgb: NDArray[np.float32]
     """[H, W, 3] specular albedo."""
     roughness: NDArray[np.float32]
     """[H, W, 1] roughness; the GGX width is its square."""
-    source: MapSource = field(default_factory=MapSource)
-    """Whose it is; what is drawn is ours."""
+    source: MapSource
+    """Whose it is, by the title of a user's own; what is drawn is ours, by name of its family."""
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)

@@ -22,7 +22,7 @@ from pipeline.presets.registry import preset_settings
 from scene_templates.families import FAMILIES, Family
 from scene_templates.layout import Emitter, SurfaceLook
 from scene_templates.renderformer_v1 import Policy, stage_1_families, stage_2_families
-from scene_templates.rooms import SIDES, PatchPlacement, SharedRoom, plane_of
+from scene_templates.rooms import SIDES, PatchPlacement, Plane, SharedRoom
 from scene_templates.sample_camera import (
     CameraPath,
     CameraSettings,
@@ -349,7 +349,7 @@ def test_a_single_object_is_placed_evenly_and_rests_half_the_time() -> None:
     radius = np.array([one.layout.objects[0].pose.radius for one in scenes])
     centre = np.stack([one.layout.objects[0].pose.centre for one in scenes])
     lowest = np.array([one.points(0)[:, 2].min() for one in scenes])
-    floors = [plane_of(one.layout.shell[0].positions) for one in scenes]
+    floors = [Plane(one.layout.shell[0].positions) for one in scenes]
     above = [floor.height(one.points(0)).min() for floor, one in zip(floors, scenes, strict=True)]
     rests = np.array(above) < 1e-9  # a floating one comes so near once in 1e8 times
     reach = 0.5 - radius / 2  # beside the open sides by half its radius at most

@@ -311,7 +311,7 @@ def test_ours_are_drawn_equally_often_and_natural_ones_as_often_as_stated() -> N
     settings = SurfaceMapSettings(size=1, natural_share=0.4)
     found = [with_draws(draw_surface, rng_for(seed, "surface"), settings) for seed in range(400)]
     natural = [draws["natural colours"] == (True,) for _, draws in found]
-    families = [maps.family for maps, _ in found]
+    families = [maps.source.name for maps, _ in found]
     even = dict.fromkeys(OUR_SURFACES, 1.0)
     require_plausible({"families": choices(families, even), "natural": share(natural, 0.4)})
     assert SurfaceMapSettings().families == OUR_SURFACES == tuple(SURFACES)
@@ -344,7 +344,7 @@ def test_looks_are_drawn_as_stated() -> None:
         {
             "share": share([look is not None for look in drawn], 0.4),
             "families": choices(
-                [look.maps.family for look in looks], {"checker": 1.0, "stripes": 1.0}
+                [look.maps.source.name for look in looks], {"checker": 1.0, "stripes": 1.0}
             ),
             "width": uniform([look.tile_m for look in looks], *SETTINGS.tile_m),
             "turns": choices([look.quarter_turns for look in looks], dict.fromkeys(range(4), 1.0)),
