@@ -171,8 +171,14 @@ def channel_sum(color: Any) -> Any:
     return color.x + color.y + color.z
 
 
+def _sums(samples: DualBuffer) -> Sums:
+    return [[each.sums for each in half] for half in samples.sums]
+
+
 class DevicePictures(ViewPictures):
     """See `ViewPictures` for the meaning of its methods."""
+
+    _read = staticmethod(_sums)
 
     def _trace_guides(
         self, tracer: VectorTracer, camera: PixelCamera
@@ -199,9 +205,6 @@ class DevicePictures(ViewPictures):
         pictures = read_back(self._make_pictures())
         return pictures.reshape(-1, self._resolution, self._resolution, 3)
 
-    def _begin_look(self) -> None:
-        self._sums = _sums(self._samples)
-
     def _finish(self, filtered: Sequence[Any]) -> Any:
         """Return the pictures of all samples of this look (Float), one after another."""
         return _finish(KernelInputs(self._pixels), self._sums, filtered, self._guides, self._names)
@@ -225,10 +228,6 @@ class DevicePictures(ViewPictures):
         adds, most = np.split(rows, [len(rows) - num_surprises - 1])
         totals = totals.reshape(-1, 6)
         return LookNumbers(totals=totals, adds=adds, sums=adds.sum(axis=1), most=most, logs=logs)
-
-
-def _sums(samples: DualBuffer) -> Sums:
-    return [[each.sums for each in half] for half in samples.sums]
 
 
 @record_launches

@@ -397,6 +397,7 @@ class ViewPictures:
     There are P of them, of lights and of their parts: all parts of the first light come first.
     """
 
+    _read: Any = staticmethod(read_sums)
     hits: NDArray[np.bool_]
     """[R, R] true where `VectorTracer.hits` is."""
     visible: NDArray[np.bool_]
@@ -440,7 +441,7 @@ class ViewPictures:
             Rejected: "nonfinite_radiance" where a raw sample is not finite, "radiance_overflow".
         """
         statement = statement_for(self._settings, self._samples)
-        self._begin_look()
+        self._sums = self._read(self._samples)
         self._picture = None
         self._filtered = self._denoise_raws(quality, of_both=False)
         if statement is None or self._settings.picture_within_db is not None:
@@ -488,9 +489,6 @@ class ViewPictures:
             filtered = self._denoise_raws(self._settings.denoiser, of_both=True)
             self._picture = self._finish(filtered)
         return self._picture
-
-    def _begin_look(self) -> None:
-        self._sums = read_sums(self._samples)
 
     def _finish(self, filtered: Sequence[Any]) -> Any:
         return finish_pictures(self._sums, filtered, None, NUMPY, self._names)

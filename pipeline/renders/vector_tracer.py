@@ -50,24 +50,21 @@ class LandedLight:
         self._waiting = {_view_name(camera): camera for camera in cameras}
         self._kept = dict[tuple[Hashable, Hashable], Any]()
 
-    def begin(self, camera: PixelCamera) -> None:
-        """Begin a view; pictures of those that were begun before it are dropped."""
-        self._waiting.pop(_view_name(camera), None)
-        names = {_view_name(camera), *self._waiting}
-        self._kept = {key: picture for key, picture in self._kept.items() if key[0] in names}
-
     def take(
         self,
         camera: PixelCamera,
         paths: Hashable,
         land: Callable[[Sequence[PixelCamera]], Sequence[Any]],
     ) -> Any:
-        """Return the picture of a view, once.
+        """Return the picture of a view, once; those of views that were asked for before it go.
 
         Args:
             paths: what tells these light paths from others.
             land: returns the picture of each of some cameras.
         """
+        self._waiting.pop(_view_name(camera), None)
+        names = {_view_name(camera), *self._waiting}
+        self._kept = {key: picture for key, picture in self._kept.items() if key[0] in names}
         picture = self._kept.pop((_view_name(camera), paths), None)
         if picture is not None:
             return picture
@@ -180,7 +177,6 @@ class VectorTracer:
         return _picture(camera, sum(means))
 
     def pass_sum(self, camera: PixelCamera) -> "DeviceSum":
-        self._landed.begin(camera)
         return DeviceSum(self, camera)
 
     def _film(self, camera: PixelCamera) -> Film:
