@@ -78,20 +78,6 @@ class Emitter:
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
-class Plane:
-    """The infinite plane of a floor or wall."""
-
-    point: NDArray[np.float64]
-    """[3] a point of it."""
-    normal: NDArray[np.float64]
-    """[3] unit, into the room."""
-
-    def height(self, points: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Return the signed distance of `points` [..., 3] on the side of the room."""
-        return np.einsum("...i,i->...", points - self.point, self.normal)
-
-
-@dataclass(frozen=True, kw_only=True, eq=False)
 class Layout:
     """A scene without its meshes and cameras."""
 
@@ -101,13 +87,3 @@ class Layout:
     """Placements in the order of the shapes."""
     emitters: tuple[Emitter, ...]
     """Outside the room, but for those that the settings put inside objects."""
-
-
-@dataclass(frozen=True, kw_only=True, eq=False)
-class CameraPose:
-    """One proposed camera."""
-
-    c2w: NDArray[np.float64]
-    """[4, 4] camera to world (storage.conventions)."""
-    fov_deg: float
-    """Full field of view in degrees."""

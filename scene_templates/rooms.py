@@ -21,7 +21,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from scene_templates.checks import OFFSET, SHIFT, SIZE, Range
-from scene_templates.layout import Plane
 from scene_templates.rotations import rotate_points, rotation_xyz
 from storage.settings.described import checked
 from storage.settings.ranges import Share, Within
@@ -97,6 +96,21 @@ PATCH_FACES = _patch_faces()
 PATCH_FACES.setflags(write=False)
 
 
+class Plane:
+    """The infinite plane of a floor or wall."""
+
+    def __init__(self, positions: NDArray[np.float64]) -> None:
+        """Take the plane of a patch, vertices [81, 3]."""
+        self._point = positions.mean(axis=0)
+        normal = np.cross(positions[-9] - positions[0], positions[8] - positions[0])
+        self.normal = normal / np.sqrt(np.sum(np.square(normal)))
+        """[3] unit, into the room."""
+
+    def height(self, points: NDArray[np.float64]) -> NDArray[np.float64]:
+        """Return the signed distance of `points` [..., 3] on the side of the room."""
+        return np.einsum("...i,i->...", points - self._point, self.normal)
+
+
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Room:
     """The shell parts in their places, and the space between them for objects."""
@@ -118,7 +132,7 @@ class Room:
     @cached_property
     def planes(self) -> list[Plane]:
         """The plane of each part; objects rest on the first."""
-        return [plane_of(positions) for positions in self.positions]
+        return [Plane(positions) for positions in self.positions]
 
     def centre_range(
         self, points: NDArray[np.float64], radius: float
@@ -196,15 +210,6 @@ def _covering_reach(spin_deg: float, tilt_deg: float) -> float:
     """
     spin = math.radians(spin_deg)
     return (abs(math.cos(spin)) + abs(math.sin(spin))) * (1 + 3 * math.tan(math.radians(tilt_deg)))
-
-
-def plane_of(positions: NDArray[np.float64]) -> Plane:
-    """Return the plane of a floor or wall from its patch, vertices [81, 3]."""
-    origin = positions[0]
-    along = positions[-9]
-    across = positions[8]
-    normal = np.cross(along - origin, across - origin)
-    return Plane(point=positions.mean(axis=0), normal=normal / np.sqrt(np.sum(np.square(normal))))
 
 
 @checked("scene settings")

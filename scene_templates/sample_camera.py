@@ -9,7 +9,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from scene_templates.checks import OFFSET, SIZE, Range, require
-from scene_templates.layout import CameraPose
 from storage.conventions import look_at_c2w
 from storage.settings.described import checked, leaves_out
 from storage.settings.ranges import Within
@@ -117,14 +116,17 @@ def sample_camera(
     settings: CameraSettings,
     sector: Sector,
     position: tuple[float, float] | None = None,
-) -> CameraPose:
-    """Draw one camera pose by look-at. Whether it sees anything is for the caller to find out.
+) -> tuple[NDArray[np.float64], float]:
+    """Draw one camera by look-at. Whether it sees anything is for the caller to find out.
 
     Args:
         rng: where the numbers come from.
         settings: the ranges.
         sector: directions from which the layout is seen.
         position: of the direction in the sector (`Sector.direction_at`); None to draw it.
+
+    Returns:
+        Camera to world [4, 4] (storage.conventions), and the full field of view in degrees.
     """
     if settings.elevation_deg is not None:
         sector = dataclasses.replace(sector, elevation_deg=settings.elevation_deg)
@@ -133,7 +135,4 @@ def sample_camera(
     towards = sector.sample_direction(rng) if position is None else sector.direction_at(*position)
     eye = target + distance * towards
     up = np.array([0, 0, 1]) + rng.uniform(-settings.up_jitter, settings.up_jitter, size=3)
-    return CameraPose(
-        c2w=look_at_c2w(eye=eye, target=target, up=up),
-        fov_deg=float(rng.uniform(*settings.fov_deg)),
-    )
+    return look_at_c2w(eye=eye, target=target, up=up), float(rng.uniform(*settings.fov_deg))

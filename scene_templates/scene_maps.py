@@ -160,7 +160,6 @@ def draw_look(
         if rough is None:
             rough = np.full((*diffuse_rgb.shape[:2], 1), rng.uniform(*clip), np.float32)
         maps = SurfaceMaps(
-            family=chosen.source.name,
             diffuse_rgb=diffuse_rgb,
             specular_rgb=specular_rgb,
             roughness=np.clip(rough, *clip).astype(np.float32),
@@ -179,17 +178,6 @@ LEAST_DISTANCE = 0.5
 """Emitters count as this far from the middle of the room at least, half of its width."""
 
 
-@dataclass(frozen=True, kw_only=True, eq=False)
-class SceneSky:
-    """The sky of a scene."""
-
-    environment: Environment
-    origin: dict[str, Any]
-    """Provenance entries: family, over_lamps and azimuth_deg."""
-    uid: str = ""
-    """Identifier of a user's map in objects.lock.jsonl; empty for a procedural one."""
-
-
 def scene_sky(
     settings: SkySettings,
     emitters: NDArray[np.float64],
@@ -198,7 +186,7 @@ def scene_sky(
     *,
     user_skies: Sequence[UserMap[NDArray[np.float32]]] = (),
     licences: Sequence[str] = (),
-) -> SceneSky | None:
+) -> tuple[Environment, dict[str, Any], str] | None:
     """Return the sky of a scene, or None where it has none.
 
     Args:
@@ -209,6 +197,10 @@ def scene_sky(
         scene_key: its attempt decides which sky, not whether there is one.
         user_skies: the user's own maps.
         licences: of what is in the scene already.
+
+    Returns:
+        The map; provenance entries: family, over_lamps and azimuth_deg; and the identifier of a
+        user's map in objects.lock.jsonl, empty for a procedural one.
     """
     if rng_for(scene_key.seed, "has sky", scene_key.index).random() >= settings.share:
         return None
@@ -238,11 +230,8 @@ def scene_sky(
         source=source,
     )
     azimuth_deg = math.degrees(azimuth_rad)
-    return SceneSky(
-        environment=environment,
-        origin={"family": family, "over_lamps": over_lamps, "azimuth_deg": azimuth_deg},
-        uid=chosen.uid if chosen else "",
-    )
+    origin = {"family": family, "over_lamps": over_lamps, "azimuth_deg": azimuth_deg}
+    return environment, origin, chosen.uid if chosen else ""
 
 
 def lamp_irradiance(emitters: NDArray[np.float64], radiance_rgb: NDArray[np.float64]) -> float:

@@ -56,6 +56,8 @@ class Sampling:
     """Samples at which all targets should be reached, or the cap; a guess that improves."""
     missing_db: float | None
     """The widest gap to a target when the floors were measured last; None before that."""
+    image: "Image | None" = None
+    """Picture of the samples so far, for display while it improves; None at most steps."""
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)

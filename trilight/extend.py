@@ -52,8 +52,8 @@ if TYPE_CHECKING:
     from scene_templates.skies.texels import SkyTexels as SkyTexels
     from scene_templates.surfaces.maps import Finish as Finish
     from scene_templates.surfaces.maps import SurfaceDraws as SurfaceDraws
+    from scene_templates.surfaces.maps import Texels as Texels
     from scene_templates.surfaces.procedural_textures import SURFACES as SURFACES
-    from scene_templates.surfaces.texels import Texels as Texels
     from scene_templates.templates import TEMPLATES as TEMPLATES
     from scene_templates.templates import Template as Template
     from storage.atomic import write_atomically as write_atomically

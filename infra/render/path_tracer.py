@@ -16,12 +16,11 @@ from typing import Any
 from pipeline.isolation import ChildFailed, ChildLimits, IsolatedChild, Result, with_retries
 from pipeline.renders.mitsuba_variant import Variant, activate, environment
 from pipeline.renders.noise_floor import MeasuredFloor
-from pipeline.renders.preview import Preview, PreviewRenderer, PreviewSettings
-from pipeline.renders.renderer import GrowingPicture, RenderedView, SceneRenderer, set_threads
-from pipeline.renders.settings import FIRST_SPP, RenderSettings
+from pipeline.renders.preview import PreviewSettings, load_preview
+from pipeline.renders.renderer import RenderedView, SceneRenderer, few_samples_remark, set_threads
+from pipeline.renders.settings import RenderSettings
 from storage.errors import Rejected, Unrenderable
 from storage.machine import available_cores
-from storage.records.lights import Parts
 from storage.records.material import PUBLISHED_COLUMNS, columns_in_use
 from storage.records.scene import Scene
 from storage.renderer import Camera, Fact, Image, OnProgress, Sampling, ignore_progress
@@ -142,20 +141,21 @@ class SceneInChild:
 
     def render(self, camera: Camera, on_progress: OnProgress = ignore_progress) -> Image:
         """Return the picture of a camera; raises Unrenderable where there is none."""
-        return image_of(self.render_view(camera, on_progress))
+        picture = self.render_view(camera, on_progress)
+        return picture if isinstance(picture, Image) else image_of(picture)
 
     def render_view(
         self, camera: Camera, on_progress: OnProgress = ignore_progress
-    ) -> RenderedView | Preview:
+    ) -> RenderedView | Image:
         """Do what `render` does, and return the picture with all that the path tracer measured."""
         view = (self._arguments[0], camera.c2w, camera.fov_deg, self._seed)
 
-        def trace(child: IsolatedChild) -> RenderedView | Preview:
+        def trace(child: IsolatedChild) -> RenderedView | Image:
             if not child.call_method(RenderWorker.begin_view, *view):
                 self._load(child)
                 child.call_method(RenderWorker.begin_view, *view)
             while isinstance(step := child.call_method(RenderWorker.advance), Sampling):
-                on_progress(image_of(step) if isinstance(step, GrowingPicture) else step)
+                on_progress(step.image or step)
             return step
 
         return self._child.call(f"{self._name}, {camera.name}", trace)
@@ -170,8 +170,8 @@ class RenderWorker:
     def __init__(self, variant: Variant, threads: int) -> None:
         activate(variant)
         set_threads(threads)
-        self._loaded = OrderedDict[int, SceneRenderer | PreviewRenderer]()
-        self._steps: Iterator[Sampling | GrowingPicture | RenderedView | Preview] = iter(())
+        self._loaded = OrderedDict[int, Callable[..., Iterator[Sampling | RenderedView | Image]]]()
+        self._steps: Iterator[Sampling | RenderedView | Image] = iter(())
 
     def wait(self) -> None:
         """Do nothing: a call forces the child to start."""
@@ -188,9 +188,10 @@ class RenderWorker:
             self._loaded.popitem(last=False)
         began_s = time.process_time()
         if isinstance(settings, PreviewSettings):
-            self._loaded[number] = PreviewRenderer(scene, settings)
+            self._loaded[number] = load_preview(scene, settings)
         else:
-            self._loaded[number] = SceneRenderer(scene, settings, shows_looks=shows_looks)
+            renderer = SceneRenderer(scene, settings, shows_looks=shows_looks)
+            self._loaded[number] = renderer.view_steps
         return time.process_time() - began_s
 
     def begin_view(self, number: int, c2w: Any, fov_deg: float, seed: int) -> bool:
@@ -198,10 +199,10 @@ class RenderWorker:
         if number not in self._loaded:
             return False
         self._loaded.move_to_end(number)
-        self._steps = self._loaded[number].view_steps(c2w, fov_deg, seed)
+        self._steps = self._loaded[number](c2w, fov_deg, seed)
         return True
 
-    def advance(self) -> Sampling | GrowingPicture | RenderedView | Preview:
+    def advance(self) -> Sampling | RenderedView | Image:
         """Return the next step, last the picture."""
         step = next(self._steps)
         if not isinstance(step, Sampling):
@@ -209,47 +210,29 @@ class RenderWorker:
         return step
 
 
-def image_of(picture: GrowingPicture | RenderedView | Preview) -> Image:
+def image_of(view: RenderedView) -> Image:
     """Return a picture of the path tracer with its facts."""
-    error_db = None
-    facts: dict[str, Fact] = {"spp": picture.spp}
-    layers_rgb: Parts = {}
-    if isinstance(picture, RenderedView):
-        error_db = picture.noise_floor_db
-        layers_rgb = picture.parts_rgb or {}
-        facts |= _measured_facts(picture)
-    elif isinstance(picture, GrowingPicture) and picture.floor is not None:
-        error_db = picture.floor.log_db
-    remark = ""
-    if error_db is None:
-        remark = "a preview: its error is not measured"
-    elif picture.spp < FIRST_SPP and "expected_error_db" not in facts:
-        remark = f"below {FIRST_SPP} samples the stated error may flatter"
-    return Image(
-        radiance_rgb=picture.radiance_rgb,
-        samples=picture.spp,
-        stated_error_db=error_db,
-        cpu_seconds=picture.core_s,
-        facts=facts,
-        layers_rgb=layers_rgb,
-        remark=remark,
-    )
-
-
-def _measured_facts(view: RenderedView) -> Mapping[str, Fact]:
     stated = MeasuredFloor(
         log_db=view.noise_floor_db,
         linear_db=view.noise_floor_linear_db,
         object_log_db=view.object_noise_floor_db,
     )
-    facts = _floor_facts(stated)
+    facts: dict[str, Fact] = {"spp": view.spp, **_floor_facts(stated)}
     if view.expected_error is not None:
         facts |= _floor_facts(view.expected_error, "expected_error")
     facts["at_cap"] = int(view.at_cap)
     facts["mean_radiance"] = float(f"{view.radiance_rgb.mean(dtype='float64'):.6g}")
     for part, floor in (view.part_floors or {}).items():
         facts |= _floor_facts(floor, prefix=f"{part}.")
-    return facts
+    return Image(
+        radiance_rgb=view.radiance_rgb,
+        samples=view.spp,
+        stated_error_db=view.noise_floor_db,
+        cpu_seconds=view.core_s,
+        facts=facts,
+        layers_rgb=view.parts_rgb or {},
+        remark=few_samples_remark(view.spp) if view.expected_error is None else "",
+    )
 
 
 def _floor_facts(

@@ -27,9 +27,8 @@ from scene_templates.skies.procedural_skies import (
     SkyMapSettings,
 )
 from scene_templates.skies.texels import SkyTexels
-from scene_templates.surfaces.maps import LEAST_TINT, SurfaceDraws
+from scene_templates.surfaces.maps import LEAST_TINT, SurfaceDraws, Texels
 from scene_templates.surfaces.procedural_textures import OUR_SURFACES, SURFACES, SurfaceMapSettings
-from scene_templates.surfaces.texels import Texels
 from storage.markdown import table
 from storage.records.material import PUBLISHED_COLUMNS, laid_out
 from storage.records.passes import MOTION, declared_passes

@@ -34,7 +34,7 @@ from pipeline.renders.mitsuba_variant import Variant, activate
 from pipeline.renders.noise_floor import MeasuredFloor
 from pipeline.renders.renderer import RenderedView, SceneRenderer, set_threads
 from pipeline.scenes.compose import compose_scene
-from pipeline.scenes.triangle_budget import FitTable, PooledAsset, least_triangles
+from pipeline.scenes.triangle_budget import FitTable, ObjectPool, PooledAsset, least_triangles
 from pipeline.scenes.views import ViewCamera, Visibility, cameras_of, cameras_of_view, with_cameras
 from scene_templates.scene_maps import OwnMaps, UserMap, UserTexture
 from scene_templates.settings import SceneSettings
@@ -187,7 +187,7 @@ class AssetMissing(Exception):
         self.asset_name = asset_name
 
 
-class SplitPool(Sequence[PooledAsset]):
+class SplitPool(ObjectPool):
     """The objects of one split, sorted by uid, each opened on access."""
 
     def __init__(self, frozen: ComposedScenes, split: str, store: AssetStore) -> None:

@@ -40,8 +40,7 @@ from pipeline.objects.generated import BENCHMARK
 from pipeline.presets.settings import DatasetPreset, DatasetSettings
 from pipeline.renders.settings import RenderSettings
 from scene_templates.families import Family
-from scene_templates.frozen_v1 import SCENES_V1
-from scene_templates.out_of_range import out_of_range_2_settings, out_of_range_settings
+from scene_templates.frozen_v1 import SCENES_V1, out_of_range_settings
 from scene_templates.renderformer_v1 import Policy, stage_1_families, stage_2_families
 from storage.dataset.settings import SplitSettings, StorageSettings
 from storage.settings.overrides import apply_overrides
@@ -158,7 +157,7 @@ def out_of_range() -> DatasetSettings:
         "renders.min_mean_radiance": 1e-5,
         "splits.scenes_per_shard": 37,
     }
-    scenes = out_of_range_settings(max_triangles=4096)
+    scenes = out_of_range_settings()
     return dataclasses.replace(apply_overrides(SETTINGS_V1, changes), scenes=scenes)
 
 
@@ -168,7 +167,7 @@ def out_of_range_2() -> DatasetSettings:
     It is another set: the first nine axes have the same distribution, and different scenes.
     """
     changes = {"build": "out-of-range-2", "splits.scenes_per_shard": 49}
-    scenes = out_of_range_2_settings(max_triangles=4096)
+    scenes = out_of_range_settings(has_maps=True)
     return dataclasses.replace(apply_overrides(out_of_range(), changes), scenes=scenes)
 
 

@@ -7,7 +7,7 @@ recordings apart, and no recording keeps a scene.
 """
 
 import gc
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from typing import Any
 
 import drjit as dr
@@ -54,46 +54,38 @@ _MOST_RECORDINGS = 64
 
 
 class KernelInputs:
-    """Objects that kernels read. Equal kinds of objects share recordings, whatever arrays hold.
+    """Objects that kernels read in one call, and the key of its recording.
 
-    Floats of Python and arrays of numpy in them are left out: no kernel may read those.
+    Equal kinds of objects share recordings, whatever arrays hold. Floats of Python and arrays of
+    numpy in them are left out: no kernel may read those.
     """
 
     def __init__(self, *objects: Any) -> None:
         """Collect the arrays of objects, of theirs, and so on."""
+        self.objects = objects
         self.arrays: list[Any] = []
-        names = list[Any]()
-        self._collect(objects, names)
-        self.kind = _Kind(tuple(names), objects)
+        self._kind = tuple(self._collect(objects))
 
-    def _collect(self, value: Any, names: list[Any]) -> None:
-        names.append(type(value))
+    def _collect(self, value: Any) -> Iterator[Any]:
+        yield type(value)
         if dr.is_array_v(value) or isinstance(value, mi.Object):
             self.arrays.append(value)
         elif isinstance(value, list | tuple):
-            names.append(len(value))
+            yield len(value)
             for item in value:
-                self._collect(item, names)
+                yield from self._collect(item)
         elif type(value).__module__.startswith(f"{__package__}."):
             for name, item in vars(value).items():
-                names.append(name)
-                self._collect(item, names)
+                yield name
+                yield from self._collect(item)
         elif not isinstance(value, np.ndarray | float):
-            names.append(value)
-
-
-class _Kind:
-    """Key of a recording, and the objects of the current call."""
-
-    def __init__(self, names: tuple[Any, ...], objects: tuple[Any, ...]) -> None:
-        self._names = names
-        self.objects = objects
+            yield value
 
     def __hash__(self) -> int:
-        return hash(self._names)
+        return hash(self._kind)
 
     def __eq__(self, other: object) -> bool:
-        return isinstance(other, _Kind) and other._names == self._names
+        return isinstance(other, KernelInputs) and other._kind == self._kind
 
 
 def record_launches(function: Callable[..., Any]) -> Callable[..., Any]:
@@ -104,8 +96,8 @@ def record_launches(function: Callable[..., Any]) -> Callable[..., Any]:
     of which each lane has one element, but other memory is as large as when it was recorded.
     """
 
-    def call(kind: _Kind, _: list[Any], *arguments: Any) -> Any:
-        return function(kind.objects, *arguments)
+    def call(inputs: KernelInputs, _: list[Any], *arguments: Any) -> Any:
+        return function(*inputs.objects, *arguments)
 
     frozen = dr.freeze(call, limit=_MOST_RECORDINGS, warn_after=1 << 30)
 
@@ -113,10 +105,11 @@ def record_launches(function: Callable[..., Any]) -> Callable[..., Any]:
         collects = gc.isenabled()
         gc.disable()  # to free an old scene cannot be recorded, and would end the process
         try:
-            return frozen(inputs.kind, inputs.arrays, *arguments)
+            return frozen(inputs, inputs.arrays, *arguments)
         finally:
             if collects:
                 gc.enable()
-            inputs.kind.objects = ()  # a recording keeps the kind that it was made with
+            inputs.objects = ()  # a recording keeps the inputs that it was made with
+            inputs.arrays = []
 
     return replay

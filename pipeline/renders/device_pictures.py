@@ -171,17 +171,24 @@ def channel_sum(color: Any) -> Any:
     return color.x + color.y + color.z
 
 
+def _sums(samples: DualBuffer) -> Sums:
+    return [[each.sums for each in half] for half in samples.sums]
+
+
 class DevicePictures(ViewPictures):
     """See `ViewPictures` for the meaning of its methods."""
+
+    _read = staticmethod(_sums)
 
     def _trace_guides(
         self, tracer: VectorTracer, camera: PixelCamera
     ) -> tuple[NDArray[np.bool_], NDArray[np.bool_]]:
         self._resolution = camera.resolution
+        self._pixels = KernelPixels(camera.resolution)
         arrays = tracer.feature_arrays(camera, spp=self._settings.aux_spp)
         hits = tracer.hit_array(camera)
-        kind = self._names or ("",), camera.resolution
-        self._guides, self._masks = _guides(KernelInputs(), arrays, hits, *kind)
+        inputs = KernelInputs(self._pixels)
+        self._guides, self._masks = _guides(inputs, arrays, hits, self._names or ("",))
         self._logs = [dr.opaque(mi.Color3d, 0, camera.resolution**2) for _ in range(2)]
         bits = read_back(self._masks).reshape(camera.resolution, camera.resolution)
         return bits & 1 > 0, bits & 2 > 0
@@ -189,7 +196,8 @@ class DevicePictures(ViewPictures):
     @staticmethod
     def mean_radiance(samples: DualBuffer) -> float:
         resolution = samples.spp_by_half.shape[-1]
-        total, broken = read_back(_brightness(KernelInputs(), _sums(samples), resolution))
+        inputs = KernelInputs(KernelPixels(resolution))
+        total, broken = read_back(_brightness(inputs, _sums(samples)))
         require_finite(int(broken))
         return float(total) / (3 * resolution**2)
 
@@ -197,55 +205,43 @@ class DevicePictures(ViewPictures):
         pictures = read_back(self._make_pictures())
         return pictures.reshape(-1, self._resolution, self._resolution, 3)
 
-    def _begin_look(self) -> None:
-        self._sums = _sums(self._samples)
-
     def _finish(self, filtered: Sequence[Any]) -> Any:
         """Return the pictures of all samples of this look (Float), one after another."""
-        arrays = self._sums, filtered, self._guides
-        return _finish(KernelInputs(), *arrays, self._names, self._resolution)
+        return _finish(KernelInputs(self._pixels), self._sums, filtered, self._guides, self._names)
 
     def _denoise_raws(self, quality: Filtered, *, of_both: bool) -> Sequence[Any]:
         if quality == "off":
             return []
-        raws = _raws(KernelInputs(), self._sums, self._names, of_both, self._resolution)
+        raws = _raws(KernelInputs(self._pixels), self._sums, self._names, of_both)
         pictures = range(sum(len(tracer) - 3 for tracer in self._sums[0]))
         guides = [self._guides[name] for _, name in to_filter(pictures, self._names)]
         return [denoise_arrays(raw, guides, self._resolution, quality) for raw in raws]
 
     def _numbers(self, finished: Any) -> LookNumbers:
         picture = [] if finished is None else [finished]
-        arrays = self._filtered, self._guides, self._masks, self._logs, picture
-        kind = self._names, self._groups(), self._resolution
-        numbers, logs = _measure(KernelInputs(), self._sums, *arrays, *kind)
+        arrays = self._sums, self._filtered, self._guides, self._masks, self._logs, picture
+        groups = self._groups()
+        numbers, logs = _measure(KernelInputs(self._pixels), *arrays, self._names, groups)
         totals, tiles = np.split(read_back(numbers), [6 * len(METRICS) if picture else 0])
         rows = tiles.reshape(-1, len(self._counts[0]))
-        num_surprises = 3 if picture else 3 * len(kind[1])
+        num_surprises = 3 if picture else 3 * len(groups)
         adds, most = np.split(rows, [len(rows) - num_surprises - 1])
         totals = totals.reshape(-1, 6)
         return LookNumbers(totals=totals, adds=adds, sums=adds.sum(axis=1), most=most, logs=logs)
 
 
-def _sums(samples: DualBuffer) -> Sums:
-    return [[each.sums for each in half] for half in samples.sums]
-
-
 @record_launches
-def _brightness(_: Any, sums: Sums, resolution: int) -> Any:
+def _brightness(pixels: KernelPixels, sums: Sums) -> Any:
     """Return the sum of all channels of the mean of both halves, and the broken pixels."""
-    pixels = KernelPixels(resolution)
     of_halves = [add_up(half) for half in half_means(sums, pixels)]
     return pixels.totals([channel_sum(add_up(of_halves)) / 2, broken_pixels(sums, pixels)])
 
 
 @record_launches
 def _guides(
-    _: Any, arrays: dict[str, Any], hits: Any, names: Sequence[str], resolution: int
+    _: KernelPixels, arrays: dict[str, Any], hits: Any, names: Sequence[str]
 ) -> tuple[Any, Any]:
-    """Return albedo and normal by the name of a part, as `Features.of_part`, and hits and shown.
-
-    Only `resolution` tells recordings of other sizes apart.
-    """
+    """Return albedo and normal by the name of a part, as `Features.of_part`, and hits and shown."""
     normal: Any = mi.Color3f(arrays["normal"])
     guides = dict[str, Any]()
     for name in names:
@@ -262,19 +258,17 @@ def _guides(
 
 
 @record_launches
-def _raws(
-    _: Any, sums: Sums, names: Sequence[str], of_both: bool, resolution: int
-) -> list[list[Any]]:
+def _raws(pixels: KernelPixels, sums: Sums, names: Sequence[str], of_both: bool) -> list[list[Any]]:
     """Return what the denoiser is asked for, of each half or of both (Float, pixel by pixel)."""
     return [
         [dr.ravel(picture) for picture, _ in to_filter(pictures, names)]
-        for pictures in means(sums, KernelPixels(resolution), of_both=of_both)
+        for pictures in means(sums, pixels, of_both=of_both)
     ]
 
 
 @record_launches
 def _measure(
-    _: Any,
+    pixels: KernelPixels,
     sums: Sums,
     filtered: list[list[Any]],
     guides: dict[str, Any],
@@ -283,13 +277,11 @@ def _measure(
     finished: list[Any],
     names: Sequence[str],
     groups: Sequence[Group],
-    resolution: int,
 ) -> tuple[Any, list[Any]]:
     """Return the totals and rows of numbers of all tiles of `measure_pixels` (Float64), and logs.
 
     What is added up comes first, and then what is greatest.
     """
-    pixels = KernelPixels(resolution)
     picture = dr.unravel(mi.Color3f, finished[0]) if finished else None
     totals, adds, most, new_logs = measure_pixels(
         pixels, names, groups, sums, filtered, guides, (masks & 1) > 0, logs, picture
@@ -302,15 +294,10 @@ def _measure(
 
 @record_launches
 def _finish(
-    _: Any,
-    sums: Sums,
-    filtered: list[list[Any]],
-    guides: dict[str, Any],
-    names: Sequence[str],
-    resolution: int,
+    pixels: KernelPixels, sums: Sums, filtered: Any, guides: dict[str, Any], names: Sequence[str]
 ) -> Any:
     """Return the pictures of all samples (Float), one after another."""
-    pictures = finish_pictures(sums, filtered, guides, KernelPixels(resolution), names)
+    pictures = finish_pictures(sums, filtered, guides, pixels, names)
     flat: list[Any] = [dr.ravel(picture) for picture in pictures]
     return dr.concat(flat)
 

@@ -323,9 +323,7 @@ def llvm_libraries() -> list[Path]:
     candidates = {
         path.resolve()
         for pattern in _FOLDERS
-        for folder in Path("/").glob(pattern.lstrip("/"))
-        for name in ("libLLVM*.so*", "libLLVM*.dylib")
-        for path in folder.glob(name)
+        for path in Path("/").glob(f"{pattern[1:]}/libLLVM*")
         if _NAME.match(path.name)
     }
     ordered = sorted(candidates, key=lambda path: (-_version_in_name(path), str(path)))

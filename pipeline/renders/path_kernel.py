@@ -346,7 +346,7 @@ def trace_light(
         emitter: where the path of each lane begins.
         u_direction: Point2f, uniform, for the directions in which they leave.
         sampler: mi.Sampler with a lane for each path.
-        record: `CameraJoin` or `PhotonRecords`.
+        record: `join_to_cameras` with its cameras, or `PhotonRecords`.
     """
     direction = scene.cone.sample(emitter.position, emitter.geometric_normal, u_direction)
     leaving = scene.cone.pdf(emitter.position, emitter.geometric_normal, direction)
@@ -387,61 +387,51 @@ def trace_light(
         active &= is_met
 
 
-class CameraJoin:
-    """Adds the light that lands to `splats`: radiance times the samples of a pixel.
+def join_to_cameras(
+    films: Sequence[Film],
+    parts: KernelParts,
+    light_paths: Any,
+    splats: Sequence[Sequence[Splats]],
+    scene: KernelScene,
+    arrival: Arrival,
+) -> None:
+    """Add the light that lands to `splats`: radiance times the samples of a pixel.
 
-    Not a dataclass: Dr.Jit would take its arrays for loop variables.
+    Args:
+        films: the cameras that each path is joined to.
+        parts: what is kept apart; all light that lands is indirect.
+        light_paths: Float, light paths for each sample of a pixel, the same as of `trace`.
+        splats: for each camera, the sum of each lobe, or of both.
+        scene: of the paths.
+        arrival: their vertices, of which those that a picture shows add to it.
     """
-
-    def __init__(
-        self,
-        films: Sequence[Film],
-        parts: KernelParts,
-        light_paths: Any,
-        splats: Sequence[Sequence[Splats]],
-    ) -> None:
-        """Join each path to some cameras.
-
-        Args:
-            films: the cameras that each path is joined to.
-            parts: what is kept apart; all light that lands is indirect.
-            light_paths: Float, light paths for each sample of a pixel, the same as of `trace`.
-            splats: for each camera, the sum of each lobe, or of both.
-        """
-        self._films = films
-        self._parts = parts
-        self._light_paths = light_paths
-        self._splats = splats
-
-    def __call__(self, scene: KernelScene, arrival: Arrival) -> None:
-        """Add the light that reaches a vertex to the pictures in which it shows."""
-        vertex = arrival.vertex
-        visible = arrival.active & (vertex.hit.triangle < scene.num_surfaces)
-        landing = visible & (arrival.depth > 1) & (arrival.depth < scene.max_depth)
-        ratio = dr.minimum(dr.hypot(arrival.hit_mis_ratio, arrival.pick_mis_ratio), MAX_MIS_RATIO)
-        # the square root of (hit^2 + pick^2) / land^2, without P and c_1
-        mis_ratio = ratio / self._light_paths
-        for film, sums in zip(self._films, self._splats, strict=True):
-            active = mi.Bool(landing)  # each camera narrows its own
-            to_camera = film.origin - vertex.point.position
-            distance_sq = dr.squared_norm(to_camera)
-            direction = to_camera * dr.rsqrt(distance_sq)
-            local = vertex.frame.to_local(direction)
-            reflected, forward, _ = _evaluate_brdf(scene, vertex, local, active, None)
-            pixels = film.pdf(-direction) * dr.abs(dr.dot(vertex.geometric, local)) / distance_sq
-            share = 1 / (1 + dr.square(pixels * mis_ratio * forward))
-            pixel, inside = film.pixel(vertex.point.position)
-            active &= inside & (dr.max(reflected) > 0)
-            start = off_surface(vertex.point, to_camera)
-            remaining = film.origin - start
-            ray = mi.Ray3f(start, mi.Vector3f(dr.normalize(remaining)))
-            ray.maxt = dr.norm(remaining)
-            active &= ~scene.surfaces.ray_test(ray, active=active)
-            of_diffuse = self._parts.share(*_flip_to_viewer(scene, vertex, local, active))
-            value = reflected * (share * pixels / self._light_paths)
-            values = self._parts.by_lobe(arrival.light * value, of_diffuse)
-            for total, part in zip(sums, values, strict=True):
-                total.add(part, pixel, active)
+    vertex = arrival.vertex
+    visible = arrival.active & (vertex.hit.triangle < scene.num_surfaces)
+    landing = visible & (arrival.depth > 1) & (arrival.depth < scene.max_depth)
+    ratio = dr.minimum(dr.hypot(arrival.hit_mis_ratio, arrival.pick_mis_ratio), MAX_MIS_RATIO)
+    # the square root of (hit^2 + pick^2) / land^2, without P and c_1
+    mis_ratio = ratio / light_paths
+    for film, sums in zip(films, splats, strict=True):
+        active = mi.Bool(landing)  # each camera narrows its own
+        to_camera = film.origin - vertex.point.position
+        distance_sq = dr.squared_norm(to_camera)
+        direction = to_camera * dr.rsqrt(distance_sq)
+        local = vertex.frame.to_local(direction)
+        reflected, forward, _ = _evaluate_brdf(scene, vertex, local, active, None)
+        pixels = film.pdf(-direction) * dr.abs(dr.dot(vertex.geometric, local)) / distance_sq
+        share = 1 / (1 + dr.square(pixels * mis_ratio * forward))
+        pixel, inside = film.pixel(vertex.point.position)
+        active &= inside & (dr.max(reflected) > 0)
+        start = off_surface(vertex.point, to_camera)
+        remaining = film.origin - start
+        ray = mi.Ray3f(start, mi.Vector3f(dr.normalize(remaining)))
+        ray.maxt = dr.norm(remaining)
+        active &= ~scene.surfaces.ray_test(ray, active=active)
+        of_diffuse = parts.share(*_flip_to_viewer(scene, vertex, local, active))
+        value = reflected * (share * pixels / light_paths)
+        values = parts.by_lobe(arrival.light * value, of_diffuse)
+        for total, part in zip(sums, values, strict=True):
+            total.add(part, pixel, active)
 
 
 def bounce(

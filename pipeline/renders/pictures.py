@@ -48,8 +48,7 @@ TILE = TILE_PX * TILE_PX
 """Pixels of a tile."""
 
 Sums = Sequence[Sequence[Sequence[Any]]]
-"""Of each half, and in it of each tracer: the sum of each part, squares, samples and passes, as of
-`DeviceSum.sums`."""
+"""Of each half, and in it of each tracer: `DeviceSum.sums`, or what `DeviceSum.read` returns."""
 
 _CHANNEL_ROWS = 13
 """Rows of a metric in `error_measures`: four values, and three colors by channel."""
@@ -371,17 +370,9 @@ def _require_numbers(numbers: LookNumbers) -> None:
 NUMPY = Pixels()
 
 
-def read_sums(samples: DualBuffer, *, squares: bool = False) -> Sums:
-    """Return the sums of a view, with their squares or 0; raises as `ViewPictures.look`."""
-    sums = [
-        [
-            [*each.read(), each.read_squares() if squares else np.zeros(spp.shape), spp, passes]
-            for each in half
-        ]
-        for half, spp, passes in zip(
-            samples.sums, samples.spp_by_half, samples.passes_by_half, strict=True
-        )
-    ]
+def read_sums(samples: DualBuffer) -> Sums:
+    """Return the sums of a view; raises as `ViewPictures.look`."""
+    sums = [[each.read() for each in half] for half in samples.sums]
     require_finite(int(broken_pixels(sums, NUMPY).sum()))
     return sums
 
@@ -406,6 +397,7 @@ class ViewPictures:
     There are P of them, of lights and of their parts: all parts of the first light come first.
     """
 
+    _read: Any = staticmethod(read_sums)
     hits: NDArray[np.bool_]
     """[R, R] true where `VectorTracer.hits` is."""
     visible: NDArray[np.bool_]
@@ -449,7 +441,7 @@ class ViewPictures:
             Rejected: "nonfinite_radiance" where a raw sample is not finite, "radiance_overflow".
         """
         statement = statement_for(self._settings, self._samples)
-        self._begin_look()
+        self._sums = self._read(self._samples)
         self._picture = None
         self._filtered = self._denoise_raws(quality, of_both=False)
         if statement is None or self._settings.picture_within_db is not None:
@@ -497,9 +489,6 @@ class ViewPictures:
             filtered = self._denoise_raws(self._settings.denoiser, of_both=True)
             self._picture = self._finish(filtered)
         return self._picture
-
-    def _begin_look(self) -> None:
-        self._sums = read_sums(self._samples, squares=len(self._samples.sums[0]) == 1)
 
     def _finish(self, filtered: Sequence[Any]) -> Any:
         return finish_pictures(self._sums, filtered, None, NUMPY, self._names)

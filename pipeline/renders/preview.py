@@ -7,12 +7,11 @@ of samples, so that nothing tells how far it is from the truth, and it says so.
 import time
 from collections import Counter
 from collections.abc import Callable, Iterator
-from dataclasses import dataclass
 from functools import partial
 from typing import TYPE_CHECKING, Annotated, Any, get_args
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
 from pipeline.renders.settings import PASS_SPP, Depth, Filtered, RenderSettings, Resolution
 from pipeline.renders.tracer import PixelCamera, load_tracer, pixel_camera
@@ -20,7 +19,7 @@ from pipeline.renders.view_pictures import representable, require_bounded, requi
 from storage.denoiser import Features, Quality, denoise
 from storage.errors import TrilightError
 from storage.records.scene import Scene
-from storage.renderer import Sampling
+from storage.renderer import Image, Sampling
 from storage.seeds import seed_for
 from storage.settings.described import checked
 from storage.settings.ranges import Within
@@ -67,45 +66,33 @@ class PreviewSettings:
             )
 
 
-@dataclass(frozen=True, kw_only=True, eq=False)
-class Preview:
-    """A picture without a measured error."""
+def load_preview(
+    scene: Scene, settings: PreviewSettings
+) -> Callable[[ArrayLike, float, int], Iterator[Sampling | Image]]:
+    """Return `preview_steps` of a pose, an angle and a seed, of a scene that is loaded once.
 
-    radiance_rgb: NDArray[np.float32]
-    """[R, R, 3] linear radiance that half floats can hold."""
-    spp: int
-    """Number of samples of each pixel."""
-    core_s: float
-    """Core-seconds that the picture took, without loading the scene."""
+    The scene passes `Scene.check`; `activate` must have been called.
 
+    Raises:
+        Rejected: "unlit_scene" or "no_surfaces", as of `SceneRenderer`.
+    """
+    tracer = load_tracer(scene, max_depth=settings.max_depth, rr_depth=settings.rr_depth)
 
-class PreviewRenderer:
-    """A scene loaded once, for previews of any of its views."""
-
-    def __init__(self, scene: Scene, settings: PreviewSettings) -> None:
-        """Load a scene that passes `Scene.check`; `activate` must have been called.
-
-        Raises:
-            Rejected: "unlit_scene" or "no_surfaces", as of `SceneRenderer`.
-        """
-        self._settings = settings
-        self._tracer = load_tracer(scene, max_depth=settings.max_depth, rr_depth=settings.rr_depth)
-
-    def view_steps(self, c2w: ArrayLike, fov_deg: float, seed: int) -> Iterator[Sampling | Preview]:
-        """Yield after each pass, and last the picture; equal arguments give equal bits.
-
-        Raises:
-            Rejected: "nonfinite_radiance" or "radiance_overflow", as of `SceneRenderer`.
-        """
-        settings = self._settings
+    def view_steps(c2w: ArrayLike, fov_deg: float, seed: int) -> Iterator[Sampling | Image]:
         camera = pixel_camera(c2w, fov_deg, settings.resolution)
-        return preview_steps(self._tracer, camera, seed, settings.spp, settings.denoiser)
+        return preview_steps(tracer, camera, seed, settings.spp, settings.denoiser)
+
+    return view_steps
 
 
 def preview_steps(
     tracer: "VectorTracer", camera: PixelCamera, seed: int, spp: int, denoiser: Filtered
-) -> Iterator[Sampling | Preview]:
-    """Do what `PreviewRenderer.view_steps` does, for a scene that a tracer has loaded."""
+) -> Iterator[Sampling | Image]:
+    """Yield after each pass, and last the picture; equal arguments give equal bits.
+
+    Raises:
+        Rejected: "nonfinite_radiance" or "radiance_overflow", as of `SceneRenderer`.
+    """
     began_s = time.process_time()
     total = np.zeros((camera.resolution, camera.resolution, 3))
     done = 0
@@ -119,7 +106,13 @@ def preview_steps(
     require_bounded(float(mean.max()))
     if denoiser != "off":
         mean = denoise(mean, tracer.features(camera, spp=guide_rays(done)), denoiser)
-    yield Preview(radiance_rgb=representable(mean), spp=done, core_s=time.process_time() - began_s)
+    yield Image(
+        radiance_rgb=representable(mean),
+        samples=done,
+        cpu_seconds=time.process_time() - began_s,
+        facts={"spp": done},
+        remark="a preview: its error is not measured",
+    )
 
 
 def pass_sizes(spp: int) -> Iterator[int]:

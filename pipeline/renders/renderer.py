@@ -35,7 +35,7 @@ from pipeline.renders.samples import (
     gaps_db,
     next_spp,
 )
-from pipeline.renders.settings import RenderSettings
+from pipeline.renders.settings import FIRST_SPP, RenderSettings
 from pipeline.renders.tracer import PixelCamera, load_tracer, pixel_camera
 from pipeline.renders.view_pictures import MeasuredLook, representable
 from storage.denoiser import set_denoiser_threads
@@ -49,7 +49,7 @@ from storage.records.lights import (
     sum_of_lights,
 )
 from storage.records.scene import Scene
-from storage.renderer import Sampling
+from storage.renderer import Image, Sampling
 
 Result = TypeVar("Result")
 
@@ -102,17 +102,9 @@ class RenderedView:
     """Measured error of each of `lights_rgb`."""
 
 
-@dataclass(frozen=True, kw_only=True, eq=False)
-class GrowingPicture(Sampling):
-    """A picture of the samples so far, for display while it improves."""
-
-    radiance_rgb: NDArray[np.float32]
-    """[R, R, 3] linear radiance that half floats can hold."""
-    floor: MeasuredFloor | None
-    """Measured error of the picture; None if there are too few samples."""
-    core_s: float
-    """Core-seconds that a picture as good as this one takes, without the looks before it and
-    without loading the scene."""
+def few_samples_remark(spp: int) -> str:
+    """Return the remark beside a picture whose error is a bound; empty for enough samples."""
+    return f"below {FIRST_SPP} samples the stated error may flatter" if spp < FIRST_SPP else ""
 
 
 def run_to_end(steps: Iterator[Sampling | Result]) -> Result:
@@ -135,9 +127,10 @@ class SceneRenderer:
 
         Args:
             shows_looks: whether `view_steps` yields pictures that appear at once and then improve:
-                previews of few samples, whose error is unknown, and a `GrowingPicture` after each
-                measurement by which a target is missed, each of which costs one denoise. The
-                picture at the end is the same, bit by bit.
+                previews of few samples, whose error is unknown, and one after each measurement by
+                which a target is missed, which costs one denoise. Their CPU seconds are those of a
+                picture as good, without the looks before it. The picture at the end is the same,
+                bit by bit.
             light_seed: of the light paths of all views, where the settings let them share these;
                 None: each view has its own.
 
@@ -247,17 +240,11 @@ class SceneRenderer:
             **stored,
         )
 
-    def _first_looks(self, camera: PixelCamera, seed: int) -> Iterator[GrowingPicture]:
+    def _first_looks(self, camera: PixelCamera, seed: int) -> Iterator[Sampling]:
+        expected = first_spp(self._settings)
         for spp in FIRST_LOOKS_SPP:
-            preview = run_to_end(preview_steps(self.tracer, camera, seed, spp, usual_filter(spp)))
-            yield GrowingPicture(
-                spp=preview.spp,
-                expected_spp=first_spp(self._settings),
-                missing_db=None,
-                radiance_rgb=preview.radiance_rgb,
-                floor=None,
-                core_s=preview.core_s,
-            )
+            image = run_to_end(preview_steps(self.tracer, camera, seed, spp, usual_filter(spp)))
+            yield Sampling(spp=spp, expected_spp=expected, missing_db=None, image=image)
 
     def _to_stored(self, pictures: NDArray[np.float32]) -> dict[str, Any]:
         """Return the pictures of a view by their fields: the sum of what is apart, as stored."""
@@ -301,13 +288,16 @@ class SceneRenderer:
                 radiance_rgb = self._to_stored(pictures.finish())["radiance_rgb"]
                 core_s = time.process_time() - self._began_s
                 self._began_s += time.process_time() - looked_s  # to be shown takes a view no time
-                yield GrowingPicture(
-                    spp=samples.spp,
-                    expected_spp=expected,
-                    missing_db=missing_db,
+                image = Image(
                     radiance_rgb=radiance_rgb,
-                    floor=look.floor,
-                    core_s=core_s,
+                    samples=samples.spp,
+                    stated_error_db=look.floor.log_db,
+                    cpu_seconds=core_s,
+                    facts={"spp": samples.spp},
+                    remark=few_samples_remark(samples.spp),
+                )
+                yield Sampling(
+                    spp=samples.spp, expected_spp=expected, missing_db=missing_db, image=image
                 )
             if expected >= _GUIDED_SPP:
                 samples.guide()

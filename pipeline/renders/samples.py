@@ -70,10 +70,8 @@ class DualBuffer:
         """Of each half, and in it of each tracer."""
         self.is_guided = False
         """True once a pass may be guided."""
-        self.spp_by_half, self.passes_by_half = np.zeros(
-            (2, 2, camera.resolution, camera.resolution), np.int64
-        )
-        """[2, R, R] samples and passes of each pixel in each half."""
+        self.spp_by_half = np.zeros((2, camera.resolution, camera.resolution), np.int64)
+        """[2, R, R] samples of each pixel in each half."""
         self._passes = 0
         self.counted = np.ones(self.spp_by_half.shape[1:], bool)
         """[R, R] pixels over which `spp` is a mean: at first all."""
@@ -127,7 +125,6 @@ class DualBuffer:
         for tracer in self.sums[half]:
             tracer.add(seed=seed, spp=size, chosen=chosen, light_seed=light_seed)
         self.spp_by_half[half] += size if chosen is None else size * chosen
-        self.passes_by_half[half] += 1 if chosen is None else chosen
 
     def guide(self) -> None:
         """Let the passes from now on be guided (pipeline.renders.guide_table)."""

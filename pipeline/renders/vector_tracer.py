@@ -23,7 +23,7 @@ from pipeline.renders.film import Film, Splats, SplatUnit
 from pipeline.renders.guide_table import GuideCells, GuideTable, PhotonRecords, learn
 from pipeline.renders.kernel_scene import KernelParts, KernelScene, hit_of
 from pipeline.renders.light_tables import EmitterTable, SkyTable
-from pipeline.renders.path_kernel import CameraJoin, trace, trace_light
+from pipeline.renders.path_kernel import join_to_cameras, trace, trace_light
 from pipeline.renders.tracer import Chosen, PixelCamera, split_triangles
 from storage.denoiser import Features
 from storage.records.lights import shining_sky
@@ -50,24 +50,21 @@ class LandedLight:
         self._waiting = {_view_name(camera): camera for camera in cameras}
         self._kept = dict[tuple[Hashable, Hashable], Any]()
 
-    def begin(self, camera: PixelCamera) -> None:
-        """Begin a view; pictures of those that were begun before it are dropped."""
-        self._waiting.pop(_view_name(camera), None)
-        names = {_view_name(camera), *self._waiting}
-        self._kept = {key: picture for key, picture in self._kept.items() if key[0] in names}
-
     def take(
         self,
         camera: PixelCamera,
         paths: Hashable,
         land: Callable[[Sequence[PixelCamera]], Sequence[Any]],
     ) -> Any:
-        """Return the picture of a view, once.
+        """Return the picture of a view, once; those of views that were asked for before it go.
 
         Args:
             paths: what tells these light paths from others.
             land: returns the picture of each of some cameras.
         """
+        self._waiting.pop(_view_name(camera), None)
+        names = {_view_name(camera), *self._waiting}
+        self._kept = {key: picture for key, picture in self._kept.items() if key[0] in names}
         picture = self._kept.pop((_view_name(camera), paths), None)
         if picture is not None:
             return picture
@@ -180,7 +177,6 @@ class VectorTracer:
         return _picture(camera, sum(means))
 
     def pass_sum(self, camera: PixelCamera) -> "DeviceSum":
-        self._landed.begin(camera)
         return DeviceSum(self, camera)
 
     def _film(self, camera: PixelCamera) -> Film:
@@ -198,7 +194,7 @@ class VectorTracer:
             numbers = _PassNumbers(camera, seed, spp, self._light_paths)
             films = [self._film(each) for each in cameras]
             inputs = KernelInputs(self._scene, films, self._parts, self._unit, numbers)
-            landed: list[list[Any]] = _land(inputs, camera.resolution)
+            landed: list[list[Any]] = _land(inputs)
             return landed
 
         return self._landed.take(camera, (seed, spp, self._scene.guide is not None), land_on)
@@ -235,11 +231,13 @@ def _with_fields(loaded: _Loaded, **fields: Any) -> _Loaded:
 
 
 class _PassNumbers:
-    """The numbers of a pass, as kernels read them: seeds, and how many light paths there are."""
+    """The numbers of a pass, as kernels read them: its size, seeds, and how many light paths."""
 
     def __init__(self, camera: PixelCamera, seed: int, spp: int, light_paths: float) -> None:
         """Take the numbers of a seed; weights have `light_paths` for each camera path."""
         light_paths *= camera.resolution**2
+        self.resolution = camera.resolution
+        self.spp = spp
         self.count = int(LIGHT_PATHS * camera.resolution**2 * spp)
         self.camera_seed = dr.opaque(mi.UInt32, seed)
         self.light_seed = dr.opaque(mi.UInt32, seed_for(seed, "light paths"))
@@ -248,11 +246,12 @@ class _PassNumbers:
         self.share = dr.opaque(mi.Float64, light_paths / self.count)
 
 
-def land(objects: Any, resolution: int) -> list[list[Any]]:
+def land(
+    scene: Any, films: Sequence[Film], parts: Any, unit: SplatUnit, numbers: _PassNumbers
+) -> list[list[Any]]:
     """Return the light (Color3f) of each lobe that light paths throw on each picture."""
-    scene, films, parts, unit, numbers = objects
-    splats = [[Splats(resolution, unit) for _ in range(parts.num_lobes)] for _ in films]
-    record = CameraJoin(films, parts, numbers.light_paths, splats)
+    splats = [[Splats(numbers.resolution, unit) for _ in range(parts.num_lobes)] for _ in films]
+    record = functools.partial(join_to_cameras, films, parts, numbers.light_paths, splats)
     _trace_light_paths(scene, numbers.light_seed, numbers.shifts, numbers.count, record)
     return [
         [mi.Color3f(total.picture() * numbers.share) for total in of_film] for of_film in splats
@@ -272,12 +271,14 @@ _land = record_launches(land)
 
 
 @record_launches
-def _add_pass(objects: Any, pixels: Any, resolution: int, spp: int, sums: list[Any]) -> list[Any]:
+def _add_pass(
+    scene: Any, film: Any, parts: Any, light: Any, numbers: Any, pixels: Any, sums: list[Any]
+) -> list[Any]:
     """Return the sums of `DeviceSum` with those of a pass over some pixels.
 
     Light of whole pictures that was traced before (Color3f) is added to what camera paths find.
     """
-    scene, film, parts, light, numbers = objects
+    spp = numbers.spp
     pixel = dr.gather(mi.UInt32, pixels, dr.arange(mi.UInt32, len(pixels) * spp) // spp)
     dr.eval(pixel)  # from its size a replay reads how many lanes there are
     sampler = mi.load_dict({"type": "multijitter", "sample_count": spp})
@@ -290,7 +291,7 @@ def _add_pass(objects: Any, pixels: Any, resolution: int, spp: int, sums: list[A
     dr.eval(traced)  # all parts in one kernel
     means: list[Any] = [_pixel_means(spp, part) for part in traced]
     if not isinstance(light, list):
-        (light,) = land((scene, [film], parts, light, numbers), resolution)
+        (light,) = land(scene, [film], parts, light, numbers)
     gathered = [dr.gather(mi.Color3f, each, pixels) for each in light]
     means = [
         mi.Color3d(part + each)
@@ -306,13 +307,12 @@ def _add_pass(objects: Any, pixels: Any, resolution: int, spp: int, sums: list[A
 
 
 @record_launches
-def _settle(objects: Any) -> Any:
-    return objects[0].num_surfaces + 1
+def _settle(scene: KernelScene) -> Any:
+    return scene.num_surfaces + 1
 
 
 @record_launches
-def _features(objects: Any, resolution: int, spp: int) -> dict[str, Any]:
-    scene, film, parts = objects
+def _features(scene: Any, film: Film, parts: Any, resolution: int, spp: int) -> dict[str, Any]:
     hit, active = _first_hit(scene, film, resolution, spp)
     normal, lobes = scene.table.shading(hit, active)
     mapped = scene.table.mapped_normal(normal, hit, active)
@@ -324,8 +324,7 @@ def _features(objects: Any, resolution: int, spp: int) -> dict[str, Any]:
 
 
 @record_launches
-def _hits(objects: Any, resolution: int) -> Any:
-    scene, film = objects
+def _hits(scene: Any, film: Film, resolution: int) -> Any:
     _, is_met = _first_hit(scene, film, resolution, 1)
     return is_met
 
@@ -355,7 +354,9 @@ class DeviceSum:
         self._film = tracer._film(camera)
         kinds = [*[mi.Color3d] * tracer._parts.count, *[mi.Float64] * 3]
         self.sums: list[Any] = [dr.opaque(kind, 0, camera.resolution**2) for kind in kinds]
-        """Of each part (Color3d); the squares of `read_squares`; samples; passes (Float64)."""
+        """Sums by pixel: of each part (`split_lights`, Color3d), of samples times squared grey mean
+        over the passes, of samples, and of passes (Float64). Grey is the mean of the three channels
+        of all parts together; its squares give the spread between passes."""
 
     def add(
         self, *, seed: int, spp: int, chosen: Chosen = None, light_seed: int | None = None
@@ -376,7 +377,7 @@ class DeviceSum:
         if chosen is not None:
             pixels = own_integers(np.flatnonzero(chosen))
         dr.eval(pixels)  # in memory even where they are all: one kernel serves any choice
-        self.sums = _add_pass(inputs, pixels, camera.resolution, spp, self.sums)
+        self.sums = _add_pass(inputs, pixels, self.sums)
 
     def guide(self) -> None:
         """Let the passes from now on be guided (pipeline.renders.guide_table), if they can be.
@@ -385,21 +386,13 @@ class DeviceSum:
         """
         self._tracer = self._tracer.with_guide()
 
-    def read(self) -> NDArray[np.float64]:
-        """Return the sum over all samples of each part (`split_lights`), [Q, R, R, 3]; else Q = 1.
+    def read(self) -> list[NDArray[np.float64]]:
+        """Return `sums`, [R, R, 3] of each part and [R, R] of all else, once they are traced.
 
-        It is not finite where any sample was not. It waits until they are traced, and equals the
-        sum in float64 of the passes, one by one.
+        They are not finite where any sample was not, and equal sums of the passes, one by one.
         """
-        return np.stack([_picture(self._camera, total) for total in self.sums[:-3]])
-
-    def read_squares(self) -> NDArray[np.float64]:
-        """Return the sum over the passes of samples times squared grey mean, [R, R].
-
-        Grey is the mean of the three channels of all parts together. With `read` it gives the
-        spread between passes.
-        """
-        return read_back(self.sums[-3]).reshape(self._camera.resolution, self._camera.resolution)
+        parts = [_picture(self._camera, total) for total in self.sums[:-3]]
+        return [*parts, *(read_back(total).reshape(parts[0].shape[:2]) for total in self.sums[-3:])]
 
 
 def _learn_guide(record: Scene, scene: KernelScene) -> GuideTable | None:

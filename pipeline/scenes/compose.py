@@ -31,7 +31,7 @@ from pipeline.scenes.pieces import (
     with_source_emission,
 )
 from pipeline.scenes.shading_normals import ShadedMesh
-from pipeline.scenes.triangle_budget import PooledAsset, draw_rows, fits_of, levels_within
+from pipeline.scenes.triangle_budget import ObjectPool, PooledAsset, draw_rows, levels_within
 from pipeline.scenes.views import require_valid, with_first_cameras
 from scene_templates.layout import Layout, Pose
 from scene_templates.rotations import rotate_points
@@ -120,7 +120,7 @@ def pose_points(points: NDArray[np.float64], pose: Pose) -> NDArray[np.float32]:
 
 def compose_scene(
     settings: SceneSettings,
-    pool: Sequence[PooledAsset],
+    pool: ObjectPool,
     scene_key: SceneKey,
     *,
     user_maps: OwnMaps = NO_OWN_MAPS,
@@ -128,7 +128,7 @@ def compose_scene(
     """Compose one scene.
 
     Args:
-        pool: the objects of the scene's split, sorted by uid.
+        pool: the objects of the scene's split.
         user_maps: the user's textures and maps of the scene's split.
 
     Returns:
@@ -149,7 +149,7 @@ def compose_scene(
     settings = settings.of_scene(scene_key.index)
     rng = scene_key.rng("scene")
     budget = settings.max_triangles - plan.family.shell_triangles - plan.num_lights
-    chosen = [pool[row] for row in draw_rows(rng, fits_of(pool), plan.num_objects, budget)]
+    chosen = [pool[row] for row in draw_rows(rng, pool.fits, plan.num_objects, budget)]
     levels = levels_within([entry.asset for entry in chosen], budget, settings.enough_error)
     shapes = [
         MeshShape(entry.locked.uid, level, settings.centring)
@@ -196,9 +196,9 @@ def _with_sky(
     )
     provenance = dict(scene.provenance)
     if sky is not None:
-        scene = dataclasses.replace(scene, environment=sky.environment)
-        provenance["sky"] = sky.origin
-        uids = uids | ({sky.uid} if sky.uid else set())
+        environment, provenance["sky"], uid = sky
+        scene = dataclasses.replace(scene, environment=environment)
+        uids = uids | ({uid} if uid else set())
     if uids:
         provenance["maps"] = sorted(uids)
     return scene.with_provenance(provenance)

@@ -333,7 +333,7 @@ def _textures(maps: SurfaceMaps) -> tuple[Texture, Texture, Texture]:
 
     def texture(texels: NDArray[np.uint8], name: str, *, is_srgb: bool = False) -> Texture:
         upwards = np.ascontiguousarray(texels[::-1])
-        source = dataclasses.replace(maps.source, name=f"{maps.family} {name}")
+        source = dataclasses.replace(maps.source, name=f"{maps.source.name} {name}")
         return Texture(texels=upwards, is_srgb=is_srgb, source=source)
 
     return (

@@ -19,7 +19,7 @@ from numpy.typing import NDArray
 from storage.errors import Rejected
 from storage.licences import share_alike_camp
 from storage.records.asset import Asset, Level
-from storage.records.object_index import CampSizes, camp_sizes
+from storage.records.object_index import CampSizes
 from storage.records.objects import LockedObject
 
 _CHUNK = 1 << 16
@@ -41,14 +41,6 @@ class FitTable:
     """Name of each camp by number; "" is for objects without a camp."""
     sizes: Mapping[str, CampSizes]
     """Number and sizes of the objects of each camp that occurs."""
-
-    @classmethod
-    def of(cls, least: Sequence[int], camps: Sequence[str] = ()) -> "FitTable":
-        """Return the table of some objects; without `camps` none has a camp."""
-        names = sorted({*camps}) or [""]
-        sizes = np.array(least, np.int64)
-        numbers = np.array([names.index(camp) for camp in camps] or [0] * len(least), np.int64)
-        return cls(sizes, numbers, names, camp_sizes(sizes, numbers, names))
 
     def size(self, row: int) -> int:
         return int(self.least[row : row + 1][0])
@@ -98,15 +90,11 @@ class PooledAsset:
         return share_alike_camp(self.locked.licence)
 
 
-def fits_of(pool: Sequence[PooledAsset]) -> FitTable:
-    """Return the table from which objects of a pool are drawn.
+class ObjectPool(Sequence[PooledAsset]):
+    """Objects from which scenes are composed, sorted by uid."""
 
-    A pool that opens an object on access has one, `fits`, so that it draws without opening any.
-    """
-    fits: FitTable | None = getattr(pool, "fits", None)
-    return fits or FitTable.of(
-        [least_triangles(entry.asset) for entry in pool], [e.camp for e in pool]
-    )
+    fits: FitTable
+    """Table from which objects are drawn, so that only those drawn are opened."""
 
 
 def draw_rows(

@@ -296,7 +296,5 @@ def _proposal(scene: Scene, settings: SceneSettings, view: int, attempt: int) ->
         of_path = rng_for(seed, f"{purpose} path", *names[:2])
         position = path_position(settings.cameras.path, view, settings.num_views, of_path)
     rng = rng_for(seed, purpose, *names)
-    pose = sample_camera(rng, settings.cameras, TEMPLATES[template].cameras, position)
-    return ViewCamera(
-        c2w=pose.c2w.astype(np.float32), fov_deg=np.float32(pose.fov_deg), attempt=attempt
-    )
+    c2w, fov_deg = sample_camera(rng, settings.cameras, TEMPLATES[template].cameras, position)
+    return ViewCamera(c2w=c2w.astype(np.float32), fov_deg=np.float32(fov_deg), attempt=attempt)

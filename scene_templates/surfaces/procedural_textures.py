@@ -23,8 +23,10 @@ from scene_templates.surfaces.maps import (
     GlossRanges,
     SurfaceDraws,
     SurfaceMaps,
+    Texels,
+    stones,
 )
-from scene_templates.surfaces.texels import Texels, stones
+from storage.records.texture import MapSource
 from storage.registry import Registry
 from storage.settings.described import checked
 from storage.settings.ranges import Share, Within
@@ -478,8 +480,8 @@ def draw_surface(rng: np.random.Generator, settings: SurfaceMapSettings) -> Surf
     full_size = np.zeros((settings.size, settings.size, 1))
     roughness = np.clip(made_of.roughness[..., None] + full_size, *settings.roughness_clip)
     return SurfaceMaps(
-        family=name,
         diffuse_rgb=(made_of.diffuse_rgb + full_size).astype(np.float32),
         specular_rgb=(made_of.specular_rgb + full_size).astype(np.float32),
         roughness=roughness.astype(np.float32),
+        source=MapSource(name=name),
     )

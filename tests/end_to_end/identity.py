@@ -25,7 +25,6 @@ from pipeline.objects.local.folder import list_folder
 from pipeline.presets.registry import DATASET_PRESETS, preset_settings
 from pipeline.presets.settings import DatasetSettings
 from pipeline.renders.mitsuba_variant import vector_extension
-from pipeline.scenes.compose import compose_scene
 from pipeline.scenes.triangle_budget import PooledAsset
 from storage.dataset.dataset import open_dataset
 from storage.dataset.statistics import digest_of_scenes
@@ -39,6 +38,7 @@ from storage.records.scene_file import encode_arrays, encode_scene
 from storage.seeds import SceneKey
 from tests.conftest import ROOT
 from tests.model.check_reference import differences
+from tests.pipeline.scenes.small_pool import composed
 from tests.scenes_by_hand import tiny_scene
 from trilight.scenes import read_scene
 
@@ -91,9 +91,7 @@ def _pool(settings: DatasetSettings, folder: Path) -> list[PooledAsset]:
 def _composed(settings: DatasetSettings, pool: list[PooledAsset], scene_index: int) -> Scene:
     for attempt in range(MAX_ATTEMPTS):
         try:
-            return compose_scene(
-                settings.scenes, pool, SceneKey(settings.seed, scene_index, attempt)
-            )
+            return composed(settings.scenes, pool, SceneKey(settings.seed, scene_index, attempt))
         except Rejected:
             continue
     raise AssertionError(f"scene {scene_index} of the benchmark is rejected")

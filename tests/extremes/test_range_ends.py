@@ -26,7 +26,6 @@ from model.renderformer import RenderFormer
 from model.scene_tensors import MAX_NETWORK_M, SceneBatch, batch_scenes, scene_tensors
 from pipeline.renders.renderer import RenderedView, SceneRenderer
 from pipeline.renders.settings import MAX_SPP
-from pipeline.scenes.compose import compose_scene
 from pipeline.scenes.triangle_budget import PooledAsset
 from scene_templates.families import Family
 from scene_templates.placement import PlacementSettings
@@ -56,7 +55,7 @@ from tests.model.kit import (
 )
 from tests.pipeline.renders.sampling import view_settings
 from tests.pipeline.renders.scene_kit import join, light, material, quad
-from tests.pipeline.scenes.small_pool import BLIND
+from tests.pipeline.scenes.small_pool import BLIND, composed
 from tests.train.kit import stepper, tiny_run
 from tests.train.toy import toy_sample, toy_scene
 from train.data.augment import augment_scene
@@ -136,7 +135,7 @@ def _require_scene_or_reason(
     wanted = apply_overrides(ONE_FAMILY, {**blind, **beside, name: _value(field, end)})
     with case((name, end)):
         try:
-            scene = compose_scene(wanted, pool, SceneKey(0, 0))
+            scene = composed(wanted, pool, SceneKey(0, 0))
         except Rejected as rejection:
             assert rejection.reason == NO_SCENE.get((name, end)), rejection
         else:
@@ -166,7 +165,7 @@ def test_scenes_at_several_ends_keep_their_laws_or_have_a_reason(
     except TrilightError:
         reject()  # laws between fields
     try:
-        require_laws(compose_scene(wanted, pool, SceneKey(0, 0)), wanted)
+        require_laws(composed(wanted, pool, SceneKey(0, 0)), wanted)
     except Rejected as rejection:
         assert rejection.reason in SCENE_REASONS, rejection
 

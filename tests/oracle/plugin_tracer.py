@@ -23,7 +23,7 @@ class HostSum:
     def __init__(self, tracer: Any, camera: PixelCamera) -> None:
         self._tracer, self._camera = tracer, camera
         self._total = np.zeros((camera.resolution, camera.resolution, 3))
-        self._squares = np.zeros((camera.resolution, camera.resolution))
+        self._numbers = np.zeros((3, camera.resolution, camera.resolution))
 
     def add(
         self, *, seed: int, spp: int, chosen: Chosen = None, light_seed: int | None = None
@@ -31,16 +31,14 @@ class HostSum:
         means = self._tracer.radiance(self._camera, seed=seed, spp=spp, chosen=chosen)
         mean = means.astype(np.float64)
         self._total += spp * mean
-        self._squares += spp * np.square(mean.mean(axis=-1))
+        one = np.ones(mean.shape[:2]) if chosen is None else chosen
+        self._numbers += [spp * np.square(mean.mean(axis=-1)), spp * one, one]
 
     def guide(self) -> None:
         """Do nothing: other tracers are not guided."""
 
-    def read(self) -> NDArray[np.float64]:
-        return self._total[None].copy()
-
-    def read_squares(self) -> NDArray[np.float64]:
-        return self._squares.copy()
+    def read(self) -> list[NDArray[np.float64]]:
+        return [self._total.copy(), *self._numbers.copy()]
 
 
 _BLOCK_SIZE = 8

@@ -20,9 +20,9 @@ from scipy import stats
 
 from pipeline.presets.registry import preset_settings
 from scene_templates.families import FAMILIES, Family
-from scene_templates.layout import CameraPose, Emitter, SurfaceLook
+from scene_templates.layout import Emitter, SurfaceLook
 from scene_templates.renderformer_v1 import Policy, stage_1_families, stage_2_families
-from scene_templates.rooms import SIDES, PatchPlacement, SharedRoom, plane_of
+from scene_templates.rooms import SIDES, PatchPlacement, Plane, SharedRoom
 from scene_templates.sample_camera import (
     CameraPath,
     CameraSettings,
@@ -349,7 +349,7 @@ def test_a_single_object_is_placed_evenly_and_rests_half_the_time() -> None:
     radius = np.array([one.layout.objects[0].pose.radius for one in scenes])
     centre = np.stack([one.layout.objects[0].pose.centre for one in scenes])
     lowest = np.array([one.points(0)[:, 2].min() for one in scenes])
-    floors = [plane_of(one.layout.shell[0].positions) for one in scenes]
+    floors = [Plane(one.layout.shell[0].positions) for one in scenes]
     above = [floor.height(one.points(0)).min() for floor, one in zip(floors, scenes, strict=True)]
     rests = np.array(above) < 1e-9  # a floating one comes so near once in 1e8 times
     reach = 0.5 - radius / 2  # beside the open sides by half its radius at most
@@ -403,7 +403,7 @@ def test_lights_hang_evenly_in_their_sector(name: str) -> None:
     require_plausible(table)
 
 
-def _cameras(sector: Sector, **changes: object) -> list[CameraPose]:
+def _cameras(sector: Sector, **changes: object) -> list[tuple[NDArray[np.float64], float]]:
     settings = CameraSettings(**changes)  # type: ignore[arg-type]
     rng = np.random.default_rng(0)
     return [sample_camera(rng, settings, sector) for _ in range(COUNT)]
@@ -411,18 +411,18 @@ def _cameras(sector: Sector, **changes: object) -> list[CameraPose]:
 
 def _camera_table(sector: Sector, **changes: object) -> Table:
     poses = _cameras(sector, **changes)
-    backward = np.stack([pose.c2w[:3, 2] for pose in poses])
-    roll = [_roll(pose.c2w[:3, 1], pose.c2w[:3, 2]) for pose in poses]
+    backward = np.stack([c2w[:3, 2] for c2w, _ in poses])
+    roll = [_roll(c2w[:3, 1], c2w[:3, 2]) for c2w, _ in poses]
     still = _cameras(sector, **{**changes, "target_jitter": 0.0})
     near = _cameras(sector, **{**changes, "distance": (1e-3, 1e-3)})
     table = {
-        "fov": uniform([pose.fov_deg for pose in poses], 30, 60),
-        "distance": uniform([np.linalg.norm(pose.c2w[:3, 3]) for pose in still], 1.5, 2.0),
+        "fov": uniform([fov_deg for _, fov_deg in poses], 30, 60),
+        "distance": uniform([np.linalg.norm(c2w[:3, 3]) for c2w, _ in still], 1.5, 2.0),
         "roll": alike(roll, _roll_twin(sector)),
         **_sector_table(backward, sector),
     }
     for axis in range(3):
-        targets = [pose.c2w[axis, 3] - 1e-3 * pose.c2w[axis, 2] for pose in near]
+        targets = [c2w[axis, 3] - 1e-3 * c2w[axis, 2] for c2w, _ in near]
         table[f"target {axis}"] = uniform(targets, -0.2, 0.2)
     return table
 
@@ -459,7 +459,7 @@ def _directions(path: CameraPath, count: int, seed: int = 0, **changes: object) 
         path_position(path, view, count, np.random.default_rng(seed)) for view in range(count)
     ]
     poses = [sample_camera(rng, settings, TEMPLATES["alone"].cameras, each) for each in positions]
-    return np.stack([pose.c2w[:3, 2] for pose in poses])
+    return np.stack([c2w[:3, 2] for c2w, _ in poses])
 
 
 def _unevenness(directions: NDArray) -> float:

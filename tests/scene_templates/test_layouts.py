@@ -18,9 +18,9 @@ from scene_templates.rooms import (
     PATCH_FACES,
     SIDES,
     TOUCHING,
+    Plane,
     SharedRoom,
     patch,
-    plane_of,
 )
 from scene_templates.sample_layout import sample_layout, scene_plan
 from scene_templates.sample_material import MaterialSettings, sample_material
@@ -72,7 +72,7 @@ def test_objects_do_not_meet_nor_leave_the_room(name: str) -> None:
             assert low / 4 <= placement.pose.radius <= high / 4
             assert np.abs(placement.pose.centre).max() <= 0.75  # the lowest floor stands at -0.7
             for part in one.layout.shell:
-                heights = plane_of(part.positions).height(one.points(row))
+                heights = Plane(part.positions).height(one.points(row))
                 assert heights.min() >= -TOUCHING
     # One scene in ten may overlap, and those of two or three objects mostly do: else the branch
     # above has never been taken, and proves nothing.
@@ -86,7 +86,7 @@ def test_objects_keep_inside_of_parts_that_lean_and_stand_apart() -> None:
     for one in drawn(SceneSettings(families=tuple(families)), 60):
         for row in range(one.plan.num_objects):
             for part in one.layout.shell:
-                assert plane_of(part.positions).height(one.points(row)).min() >= -TOUCHING
+                assert Plane(part.positions).height(one.points(row)).min() >= -TOUCHING
 
 
 def test_a_shape_decides_what_meets() -> None:
@@ -130,7 +130,7 @@ def test_emitters_hang_outside(name: str) -> None:
     for one in _sixty(name):
         shell = one.layout.shell
         reach = max(float(np.linalg.norm(part.positions, axis=1).max()) for part in shell)
-        floor = plane_of(shell[0].positions)
+        floor = Plane(shell[0].positions)
         for emitter in one.layout.emitters:
             centre = emitter.triangle.mean(axis=0)
             assert np.linalg.norm(centre) > min(reach, 1.7)
@@ -205,7 +205,7 @@ def test_parts_are_flat_patches_of_128_faces_that_face_the_room(
             assert part.positions.shape == (81, 3)
             assert part.faces.shape == (128, 3)
             normals = _corner_normals(part.positions)
-            plane = plane_of(part.positions)
+            plane = Plane(part.positions)
             assert np.abs(plane.height(part.positions)).max() < SUM_ROUNDING
             assert (np.einsum("ti,i->t", normals, plane.normal) > 0).all()
             # The room's middle is at most 0.125 from the origin, its sides at least 0.375.
@@ -295,7 +295,7 @@ def test_boxes_turn_one_wall_away_as_published_and_patches_are_exact(policy: Pol
         for part in one_drawn(SceneSettings(families=(family,)), 0).layout.shell:
             if family.template == "open_box":
                 normals = _corner_normals(part.positions, part.faces)
-                inward = np.einsum("tk,k->t", normals, plane_of(part.positions).normal)
+                inward = np.einsum("tk,k->t", normals, Plane(part.positions).normal)
                 turned_away = part.name == "wall2" and policy == "original"
                 assert ((inward < 0) == turned_away).all()
             if "patch" in family.name:

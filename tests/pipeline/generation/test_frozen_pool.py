@@ -24,8 +24,7 @@ from pipeline.generation.scene_worker import AssetMissing, SceneAttempt, SplitPo
 from pipeline.objects.maps.prepared import prepare_map
 from pipeline.presets.registry import preset_settings
 from pipeline.presets.settings import DatasetSettings
-from pipeline.scenes.compose import compose_scene
-from pipeline.scenes.triangle_budget import PooledAsset, draw_rows, fits_of
+from pipeline.scenes.triangle_budget import PooledAsset, draw_rows
 from scene_templates.scene_maps import UserMap, draw_user_map
 from storage.conventions import SPLITS
 from storage.dataset.verify import check_sample
@@ -46,7 +45,7 @@ from tests.infra.child_here import ChildHere
 from tests.pipeline.documents.dataset_by_hand import locked, write_dataset
 from tests.pipeline.generation.frozen_kit import BUILD, SOURCE, asked, begun, frozen, prepared
 from tests.pipeline.objects.maps.test_maps import exr, noise, png, sun_map
-from tests.pipeline.scenes.small_pool import first_scene, small_pool
+from tests.pipeline.scenes.small_pool import ListPool, composed, first_scene, small_pool
 from tests.scenes_by_hand import tiny_sample
 
 NUM_OBJECTS = 30
@@ -91,8 +90,8 @@ def test_scenes_of_opened_objects_are_those_of_objects_in_memory(
     assert [entry.locked for entry in opened] == [entry.locked for entry in whole]
     for room in (30, 60, 200, 5000):  # some objects do not fit, or all do
         draws = [
-            [draw_rows(np.random.default_rng(n), fits_of(pool), 2, room) for n in range(20)]
-            for pool in (opened, whole)
+            [draw_rows(np.random.default_rng(n), pool.fits, 2, room) for n in range(20)]
+            for pool in (opened, ListPool(whole))
         ]
         assert draws[0] == draws[1]
     for index in range(2):
@@ -280,7 +279,7 @@ def test_no_texture_or_map_of_test_is_in_train(
         for index in range(5):
             try:
                 key = SceneKey(0, index)
-                scene = compose_scene(settings.scenes, small_pool(), key, user_maps=own)
+                scene = composed(settings.scenes, small_pool(), key, user_maps=own)
             except Rejected:
                 continue
             scene.check()
@@ -306,8 +305,7 @@ def test_without_own_ones_a_scene_is_what_it_was(accepted: AcceptedMaps) -> None
     plain = preset_settings("smoke", changes=SHARES | changes).scenes
     own = user_maps(accepted.rows, "train")
     first, second = (
-        compose_scene(plain, small_pool(), SceneKey(0, 3), **given)
-        for given in ({}, {"user_maps": own})
+        composed(plain, small_pool(), SceneKey(0, 3), **given) for given in ({}, {"user_maps": own})
     )
     assert [t.sha256 for t in first.textures] == [t.sha256 for t in second.textures]
     assert "maps" not in second.provenance

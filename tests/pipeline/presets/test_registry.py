@@ -232,7 +232,7 @@ def _numbers(settings: SceneSettings, seed: int, index: int) -> np.ndarray:
     found += [surface.diffuse_rgb for surface in surfaces]
     found += [surface.roughness for surface in surfaces]
     found += [value for lamp in layout.emitters for value in (lamp.triangle, lamp.radiance_rgb)]
-    return np.concatenate([np.ravel(value) for value in (*found, camera.c2w, camera.fov_deg)])
+    return np.concatenate([np.ravel(value) for value in (*found, *camera)])
 
 
 def test_a_layout_that_is_registered_later_changes_no_build() -> None:

@@ -256,7 +256,7 @@ def test_the_standard_error_is_that_between_passes() -> None:
         total.add = remembered  # type: ignore[method-assign]
     for _ in samples.passes_to(128):
         pass
-    few = squared_error(read_sums(samples, squares=True), NUMPY)
+    few = squared_error(read_sums(samples), NUMPY)
     assert np.isinf(few).all(), "8 passes are too few"
     for _ in samples.passes_to(256):
         pass
@@ -266,7 +266,7 @@ def test_the_standard_error_is_that_between_passes() -> None:
     weights = np.array([spp for _, spp in asked], np.float64)
     mean = np.tensordot(weights / weights.sum(), greys, 1)
     variance = np.tensordot(weights, np.square(greys - mean), 1) / (len(asked) - 1) / weights.sum()
-    found = np.sqrt(squared_error(read_sums(samples, squares=True), NUMPY))
+    found = np.sqrt(squared_error(read_sums(samples), NUMPY))
     # Differences of sums lose 7 of 16 digits: 1e-4 of the pixel's value is far below its noise.
     np.testing.assert_allclose(found, np.sqrt(variance), rtol=1e-3, atol=1e-4 * mean.max())
 

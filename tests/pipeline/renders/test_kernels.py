@@ -154,9 +154,9 @@ def test_all_views_and_lights_share_one_load(monkeypatch: pytest.MonkeyPatch) ->
 def test_pictures_come_back_only_where_something_is_decided(reads: list[int]) -> None:
     """A pass that is read back makes a graphics card wait for us, and us for it."""
     _render(_smallest(), dataclasses.replace(SETTINGS, min_spp=512, max_spp=512))
-    # Both halves at the first look for black and at the floor, there with their squares; albedo,
-    # normals and hits once.
-    assert len(reads) == 2 + 2 + 3 + 2
+    # Both halves, of four arrays, at the first look for black and at the floor; albedo, normals and
+    # hits once.
+    assert len(reads) == 2 * 4 + 2 * 4 + 3
 
 
 ADAPTIVE = dataclasses.replace(SETTINGS, min_spp=32, max_spp=512, aux_spp=16)
@@ -253,7 +253,7 @@ def test_old_scenes_are_not_freed_while_a_call_is_recorded() -> None:
     vars(old)["itself"] = old
     del old
 
-    def double(_: Any, values: Any) -> Any:
+    def double(values: Any) -> Any:
         if gc.isenabled():
             gc.collect()
         return 2 * values

@@ -1,45 +1,48 @@
 """Previews of any number of samples, the parts that price them, and pictures that grow."""
 
 from collections import Counter
+from collections.abc import Callable, Iterator
 from typing import Any
 
 import numpy as np
 import pytest
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 
 from pipeline.renders import preview
 from pipeline.renders.preview import (
     FIRST_LOOKS_SPP,
-    Preview,
-    PreviewRenderer,
     PreviewSettings,
     all_parts,
+    load_preview,
     preview_parts,
     timed_parts,
     usual_filter,
 )
-from pipeline.renders.renderer import GrowingPicture, RenderedView, SceneRenderer, run_to_end
+from pipeline.renders.renderer import RenderedView, SceneRenderer, run_to_end
 from pipeline.renders.settings import Filtered
 from pipeline.renders.tracer import PixelCamera
 from storage.denoiser import Features
 from storage.errors import Rejected, TrilightError
 from storage.metrics import psnr_log_db
 from storage.records.scene import Scene
-from storage.renderer import Sampling
+from storage.renderer import Image, Sampling
 from tests.pipeline.renders.sampling import Estimate, assert_agree, blocks_of, view_settings
 from tests.pipeline.renders.scene_kit import sampled_like_scene
 from tests.scenes_by_hand import tiny_scene
 
+Steps = Callable[[ArrayLike, float, int], Iterator[Sampling | Image]]
 
-def loaded(scene: Scene, spp: int, **changes: Any) -> PreviewRenderer:
+
+def loaded(scene: Scene, spp: int, **changes: Any) -> Steps:
     settings = PreviewSettings(**{"resolution": 32, "spp": spp, "denoiser": "off", **changes})
-    return PreviewRenderer(scene, settings)
+    return load_preview(scene, settings)
 
 
-def picture(renderer: PreviewRenderer, scene: Scene, seed: int = 0) -> NDArray[np.float32]:
-    steps = renderer.view_steps(scene.c2w[0], float(scene.fov_deg[0]), seed)
+def picture(view_steps: Steps, scene: Scene, seed: int = 0) -> NDArray[np.float32]:
+    steps = view_steps(scene.c2w[0], float(scene.fov_deg[0]), seed)
     *told, found = steps
-    assert isinstance(found, Preview) and told[-1].spp == found.spp
+    assert isinstance(found, Image) and found.stated_error_db is None
+    assert isinstance(told[-1], Sampling) and told[-1].spp == found.samples
     assert all(isinstance(step, Sampling) and step.missing_db is None for step in told)
     return found.radiance_rgb
 
@@ -48,12 +51,12 @@ def picture(renderer: PreviewRenderer, scene: Scene, seed: int = 0) -> NDArray[n
 def test_any_number_of_samples_is_a_picture(spp: int) -> None:
     scene = tiny_scene()
     for denoiser in ("off", "fast", "high"):
-        renderer = loaded(scene, spp, denoiser=denoiser)
-        found = picture(renderer, scene)
+        view_steps = loaded(scene, spp, denoiser=denoiser)
+        found = picture(view_steps, scene)
         assert found.shape == (32, 32, 3) and found.dtype == np.float32
         assert np.isfinite(found).all() and (found >= 0).all() and found.max() > 0
-        np.testing.assert_array_equal(found, picture(renderer, scene))
-        assert not np.array_equal(found, picture(renderer, scene, seed=1))
+        np.testing.assert_array_equal(found, picture(view_steps, scene))
+        assert not np.array_equal(found, picture(view_steps, scene, seed=1))
 
 
 def test_few_samples_have_the_light_of_many() -> None:
@@ -61,8 +64,8 @@ def test_few_samples_have_the_light_of_many() -> None:
     scene = sampled_like_scene(np.random.default_rng(3), num_views=1)
 
     def blocks(spp: int, seeds: range) -> Estimate:
-        renderer = loaded(scene, spp, resolution=16)
-        return blocks_of(np.array([picture(renderer, scene, seed) for seed in seeds]), 4)
+        view_steps = loaded(scene, spp, resolution=16)
+        return blocks_of(np.array([picture(view_steps, scene, seed) for seed in seeds]), 4)
 
     many = blocks(64, range(1000, 1016))
     for spp in (1, 5):
@@ -117,7 +120,7 @@ def test_a_preview_is_made_of_its_parts(
     for spp in (1, 2, 3, 15, 16, 63, 64, 85, 1024, 4096):
         tracer.asked.clear()
         settings = PreviewSettings(resolution=8, spp=spp, denoiser=denoiser)
-        run_to_end(PreviewRenderer(scene, settings).view_steps(scene.c2w[0], 40.0, 0))
+        run_to_end(load_preview(scene, settings)(scene.c2w[0], 40.0, 0))
         assert tracer.asked == preview_parts(spp, denoiser), spp
         assert set(tracer.asked) <= set(all_parts())
 
@@ -141,17 +144,19 @@ def test_the_first_looks_are_previews_and_the_last_picture_is_the_measured_one()
     *steps, last = SceneRenderer(scene, GROWING, shows_looks=True).view_steps(scene.c2w[0], 45.0, 7)
     assert isinstance(last, RenderedView) and last.noise_floor_db == view.noise_floor_db
     np.testing.assert_array_equal(last.radiance_rgb, view.radiance_rgb)
-    seen = [step for step in steps if isinstance(step, GrowingPicture)]
+    assert all(isinstance(step, Sampling) for step in steps)
+    seen = [step.image for step in steps if isinstance(step, Sampling) and step.image]
     few = len(FIRST_LOOKS_SPP)
     for look, spp in zip(seen[:few], FIRST_LOOKS_SPP, strict=True):
-        renderer = loaded(scene, spp, denoiser=usual_filter(spp))
-        alone = run_to_end(renderer.view_steps(scene.c2w[0], 45.0, 7))
+        view_steps = loaded(scene, spp, denoiser=usual_filter(spp))
+        alone = run_to_end(view_steps(scene.c2w[0], 45.0, 7))
         np.testing.assert_array_equal(look.radiance_rgb, alone.radiance_rgb)
-        assert (look.spp, look.floor) == (spp, None) and look.core_s > 0
+        assert (look.samples, look.stated_error_db) == (spp, None) and (look.cpu_seconds or 0) > 0
     measured = seen[few:]
-    assert measured and [look.spp for look in measured] == sorted({look.spp for look in measured})
-    assert all(look.floor is not None for look in measured)
+    counts = [look.samples or 0 for look in measured]
+    assert counts and counts == sorted(set(counts))
+    assert all(look.stated_error_db is not None for look in measured)
     errors_db = [psnr_log_db(look.radiance_rgb, view.radiance_rgb) for look in seen]
     assert errors_db[few] > errors_db[0] + 3
-    spent = [*(look.core_s for look in measured), last.core_s]
+    spent = [*(look.cpu_seconds or 0 for look in measured), last.core_s]
     assert spent == sorted(spent)

@@ -11,12 +11,14 @@ from numpy.typing import NDArray
 
 from pipeline.scenes.compose import compose_scene
 from pipeline.scenes.pieces import ScenePiece, Skin, shell_piece, surface_piece
-from pipeline.scenes.triangle_budget import PooledAsset
+from pipeline.scenes.triangle_budget import FitTable, ObjectPool, PooledAsset, least_triangles
 from scene_templates.layout import ShellPart, SurfaceLook
 from scene_templates.rooms import PATCH_FACES, SIDES, patch
+from scene_templates.scene_maps import OwnMaps
 from scene_templates.settings import SceneSettings
 from storage.errors import Rejected
 from storage.records.asset import Asset, Level, LevelQuality, LevelRecord, SourceFacts
+from storage.records.object_index import camp_sizes
 from storage.records.objects import LockedObject
 from storage.records.scene import ARRAY_FIELDS, Scene, SceneObject
 from storage.seeds import SceneKey
@@ -123,6 +125,30 @@ def small_pool() -> list[PooledAsset]:
     ]
 
 
+def fit_table(least: Sequence[int], camps: Sequence[str] = ()) -> FitTable:
+    """Return the table of some objects; without `camps` none has a camp."""
+    names = sorted({*camps}) or [""]
+    sizes = np.array(least, np.int64)
+    numbers = np.array([names.index(camp) for camp in camps] or [0] * len(least), np.int64)
+    return FitTable(sizes, numbers, names, camp_sizes(sizes, numbers, names))
+
+
+class ListPool(list[PooledAsset], ObjectPool):
+    """A pool whose objects are all in memory."""
+
+    @property
+    def fits(self) -> FitTable:  # type: ignore[override]
+        return fit_table([least_triangles(each.asset) for each in self], [e.camp for e in self])
+
+
+def composed(
+    settings: SceneSettings, pool: Sequence[PooledAsset], key: SceneKey, **user_maps: OwnMaps
+) -> Scene:
+    """Return the scene of a key."""
+    each = pool if isinstance(pool, ObjectPool) else ListPool(pool)
+    return compose_scene(settings, each, key, **user_maps)
+
+
 def floor_piece(look: SurfaceLook, rng: np.random.Generator) -> ScenePiece:
     """Return the floor of a room, of 128 triangles, with a look."""
     positions = patch(SIDES["floor"], STILL)
@@ -148,7 +174,7 @@ def first_scene(
     """Return the first attempt at a scene that is not rejected, as a run does."""
     for attempt in range(16):
         try:
-            return compose_scene(settings, pool, SceneKey(seed, scene_index, attempt))
+            return composed(settings, pool, SceneKey(seed, scene_index, attempt))
         except Rejected:
             continue
     raise AssertionError(f"scene {scene_index} of seed {seed} was rejected sixteen times")

@@ -18,7 +18,6 @@ import pytest
 from pipeline.presets.registry import DATASET_PRESETS, preset_settings
 from pipeline.renders.tracer import choose_tracing_scale
 from pipeline.scenes import triangle_budget
-from pipeline.scenes.compose import compose_scene
 from pipeline.scenes.pieces import shell_piece
 from pipeline.scenes.triangle_budget import (
     FitTable,
@@ -44,9 +43,11 @@ from tests.pipeline.scenes.small_pool import (
     QUALITY,
     SOURCE,
     TOUCH,
+    composed,
     counts_of,
     digest,
     first_scene,
+    fit_table,
     planes_of,
     points_of,
     rows_of,
@@ -63,7 +64,7 @@ def test_attempts_differ_but_keep_what_was_planned(pool: list[PooledAsset]) -> N
         tries = []
         for attempt in range(4):
             with contextlib.suppress(Rejected):
-                scene = compose_scene(SETTINGS, pool, SceneKey(0, index, attempt))
+                scene = composed(SETTINGS, pool, SceneKey(0, index, attempt))
                 tries.append(scene)
         assert len({digest(scene) for scene in tries}) == len(tries) >= 2
         for scene in tries:
@@ -97,7 +98,7 @@ def test_no_build_exceeds_its_budget(
         for index in range(scenes):
             after = settings.of_scene(index)
             with contextlib.suppress(Rejected):
-                scene = compose_scene(settings, pool, SceneKey(2, index))
+                scene = composed(settings, pool, SceneKey(2, index))
                 fullest = max(fullest, scene.num_triangles / after.max_triangles)
                 assert choose_tracing_scale(scene) == 1, "no preset's pictures change by a size"
                 counts, template = counts_of(scene), TEMPLATES[scene.provenance["template"]]
@@ -143,7 +144,7 @@ def test_scenes_keep_the_laws_of_the_record_emitters_objects_and_normals(
 def test_rights_travel_and_names_are_unique(pool: list[PooledAsset]) -> None:
     wall = [entry for entry in pool if entry.locked.uid == "made/wall1"]
     settings = template_settings("corner", {"families.num_objects": [3, 3], "num_views": 1})
-    scene = compose_scene(settings, wall, SceneKey(0, 0))
+    scene = composed(settings, wall, SceneKey(0, 0))
     objects = [entry for entry in scene.objects if entry.kind == "object"]
     assert [entry.name for entry in objects] == ["wall1_2", "wall1_3", "wall1_4"]
     for entry in objects:
@@ -156,7 +157,7 @@ def test_rights_travel_and_names_are_unique(pool: list[PooledAsset]) -> None:
 def test_a_scene_without_objects_is_a_scene(pool: list[PooledAsset]) -> None:
     """The published families have some; a view of one need not show any object."""
     settings = template_settings("open_box", {"families.num_objects": [0, 0]})
-    scene = compose_scene(settings, pool, SceneKey(0, 0))
+    scene = composed(settings, pool, SceneKey(0, 0))
     scene.check()
     assert rows_of(scene, "object") == []
     assert len(scene.provenance["camera_attempts"]) == scene.num_views == 4
@@ -200,7 +201,7 @@ def test_each_reason_is_given_where_it_holds(
     found = []
     for _ in range(2):
         with pytest.raises(Rejected) as caught:
-            compose_scene(settings, pool, SceneKey(0, 0))
+            composed(settings, pool, SceneKey(0, 0))
         found.append(caught.value)
     assert found[0].reason == reason
     assert message in found[0].message
@@ -240,7 +241,7 @@ def test_a_mesh_without_usable_triangles_is_rejected(pool: list[PooledAsset], bu
     overlapping = apply_overrides(settings, {"placement.overlap_share": 1.0})
     for damage, each, index in itertools.product(DAMAGES, (settings, overlapping), range(4)):
         try:
-            scene = compose_scene(each, [_damaged(pool[1], damage)], SceneKey(0, index))
+            scene = composed(each, [_damaged(pool[1], damage)], SceneKey(0, index))
         except Rejected as rejection:
             assert rejection.reason == "no_faces", (damage, rejection)
             assert "made/box" in rejection.message
@@ -435,13 +436,13 @@ def test_the_worst_error_is_the_least_that_the_budget_allows() -> None:
 
 def test_too_little_room_is_rejected_with_the_numbers_and_an_empty_pool_is_a_mistake() -> None:
     with pytest.raises(TrilightError, match="pool"):
-        compose_scene(SETTINGS, [], SceneKey(0, 0))
+        composed(SETTINGS, [], SceneKey(0, 0))
     with pytest.raises(Rejected, match="1 objects need 300 triangles at least.*has 200"):
         levels_within([_asset([(300, 0.1), (600, 0.0)])], 200, 0.0)
     with pytest.raises(Rejected, match="^over_budget: 3 objects of at least 50 .* into the 149"):
-        draw_rows(np.random.default_rng(0), FitTable.of([50, 80]), 3, 149)
+        draw_rows(np.random.default_rng(0), fit_table([50, 80]), 3, 149)
     with pytest.raises(Rejected, match="do not fit"):
-        draw_rows(np.random.default_rng(0), FitTable.of([5, 5], ["a", "b"]), 3, 14)
+        draw_rows(np.random.default_rng(0), fit_table([5, 5], ["a", "b"]), 3, 14)
 
 
 LICENCES = ("CC-BY-SA-4.0", "CC-BY-SA-3.0", "CC0-1.0", "cc-by-sa-4.0", "GPL-3.0-only")
@@ -501,7 +502,7 @@ def test_parts_change_no_draw(monkeypatch: pytest.MonkeyPatch) -> None:
         camps = rng.choice(["", "", "a", "b"], num_rows).tolist()
         total = int(rng.integers(1, 300))
         expected = _slow_twin(np.random.default_rng(trial), least, camps, count, total)
-        table = FitTable.of(least, camps)
+        table = fit_table(least, camps)
         try:
             assert draw_rows(np.random.default_rng(trial), table, count, total) == expected
         except Rejected:
@@ -528,7 +529,7 @@ def test_no_row_is_looked_at_where_all_fit() -> None:
             return found
 
     least, camp = Counting(range(1, 1001)), Counting([0] * 1000)
-    table = FitTable(least, camp, [""], FitTable.of(range(1, 1001)).sizes)
+    table = FitTable(least, camp, [""], fit_table(range(1, 1001)).sizes)
     draw_rows(np.random.default_rng(0), table, 3, 3000)
     assert (least.read, camp.read) == (3, 3)
     draw_rows(np.random.default_rng(0), table, 3, 2000)

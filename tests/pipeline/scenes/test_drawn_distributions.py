@@ -16,8 +16,8 @@ from numpy.typing import NDArray
 
 from pipeline.presets.registry import preset_settings
 from pipeline.scenes.triangle_budget import PooledAsset
+from scene_templates.frozen_v1 import median_settings
 from scene_templates.layout import SurfaceLook
-from scene_templates.out_of_range import median_settings
 from scene_templates.sample_layout import scene_plan
 from storage.records.material import DIFFUSE, EMISSION, ROUGHNESS
 from storage.records.scene import Scene
@@ -185,7 +185,7 @@ def test_every_value_is_planned_in_every_layout_and_scenes_are_as_planned(
 
 
 def test_each_excursion_changes_its_own_settings_only() -> None:
-    median = median_settings(4096)
+    median = median_settings()
     assert dataclasses.replace(SETTINGS, excursions=()) == median
     for index, excursion in enumerate(SETTINGS.excursions):
         after = SETTINGS.of_scene(index)

@@ -15,7 +15,7 @@ import pytest
 from numpy.typing import NDArray
 
 from pipeline.presets.registry import preset_settings
-from scene_templates.scene_maps import SceneSky, lamp_irradiance, scene_sky
+from scene_templates.scene_maps import lamp_irradiance, scene_sky
 from scene_templates.skies.procedural_skies import (
     OUR_SKIES,
     SKIES,
@@ -26,6 +26,7 @@ from scene_templates.skies.procedural_skies import (
     planckian_rgb,
 )
 from scene_templates.skies.texels import SkyTexels
+from storage.records.environment import Environment
 from storage.records.scene import Scene
 from storage.seeds import SceneKey, rng_for
 from storage.settings.overrides import apply_overrides
@@ -362,21 +363,23 @@ LAMP = np.array([[[0, 0, 2], [0.1, 0, 2], [0, 0.1, 2]]], np.float64)
 RADIANCE = np.array([[300.0, 200.0, 100.0]])
 
 
-def _drawn(settings: SkySettings, count: int = 2000) -> list[SceneSky | None]:
-    return [scene_sky(settings, LAMP, RADIANCE, SceneKey(3, index)) for index in range(count)]
+def _drawn(settings: SkySettings, count: int = 2000) -> list[tuple[Environment, dict[str, Any]]]:
+    """Return the skies of the scenes that have one, with their provenance."""
+    keys = [SceneKey(3, index) for index in range(count)]
+    return [sky[:2] for key in keys if (sky := scene_sky(settings, LAMP, RADIANCE, key))]
 
 
 def test_shares_families_strengths_and_turns_are_as_stated() -> None:
     settings = SkySettings(share=0.4, over_lamps_log=(0.1, 10.0), seen_share=0.3, maps=SMALL)
-    found = [sky for sky in _drawn(settings) if sky is not None]
-    families = [sky.origin["family"] for sky in found]
-    log = np.log10([sky.origin["over_lamps"] for sky in found])
-    turns_deg = np.array([sky.origin["azimuth_deg"] for sky in found])
+    found = _drawn(settings)
+    families = [origin["family"] for _, origin in found]
+    log = np.log10([origin["over_lamps"] for _, origin in found])
+    turns_deg = np.array([origin["azimuth_deg"] for _, origin in found])
     assert abs(log).max() <= 1 and turns_deg.min() >= 0 and turns_deg.max() <= 360
     require_plausible(
         {
             "share": share(np.arange(2000) < len(found), 0.4),
-            "seen": share([sky.environment.is_seen for sky in found], 0.3),
+            "seen": share([environment.is_seen for environment, _ in found], 0.3),
             "families": choices(families, dict.fromkeys(OUR_SKIES, 1.0)),
             "over lamps": uniform(log, -1, 1),
             "turns": uniform(turns_deg, 0, 360),
@@ -389,14 +392,15 @@ def test_a_sky_sends_what_was_drawn_over_what_lamps_send() -> None:
     at = LAMP.mean(axis=1)[0]
     lamps = 0.005 * 200 / (at @ at)
     assert lamp_irradiance(LAMP, RADIANCE) == pytest.approx(lamps)
-    for sky in _drawn(SkySettings(share=1.0, maps=SMALL), 20):
-        assert sky is not None
-        grey = sky.environment.radiance_rgb.astype(np.float64).mean(axis=(1, 2))
+    found = _drawn(SkySettings(share=1.0, maps=SMALL), 20)
+    assert len(found) == 20
+    for environment, origin in found:
+        grey = environment.radiance_rgb.astype(np.float64).mean(axis=(1, 2))
         weight = np.diff(np.sin(np.linspace(-np.pi / 2, np.pi / 2, 9)))[::-1] / 2
         # Float32 texels.
-        assert np.pi * (grey @ weight) == pytest.approx(sky.origin["over_lamps"] * lamps, rel=1e-5)
-        sky.environment.check()
-        assert sky.environment.rotation[2].tolist() == [0, 0, 1]
+        assert np.pi * (grey @ weight) == pytest.approx(origin["over_lamps"] * lamps, rel=1e-5)
+        environment.check()
+        assert environment.rotation[2].tolist() == [0, 0, 1]
 
 
 def test_only_the_sky_is_new() -> None:

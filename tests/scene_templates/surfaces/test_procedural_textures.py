@@ -12,8 +12,16 @@ import pytest
 from numpy.typing import NDArray
 
 from scene_templates.exact import Numbers
+from scene_templates.layout import RGB
 from scene_templates.scene_maps import TexturedLook, TextureSettings, draw_look
-from scene_templates.surfaces.maps import MOST_ALBEDO, Finish, SurfaceDraws, SurfaceMaps, finish
+from scene_templates.surfaces.maps import (
+    MOST_ALBEDO,
+    Finish,
+    SurfaceDraws,
+    SurfaceMaps,
+    Texels,
+    stones,
+)
 from scene_templates.surfaces.procedural_textures import (
     OUR_SURFACES,
     SURFACES,
@@ -22,7 +30,6 @@ from scene_templates.surfaces.procedural_textures import (
     exceeded_by,
     lay_rows,
 )
-from scene_templates.surfaces.texels import Texels, stones
 from storage.seeds import rng_for
 from storage.settings.overrides import apply_overrides
 from tests.for_each import for_each
@@ -215,8 +222,16 @@ def test_the_nearest_stone_is_the_nearest(jitter: float) -> None:
     assert (off > 1e-12).mean() < 0.02 and off.max() < 0.3
 
 
-RED = finish((0.8, 0.1, 0.0), specular_share=0.25, roughness=0.6, metal=False)
-GOLD = finish((0.9, 0.7, 0.3), specular_share=0.9, roughness=0.2, metal=True)
+def _finish(base: RGB, *, specular: float, roughness: float, metal: bool) -> Finish:
+    """Return the finish that is drawn with this base colour."""
+    draws = SurfaceDraws(np.random.default_rng(0), natural_share=0.0, albedo=(0.0, 1.0))
+    draws.colour = lambda *_: np.array(base)  # type: ignore[method-assign]
+    ranges = {"specular": (specular, specular), "roughness": (roughness, roughness)}
+    return draws.finish("it", low=base, high=base, metal=metal, **ranges)
+
+
+RED = _finish((0.8, 0.1, 0.0), specular=0.25, roughness=0.6, metal=False)
+GOLD = _finish((0.9, 0.7, 0.3), specular=0.9, roughness=0.2, metal=True)
 
 
 def test_finishes_are_grey_but_for_metal_mixed_by_area_and_toned() -> None:
@@ -225,7 +240,7 @@ def test_finishes_are_grey_but_for_metal_mixed_by_area_and_toned() -> None:
     np.testing.assert_allclose(RED.specular_rgb, [0.25, 0.25, 0.25], rtol=1e-15)
     np.testing.assert_allclose(GOLD.diffuse_rgb, [0.09, 0.07, 0.03], rtol=1e-14)
     np.testing.assert_allclose(GOLD.specular_rgb, [0.81, 0.63, 0.27], rtol=1e-15)
-    white = finish((1.0, 1.0, 2.0), specular_share=1.0, roughness=0.5, metal=False)
+    white = _finish((1.0, 1.0, 2.0), specular=1.0, roughness=0.5, metal=False)
     assert (white.diffuse_rgb + white.specular_rgb).max() < 1
     assert white.specular_rgb.max() == MOST_ALBEDO
     half = RED.covered(GOLD, np.array([[0.0, 1.0], [0.5, 0.5]]))
@@ -296,7 +311,7 @@ def test_ours_are_drawn_equally_often_and_natural_ones_as_often_as_stated() -> N
     settings = SurfaceMapSettings(size=1, natural_share=0.4)
     found = [with_draws(draw_surface, rng_for(seed, "surface"), settings) for seed in range(400)]
     natural = [draws["natural colours"] == (True,) for _, draws in found]
-    families = [maps.family for maps, _ in found]
+    families = [maps.source.name for maps, _ in found]
     even = dict.fromkeys(OUR_SURFACES, 1.0)
     require_plausible({"families": choices(families, even), "natural": share(natural, 0.4)})
     assert SurfaceMapSettings().families == OUR_SURFACES == tuple(SURFACES)
@@ -329,7 +344,7 @@ def test_looks_are_drawn_as_stated() -> None:
         {
             "share": share([look is not None for look in drawn], 0.4),
             "families": choices(
-                [look.maps.family for look in looks], {"checker": 1.0, "stripes": 1.0}
+                [look.maps.source.name for look in looks], {"checker": 1.0, "stripes": 1.0}
             ),
             "width": uniform([look.tile_m for look in looks], *SETTINGS.tile_m),
             "turns": choices([look.quarter_turns for look in looks], dict.fromkeys(range(4), 1.0)),
