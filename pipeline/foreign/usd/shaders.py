@@ -96,6 +96,17 @@ _WEIGHTS = ("base", "base_weight")
 _PARTS = "clearcoat|coat_|opacity|transmission_|subsurface_|fuzz_|sheen_|thin_film_".split("|")
 """Prefixes of inputs that only refine an unsupported one."""
 
+_LOST = {
+    "opacity": "transparency",
+    "transmission": "transmission",
+    "clearcoat": "clearcoat",
+    "coat": "clearcoat",
+    "subsurface": "subsurface",
+    "displacement": "displacement",
+    "normal": "normal map",
+}
+"""Words for unsupported inputs, by the beginnings of their names."""
+
 _READERS: Mapping[str, tuple[str, str]] = {
     **{
         f"UsdPrimvarReader_{kind}": ("varname", "fallback")
@@ -126,9 +137,7 @@ class StatedMaterial:
     has_strength: bool = False
     """True where emission is multiplied with `strength`."""
     lost: tuple[str, ...] = ()
-    """Names of unsupported inputs that have an effect."""
-    has_networks: bool = False
-    """True where nodes that are not read, or values that are not finite, feed an input."""
+    """Words for unsupported inputs that have an effect, and for networks that feed an input."""
 
     @property
     def is_specular(self) -> bool:
@@ -232,6 +241,9 @@ def read_material(
     if material.GetDisplacementOutput().HasConnectedSource():
         opened.lost.append(f"{material.GetPath()}: its displacement has no place here")
     lost = reader.note_unsupported(known)
+    words = {word for name in lost for start, word in _LOST.items() if name.startswith(start)}
+    if reader.textures.pop("ior", None):
+        opened.lost.append(f"{shader.GetPath()}.ior: its texture is not read; 1.5 taken")
     return StatedMaterial(
         name=str(material.GetPrim().GetName()),
         where=str(shader.GetPath()),
@@ -239,8 +251,7 @@ def read_material(
         textures=reader.textures,
         primvars=reader.primvars,
         has_strength="strength" in NAMES[shader.GetShaderId()],
-        lost=lost,
-        has_networks=has_networks,
+        lost=tuple(sorted(words | {"networks of shaders"} if has_networks else words)),
     )
 
 
