@@ -106,7 +106,6 @@ def _read_pictures(nodes: Sequence[TextureNode], bytes_left: int) -> MaterialFil
     for node in nodes:
         distinct.setdefault(node.resolved or node.named, node)
     for path, node in distinct.items():
-        name = node.named
         try:
             picture = None if node.resolved is None else asset_bytes(node.resolved, bytes_left)
         except TrilightError as error:
@@ -115,11 +114,11 @@ def _read_pictures(nodes: Sequence[TextureNode], bytes_left: int) -> MaterialFil
         if picture is not None:
             data[path] = picture
             bytes_left -= len(picture)
-        elif "<UDIM>" in name:
-            why = f"{name!r:.80} has UDIM tiles, which are not read"
+        elif "<UDIM>" in node.named:
+            why = f"{node.named!r:.80} has UDIM tiles, which are not read"
             refused[path] = Rejected("texture_unreadable", why)
         else:
-            why = f"{name!r:.80} is not beside the object"
+            why = f"{node.named!r:.80} is not beside the object"
             refused[path] = Rejected("texture_missing", why)
     return MaterialFiles(data=data, refused=refused)
 

@@ -30,6 +30,7 @@ from pxr import Ar, Pcp, Sdf, Tf, Usd, UsdUtils
 
 from pipeline.foreign.numbers import Malformed
 from storage.errors import TrilightError
+from storage.records.safe_read import name_unreadable
 
 MAX_FILE_BYTES = 1 << 30
 """Maximum size of a file; a million triangles take about 70 MB."""
@@ -287,14 +288,12 @@ class OpenedStage:
 
 def _check_file(path: Path, max_bytes: int) -> None:
     """Refuse a file that is too large, and an archive that is compressed or inconsistent."""
-    try:
+    with name_unreadable(path.name):
         size = path.stat().st_size
         if not path.is_file() or not 0 < size <= max_bytes:
             raise TrilightError(f"{path.name}: {size} bytes; expected a file of 1 to {max_bytes}.")
         if path.suffix.lower() == ".usdz":
             _check_package(path, size)
-    except OSError as error:
-        raise TrilightError(f"{path.name}: cannot be read ({error.strerror}).") from error
 
 
 def _check_package(path: Path, size: int) -> None:
