@@ -291,13 +291,17 @@ class ShaderReader:
 
     def constant(self, name: str) -> NDArray[np.float32]:
         """Return the constant [3] of an input; a number fills all channels."""
-        if name in self._fallbacks:
-            return self._finite(name, self._fallbacks[name])
+        default = self._defaults[name]
+        stated = self._fallbacks.get(name)
         sources = self._sources(name)
-        stated = sources[0].Get(self._time) if sources and not is_output(sources[0]) else None
-        if stated is None:
-            return self._finite(name, self._defaults[name])
-        return self._finite(name, convert_to_rec709(sources[0], np.array(stated)))
+        if sources and not is_output(sources[0]):
+            stated = sources[0].Get(self._time)
+            stated = None if stated is None else convert_to_rec709(sources[0], np.array(stated))
+        value = parse_color(default if stated is None else stated)
+        if value is None:
+            self._lose(name, "no finite number or color")
+            return np.broadcast_to(np.array(default, np.float32), 3)
+        return value
 
     def weight(self) -> NDArray[np.float32]:
         """Return the factor [3] of a base color; a textured one is not multiplied."""
@@ -337,13 +341,6 @@ class ShaderReader:
         if sources and is_output(sources[0]):
             return None
         return parse_color(read_input(self._shader, name, self._time, default))
-
-    def _finite(self, name: str, stated: Any) -> NDArray[np.float32]:
-        value = parse_color(stated)
-        if value is None:
-            self._lose(name, "no finite number or color")
-            value = np.array(self._defaults[name], np.float32)
-        return np.broadcast_to(value, 3).astype(np.float32)
 
     def _sources(self, name: str) -> Any:
         return find_sources(self._shader, self._names.get(name, name))
