@@ -194,8 +194,8 @@ def _read_rows(
     codes: NDArray[np.uint8], order: Order | None, element: _Element, at: int
 ) -> tuple[Columns, int]:
     """Return the columns of an element whose rows begin at position `at`, and their end."""
-    kinds = [_stored(one.kind, order) for one in element.properties]
-    counts = [one.count and _stored(one.count, order) for one in element.properties]
+    kinds = [_storage_type(one.kind, order) for one in element.properties]
+    counts = [one.count and _storage_type(one.count, order) for one in element.properties]
     heads = np.array([0 if count is None else count.itemsize for count in counts])
     sizes = np.array([kind.itemsize for kind in kinds])
     if element.rows * int(np.where(heads > 0, heads, sizes).sum()) > len(codes) - at:
@@ -252,7 +252,7 @@ def _read_rows(
     return columns, end
 
 
-def _stored(kind: np.dtype, order: Order | None) -> np.dtype:
+def _storage_type(kind: np.dtype, order: Order | None) -> np.dtype:
     """Return a type as the data hold it: all numbers of a text are doubles."""
     return kind.newbyteorder(order) if order else np.dtype(np.float64)
 
