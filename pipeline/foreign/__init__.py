@@ -8,7 +8,8 @@ Native code parses some of the bytes, so only processes with limits import this
 - `material`, `picture`: a material as its file states it, triangles with theirs, and pictures.
 - `openexr`, `radiance_hdr`, `linear_picture`: pictures of floats.
 - `obj`, `off`, `ply`, `stl`: one reader a format, of one `FileMesh`; `text` splits text into
-  words.
+  words. trimesh 5.2 cuts concave polygons wrongly, refuses lists of mixed lengths in binary PLY,
+  and returns a smaller or an empty mesh for an STL or OFF that is cut off.
 - `material_files`, `mesh_materials`: materials of those.
 - `gltf`, `usd`: the other formats.
 """

@@ -60,7 +60,8 @@ def read_obj(data: bytes) -> FileMesh:
     material, names = statements.used_materials()
     triangles, polygon = triangulate(points[:, :3], counts, corners[:, 0])
     group = 1 + material.max() - material
-    group[_is_mixed(counts, group)[group]] *= -1
+    is_uneven = counts * np.bincount(group)[group] != np.bincount(group, counts)[group]
+    group[np.bincount(group, is_uneven)[group] > 0] *= -1  # its faces differ in size
     triangles, polygon = sort_by_size(triangles, polygon, counts, group)
     chosen = corners[triangles.ravel()]
     first, vertex = _unmerge(chosen, np.repeat(material[polygon], 3))
@@ -81,15 +82,6 @@ def read_obj(data: bytes) -> FileMesh:
         color=None if colors is None else colors[chosen[:, 0]].reshape(-1, 3, 3),
         unread=list_some(unread),
     )
-
-
-def _is_mixed(counts: NDArray[np.int64], group: NDArray[np.int64]) -> NDArray[np.bool_]:
-    """Return whether the faces of each group [G] differ in size."""
-    least = np.full(group.max() + 1, counts.max())
-    most = np.zeros(group.max() + 1, np.int64)
-    np.minimum.at(least, group, counts)
-    np.maximum.at(most, group, counts)
-    return np.asarray(least < most)
 
 
 class _Statements:

@@ -7,8 +7,7 @@ and roughness is linear, whatever profile or gamma the file names.
 import io
 import warnings
 from collections.abc import Callable
-from dataclasses import dataclass
-from functools import cached_property
+from dataclasses import dataclass, field
 from typing import Literal
 
 import numpy as np
@@ -175,10 +174,7 @@ class Picture:
     """Wrap modes along u and v."""
     is_nearest: bool = False
     """True where texels are flat squares instead of being interpolated."""
-
-    @cached_property
-    def _levels(self) -> list[NDArray[np.float32]]:
-        return []
+    _levels: list[NDArray[np.float32]] = field(default_factory=list, init=False)
 
     def level(self, number: int) -> NDArray:
         """Return the picture halved `number` times, linear from the first halving on."""

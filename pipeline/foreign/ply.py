@@ -115,11 +115,8 @@ def check_face_count(data: bytes, max_faces: int) -> None:
 
 
 def list_ply_pictures(data: bytes) -> Sequence[str]:
-    """Return the names of the pictures of a PLY; none where its header is malformed."""
-    try:
-        return _read_header(data).pictures
-    except Rejected:
-        return ()
+    """Return the names of the pictures of a PLY; raises Rejected as `check_face_count`."""
+    return _read_header(data).pictures
 
 
 def _read_header(data: bytes) -> _Header:
@@ -130,13 +127,10 @@ def _read_header(data: bytes) -> _Header:
     form: bytes = b""
     elements: list[_Element] = []
     pictures: list[str] = []
-    start = begin.end()
-    while True:
-        end = data.find(begin[1], start)
-        if end < 0:
-            raise Rejected("header_size_mismatch", "the PLY ends within its header")
-        line = data[start:end].strip()
-        start = end + len(begin[1])
+    size = begin.end()
+    for row in data[size:].split(begin[1])[:-1]:
+        size += len(row) + len(begin[1])
+        line = row.strip()
         words = line.split()
         key = words[0] if words else b"comment"
         if key == b"end_header":
@@ -155,9 +149,11 @@ def _read_header(data: bytes) -> _Header:
             elements[-1].properties.append(_read_property(words))
         else:
             raise Rejected("load_error", f"the PLY header has the line {line[:60]!r}")
+    else:
+        raise Rejected("header_size_mismatch", "the PLY ends within its header")
     if form not in _ORDERS:
         raise Rejected("load_error", f"the PLY is of the format {form[:24]!r}")
-    return _Header(order=_ORDERS[form], elements=elements, pictures=pictures, size=start)
+    return _Header(order=_ORDERS[form], elements=elements, pictures=pictures, size=size)
 
 
 def _read_property(words: Sequence[bytes]) -> _Property:
@@ -179,112 +175,91 @@ Columns = dict[str, Any]
 def _read_elements(data: bytes, header: _Header) -> tuple[dict[str, Columns], int]:
     """Return the columns of each element, and the number of bytes after the last one."""
     data = data.removeprefix(b"\xef\xbb\xbf")
-    body = _Body(memoryview(data)[header.size :], header.order)
+    codes = np.frombuffer(data, np.uint8)[header.size :]
+    if not header.order:
+        text = data[header.size :]
+        codes = parse_numbers(text, len(find_words(text)), np.float64).view(np.uint8)
     columns: dict[str, Columns] = {}
     at = 0
     for element in header.elements:
         if element.properties:
-            columns[element.name], at = _read_rows(body, element, at)
-    if at < body.size and not header.order:
-        more = (body.size - at) // 8
-        raise Rejected("header_size_mismatch", f"the PLY holds {more} numbers too many")
-    return columns, body.size - at
+            columns[element.name], at = _read_rows(codes, header.order, element, at)
+    rest = len(codes) - at
+    if rest and not header.order:
+        raise Rejected("header_size_mismatch", f"the PLY holds {rest // 8} numbers too many")
+    return columns, rest
 
 
-class _Body:
-    """The data of a PLY, addressed by byte; each number of a text takes eight."""
-
-    def __init__(self, data: memoryview, order: Order | None) -> None:
-        self._codes = np.frombuffer(data, np.uint8)
-        if order is None:
-            text = bytes(data)
-            self._codes = parse_numbers(text, len(find_words(text)), np.float64).view(np.uint8)
-        self.size = len(self._codes)
-        self._order = order
-
-    def width(self, kind: np.dtype) -> int:
-        return kind.itemsize if self._order else 8
-
-    def count(self, at: int, kind: np.dtype) -> int:
-        return int(self._view_as(self._codes[at : at + self.width(kind)], kind)[0])
-
-    def take(self, at: NDArray[np.int64], kind: np.dtype) -> NDArray:
-        taken = self._codes[at[:, None] + np.arange(self.width(kind))]
-        return self._view_as(np.ascontiguousarray(taken), kind)[:, 0].astype(kind)
-
-    def _view_as(self, codes: NDArray[np.uint8], kind: np.dtype) -> NDArray:
-        return codes.view(kind.newbyteorder(self._order) if self._order else np.float64)
-
-
-def _read_rows(body: _Body, element: _Element, at: int) -> tuple[Columns, int]:
+def _read_rows(
+    codes: NDArray[np.uint8], order: Order | None, element: _Element, at: int
+) -> tuple[Columns, int]:
     """Return the columns of an element whose rows begin at position `at`, and their end."""
-    widths = [body.width(one.count or one.kind) for one in element.properties]
-    if element.rows * sum(widths) > body.size - at:
+    kinds = [_storage_type(one.kind, order) for one in element.properties]
+    counts = [one.count and _storage_type(one.count, order) for one in element.properties]
+    heads = np.array([0 if count is None else count.itemsize for count in counts])
+    sizes = np.array([kind.itemsize for kind in kinds])
+    if element.rows * int(np.where(heads > 0, heads, sizes).sum()) > len(codes) - at:
         raise Rejected(
             "header_size_mismatch",
             f"the PLY header counts {element.rows} rows of {element.name[:24]!r}, which the file "
             "does not hold",
         )
-    lists = [(k, one.count) for k, one in enumerate(element.properties) if one.count is not None]
-    first = _walk_lists(body, element, at, min(element.rows, 1))
-    lengths = np.zeros((element.rows, len(lists)), np.int64) + first
-    begins, end = _place_rows(body, element, at, lengths)
-    is_even = end <= body.size and all(
-        (body.take(begins[:, k], kind) == length).all()
-        for (k, kind), length in zip(lists, lengths.T, strict=True)
+
+    def place(lengths: NDArray[np.int64]) -> tuple[NDArray[np.int64], int]:
+        """Return the first position [rows, P] of each property, and the end of all."""
+        steps = heads + sizes * lengths
+        return at + np.cumsum(steps).reshape(steps.shape) - steps, at + int(steps.sum())
+
+    def walk(rows: int) -> NDArray[np.int64]:
+        """Return the numbers [rows, P] of values of the properties, row by row."""
+        steps = list(zip(counts, heads.tolist(), sizes.tolist(), strict=True))
+        lengths = np.ones((rows, len(steps)), np.int64)
+        position = at
+        for row in range(rows):
+            for column, (count, head, size) in enumerate(steps):
+                length = 1
+                if count is not None:
+                    word = codes[position : position + head]
+                    length = int(word.view(count)[0]) if len(word) == head else -1
+                    if not 0 <= length <= len(codes):
+                        raise cut_off
+                    lengths[row, column] = length
+                position += head + size * length
+        return lengths
+
+    cut_off = Rejected("header_size_mismatch", f"the PLY ends within {element.name[:24]!r}")
+    lengths = np.zeros((element.rows, len(kinds)), np.int64) + walk(min(element.rows, 1))
+    begins, end = place(lengths)
+    is_even = end <= len(codes) and all(
+        (_gather(codes, begins[:, column], count) == lengths[:, column]).all()
+        for column, count in enumerate(counts)
+        if count is not None
     )
     if not is_even:  # the lists differ in length, and the rows are walked
-        lengths = _walk_lists(body, element, at, element.rows)
-        begins, end = _place_rows(body, element, at, lengths)
-    if end > body.size:
-        raise Rejected("header_size_mismatch", f"the PLY ends within {element.name[:24]!r}")
-    columns: dict[str, NDArray | _Lists] = {}
-    stated = iter(lengths.T)
-    for one, begin in zip(element.properties, begins.T, strict=True):
-        if one.count is None:
-            columns[one.name] = body.take(begin, one.kind)
-            continue
-        count = next(stated)
-        within = np.arange(int(count.sum())) - np.repeat(np.cumsum(count) - count, count)
-        at_value = np.repeat(begin + body.width(one.count), count) + body.width(one.kind) * within
-        columns[one.name] = _Lists(values=body.take(at_value, one.kind), counts=count)
+        lengths = walk(element.rows)
+        begins, end = place(lengths)
+    if end > len(codes):
+        raise cut_off
+    columns: Columns = {}
+    for one, kind, size, count, begin in zip(
+        element.properties, kinds, sizes, lengths.T, (begins + heads).T, strict=True
+    ):
+        if one.count is not None:
+            within = np.arange(int(count.sum())) - np.repeat(np.cumsum(count) - count, count)
+            begin = np.repeat(begin, count) + size * within
+        values = _gather(codes, begin, kind).astype(one.kind)
+        columns[one.name] = values if one.count is None else _Lists(values=values, counts=count)
     return columns, end
 
 
-def _place_rows(
-    body: _Body, element: _Element, at: int, lengths: NDArray[np.int64]
-) -> tuple[NDArray[np.int64], int]:
-    """Return the start of each property [rows, P], and the end of the last one."""
-    steps = np.zeros((element.rows, len(element.properties)), np.int64)
-    lists = iter(lengths.T)
-    for column, one in enumerate(element.properties):
-        size = body.width(one.kind)
-        steps[:, column] = size if one.count is None else body.width(one.count) + size * next(lists)
-    ends = at + np.cumsum(steps.ravel()).reshape(steps.shape)
-    return ends - steps, int(ends[-1, -1]) if element.rows else at
+def _storage_type(kind: np.dtype, order: Order | None) -> np.dtype:
+    """Return a type as the data hold it: all numbers of a text are doubles."""
+    return kind.newbyteorder(order) if order else np.dtype(np.float64)
 
 
-def _walk_lists(body: _Body, element: _Element, at: int, rows: int) -> NDArray[np.int64]:
-    """Return the lengths [rows, L] of lists, read row by row."""
-    steps: list[tuple[int, np.dtype, int]] = []
-    skipped = 0
-    for one in element.properties:
-        if one.count is None:
-            skipped += body.width(one.kind)
-        else:
-            steps.append((skipped, one.count, body.width(one.kind)))
-            skipped = 0
-    lengths = np.zeros((rows, len(steps)), np.int64)
-    for row in range(rows):
-        for column, (before, kind, size) in enumerate(steps):
-            at += before
-            length = body.count(at, kind) if at + body.width(kind) <= body.size else -1
-            if not 0 <= length <= body.size:
-                raise Rejected("header_size_mismatch", f"the PLY ends within {element.name[:24]!r}")
-            lengths[row, column] = length
-            at += body.width(kind) + size * length
-        at += skipped
-    return lengths
+def _gather(codes: NDArray[np.uint8], at: NDArray[np.int64], kind: np.dtype) -> NDArray:
+    """Return the numbers [N] of a type that begin at positions [N]."""
+    return codes[at[:, None] + np.arange(kind.itemsize)].view(kind)[:, 0]
 
 
 def _take(columns: Columns, *names: str) -> list[NDArray] | None:

@@ -12,13 +12,19 @@ from storage.errors import Rejected
 
 _HEADER_BYTES = 84
 _FACET = np.dtype([("normal", "<f4", 3), ("corners", "<f4", (3, 3)), ("attribute", "<u2")])
-_FACET_BEGINS = re.compile(rb"\sfacet\s+normal(?:\s+[-+.\da-z#()]+){3}(?=\s+outer\s|\s*$)")
+_NAME = re.compile(
+    rb"""(?x)
+    ((?:\n|endfacet)[^\S\n]*) (?:solid|(end)solid)
+    (?: [^\n]*? (?=
+            [^\S\n]facet [^\S\n]+normal (?:[^\S\n]+[-+.\da-z#()]+){3}
+            (?:[^\S\n]+outer[^\S\n] | [^\S\n]*\n))
+        | [^\n]*)"""
+)
+"""The word that begins or ends a solid, and its name: to the end of the line, or to a facet."""
 _LOOP = re.compile(rb"outer\s+loop((?:\s+vertex(?:\s+\S+){3})+)\s+endloop\s")
 _AROUND_LOOP = re.compile(rb"facet(?:\s+normal(?:\s+(?!endfacet)\S+){0,3})?\s+endfacet\s")
-_ENDS = re.compile(rb"(?m)^([ \t]*)end[ \t]+(?=(?:facet|loop|solid)\b)")
+_ENDS = re.compile(rb"(\n[ \t]*)end[ \t]+(?=(?:facet|loop|solid)\b)")
 _WORDS = {b"facet", b"outer", b"loop", b"vertex"}
-_MOST_INDENT = 4096
-"""Bytes that are searched before the word that begins or ends a solid."""
 
 
 def count_facets(data: bytes) -> int | None:
@@ -69,35 +75,18 @@ def _build_mesh(corners: np.ndarray) -> TriangleMesh:
     return TriangleMesh(positions=corners, faces=np.arange(len(corners)).reshape(-1, 3))
 
 
-def _strip_names(text: bytes) -> tuple[bytes, bool]:
-    """Return a text without the lines that begin and end solids, and whether all solids end.
-
-    The name of a solid goes to the end of its line, or to a facet on the same line.
-    """
-    pieces: list[bytes] = []
-    rest_start = 0
-    balance = 0
-    at = text.find(b"solid")
-    while at >= 0:
-        start = at - 3 if text[at - 3 : at] == b"end" else at
-        before = text[max(start - _MOST_INDENT, 0) : start].rpartition(b"\n")[2].rstrip()
-        end = at + len(b"solid")
-        if not before or before.endswith(b"endfacet"):
-            balance += 1 if start == at else -1
-            last = text.find(b"\n", at)
-            last = len(text) if last < 0 else last
-            facet = _FACET_BEGINS.search(text, at, last)
-            pieces.append(text[rest_start:start])
-            rest_start = end = facet.start() if facet else last
-        at = text.find(b"solid", end)
-    return b" ".join([*pieces, text[rest_start:]]), balance == 0
-
-
 def _read_text(text: bytes) -> FileMesh:
-    text, is_closed = _strip_names(_ENDS.sub(rb"\1end", text) + b"\n")
-    loops = _LOOP.findall(text)
-    rest = _AROUND_LOOP.sub(b" ", _LOOP.sub(b" ", text)).strip(b"\0\x1a \n").split()
-    if not is_closed or (rest and b"solid".startswith(rest[-1])):
+    ends: list[bytes | None] = []
+
+    def strip_name(name: re.Match[bytes]) -> bytes:
+        ends.append(name[2])
+        return name[1] + b" "
+
+    text = _NAME.sub(strip_name, _ENDS.sub(rb"\1end", b"\n" + text + b"\n"))
+    pieces = _LOOP.split(text)
+    loops = pieces[1::2]
+    rest = _AROUND_LOOP.sub(b" ", b" ".join(pieces[::2])).strip(b"\0\x1a \n").split()
+    if 2 * ends.count(None) != len(ends) or (rest and b"solid".startswith(rest[-1])):
         raise Rejected("cut_off", "the STL ends within a facet, within solid, or without endsolid")
     broken = next((word for word in rest if word.removeprefix(b"end") in _WORDS), None)
     if broken is not None:

@@ -116,8 +116,10 @@ class IsolatedChild:
             self._reach = self._reach.with_all_of(more)
             self.retire()
 
-    def call(self, function: Callable[..., Result], *args: Any) -> Result:
+    def call(self, function: Callable[..., Result], *args: Any, of_held: bool = False) -> Result:
         """Run an importable function in the child and return its result.
+
+        With `of_held` its first argument is the object that the child holds.
 
         Raises:
             Rejected, TrilightError: as the function raised them.
@@ -126,15 +128,6 @@ class IsolatedChild:
             TrilightError: also where a new child cannot be set up.
             ChildClosed: `close` was called, perhaps by another thread.
         """
-        return self._call(function, args)
-
-    def call_method(self, method: Callable[..., Result], *args: Any) -> Result:
-        """Run a function whose first argument is the object that the child holds; as `call`."""
-        return self._call(method, args, of_held=True)
-
-    def _call(
-        self, function: Callable[..., Result], args: tuple[Any, ...], *, of_held: bool = False
-    ) -> Result:
         if self._closed:
             raise ChildClosed
         if self._reach is not None and not (code := code_of(function)) <= self._code:
@@ -151,6 +144,10 @@ class IsolatedChild:
         except ChildFailed:
             self.retire()
             raise
+
+    def call_method(self, method: Callable[..., Result], *args: Any) -> Result:
+        """Run a function of the object that the child holds; as `call`."""
+        return self.call(method, *args, of_held=True)
 
     def close(self) -> None:
         """End the child at once and permanently; safe while another thread waits in `call`."""
@@ -240,33 +237,31 @@ def _cannot_be_set_up(failure: ChildFailed) -> EnvironmentFailure:
     )
 
 
-def _launch(limits: ChildLimits) -> tuple[Any, Connection]:
+def _launch(limits: ChildLimits, tries: int = _LAUNCHES) -> tuple[Any, Connection]:
     """Start a child; return it and the connection to it. A killed fork server is replaced.
 
     Raises:
         EnvironmentFailure: no process can be started.
     """
     context = multiprocessing.get_context("forkserver")
-    for tries_left in reversed(range(_LAUNCHES)):
-        ours, theirs = context.Pipe()
-        output, output_sink = context.Pipe(duplex=False)
-        words = (theirs, output_sink, limits.memory_bytes, limits.cpu_s)
-        process = context.Process(target=serve, args=words, daemon=True)
-        try:
-            with theirs, output_sink, _apart_from_program():
-                process.start()
-        except (EOFError, OSError) as error:
-            ours.close()
-            output.close()
-            if not tries_left:
-                raise EnvironmentFailure(
-                    f"a child process cannot be started ({error}); see `trilight doctor`."
-                ) from error
-        else:
-            os.set_blocking(ours.fileno(), False)
-            threading.Thread(target=_print_output, args=(output,), daemon=True).start()
-            return process, ours
-    raise AssertionError("unreachable: the last try returns or raises")
+    ours, theirs = context.Pipe()
+    output, output_sink = context.Pipe(duplex=False)
+    words = (theirs, output_sink, limits.memory_bytes, limits.cpu_s)
+    process = context.Process(target=serve, args=words, daemon=True)
+    try:
+        with theirs, output_sink, _apart_from_program():
+            process.start()
+    except (EOFError, OSError) as error:
+        ours.close()
+        output.close()
+        if tries > 1:
+            return _launch(limits, tries - 1)
+        raise EnvironmentFailure(
+            f"a child process cannot be started ({error}); see `trilight doctor`."
+        ) from error
+    os.set_blocking(ours.fileno(), False)
+    threading.Thread(target=_print_output, args=(output,), daemon=True).start()
+    return process, ours
 
 
 def _print_output(output: Connection) -> None:

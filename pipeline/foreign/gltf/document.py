@@ -275,22 +275,18 @@ def _chunks(data: bytes) -> tuple[bytes, memoryview | None]:
         raise _version_error(str(version))
     if length > len(data):
         raise _cut_off_error(length, len(data))
-    chunks = list(_split(memoryview(data)[:length]))
+    chunks: list[tuple[bytes, memoryview]] = []  # unknown kinds are legal
+    start = _HEADER.size
+    while start + _CHUNK.size <= length:
+        size, kind = _CHUNK.unpack_from(data, start)
+        start += _CHUNK.size
+        if start + size > length:
+            raise _cut_off_error(start + size, length)
+        chunks.append((kind, memoryview(data)[start : start + size]))
+        start += size
     if not chunks or chunks[0][0] != b"JSON":
         raise Rejected("load_error", "the first chunk of the GLB is no JSON")
     return bytes(chunks[0][1]), next((body for kind, body in chunks[1:] if kind == b"BIN\0"), None)
-
-
-def _split(data: memoryview) -> Iterator[tuple[bytes, memoryview]]:
-    """Yield kind and bytes of each chunk; unknown kinds are legal."""
-    start = _HEADER.size
-    while start + _CHUNK.size <= len(data):
-        size, kind = _CHUNK.unpack_from(data, start)
-        start += _CHUNK.size
-        if start + size > len(data):
-            raise _cut_off_error(start + size, len(data))
-        yield kind, data[start : start + size]
-        start += size
 
 
 def _cut_off_error(expected: int, present: int) -> Rejected:

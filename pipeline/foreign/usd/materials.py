@@ -21,7 +21,7 @@ from pipeline.foreign.material import (
     with_normal_map,
 )
 from pipeline.foreign.picture import Decode, Picture, has_colors
-from pipeline.foreign.usd.object_source import TIME, StageMaterials, UsdSource, name_unsupported
+from pipeline.foreign.usd.object_source import TIME, StageMaterials, UsdSource
 from pipeline.foreign.usd.polygons import CutMesh
 from pipeline.foreign.usd.shaders import (
     IOR_OF_CONSTANT_ALBEDOS,
@@ -188,9 +188,8 @@ class MeshMaterials:
             "emissiveColor" in stated.textures or _read_constant(stated, "emissiveColor").max() > 0
         )
         is_lit = glows and _read_strength(stated) > 0
-        lost = name_unsupported(stated)
-        if is_lit or "emissiveColor" in stated.primvars:
-            lost = ("emission", *lost)
+        is_emissive = is_lit or "emissiveColor" in stated.primvars
+        lost = ("emission", *stated.lost) if is_emissive else stated.lost
         names = ["diffuseColor", "roughness"]
         names += ["emissiveColor"] if self.emission and is_lit else []
         material = self._with_inputs(SourceMaterial(lost=lost), stated, *names)

@@ -7,7 +7,6 @@ refused: a missing reference, surfaces other than polygons, bones without a pose
 """
 
 import contextlib
-import dataclasses
 import hashlib
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
@@ -30,18 +29,6 @@ from pipeline.foreign.usd.texture_nodes import TextureNode, asset_bytes
 from storage.errors import Rejected, TrilightError
 
 ReadMaterial = Callable[[Any], StatedMaterial | None]
-
-_LOST = {
-    "opacity": "transparency",
-    "transmission": "transmission",
-    "clearcoat": "clearcoat",
-    "coat": "clearcoat",
-    "subsurface": "subsurface",
-    "displacement": "displacement",
-    "normal": "normal map",
-}
-"""Words for unsupported inputs, by the beginnings of their names."""
-
 
 Binding = tuple[int, NDArray[np.int64] | None]
 """Index of a material, or -1 for none, and the polygons of a mesh that have it; None for all."""
@@ -84,20 +71,20 @@ def read_stage_materials(
     rows: dict[str, int] = {}
     materials: list[StatedMaterial] = []
 
-    def find_row(material: Any, lost: list[str]) -> int:
+    def find_row(material: Any) -> int:
         if not material:
             return -1
         name = str(material.GetPath())
         if name not in rows:
             stated = read(material)
             rows[name] = -1 if stated is None else len(materials)
-            materials.extend([] if stated is None else [_drop_ior_texture(stated, lost)])
+            materials.extend([] if stated is None else [stated])
         return rows[name]
 
     try:
         bindings = tuple(
             tuple(
-                (find_row(material, placed.lost), polygons)
+                (find_row(material), polygons)
                 for material, polygons in read_bindings(placed.prim, time)
             )
             for placed in meshes
@@ -112,21 +99,6 @@ def read_stage_materials(
     )
 
 
-def _drop_ior_texture(stated: StatedMaterial, lost: list[str]) -> StatedMaterial:
-    textures = dict(stated.textures)
-    if textures.pop("ior", None):
-        lost.append(f"{stated.where}.ior: its texture is not read; 1.5 taken")
-    return dataclasses.replace(stated, textures=textures)
-
-
-def name_unsupported(stated: StatedMaterial) -> tuple[str, ...]:
-    """Return words for the unsupported inputs that a material states."""
-    words = {
-        word for name in stated.lost for start, word in _LOST.items() if name.startswith(start)
-    }
-    return tuple(sorted(words | {"networks of shaders"} if stated.has_networks else words))
-
-
 def _read_pictures(nodes: Sequence[TextureNode], bytes_left: int) -> MaterialFiles:
     data: dict[str, bytes] = {}
     refused: dict[str, Rejected] = {}
@@ -134,7 +106,6 @@ def _read_pictures(nodes: Sequence[TextureNode], bytes_left: int) -> MaterialFil
     for node in nodes:
         distinct.setdefault(node.resolved or node.named, node)
     for path, node in distinct.items():
-        name = node.named
         try:
             picture = None if node.resolved is None else asset_bytes(node.resolved, bytes_left)
         except TrilightError as error:
@@ -143,11 +114,11 @@ def _read_pictures(nodes: Sequence[TextureNode], bytes_left: int) -> MaterialFil
         if picture is not None:
             data[path] = picture
             bytes_left -= len(picture)
-        elif "<UDIM>" in name:
-            why = f"{name!r:.80} has UDIM tiles, which are not read"
+        elif "<UDIM>" in node.named:
+            why = f"{node.named!r:.80} has UDIM tiles, which are not read"
             refused[path] = Rejected("texture_unreadable", why)
         else:
-            why = f"{name!r:.80} is not beside the object"
+            why = f"{node.named!r:.80} is not beside the object"
             refused[path] = Rejected("texture_missing", why)
     return MaterialFiles(data=data, refused=refused)
 

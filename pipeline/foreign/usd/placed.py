@@ -228,8 +228,7 @@ def _visit_below(
         imageable = UsdGeom.Imageable(prim)
         if imageable and imageable.GetVisibilityAttr().Get(time) == UsdGeom.Tokens.invisible:
             continue
-        visit = _inherit_purpose(above, imageable, time)
-        visit = dataclasses.replace(visit, to_world=_compute_world(visit, time))
+        visit = _apply_own(above, imageable, time)
         is_shown = visit.purpose == "default" or (
             visit.purpose == "render" and visit.is_render_shown
         )
@@ -246,8 +245,8 @@ def _visit_children(above: _Visit) -> Iterator[_Visit]:
     return (dataclasses.replace(above, prim=child) for child in children)
 
 
-def _inherit_purpose(above: _Visit, imageable: Any, time: Any) -> _Visit:
-    """Return a visit with the prim's authored purpose, if any, which its children inherit."""
+def _apply_own(above: _Visit, imageable: Any, time: Any) -> _Visit:
+    """Return a visit with the prim's own transform and purpose, if any; its children inherit it."""
     if not imageable:
         return above
     purpose = imageable.GetPurposeAttr()
@@ -255,17 +254,17 @@ def _inherit_purpose(above: _Visit, imageable: Any, time: Any) -> _Visit:
     if above.prim.HasAPI(UsdGeom.VisibilityAPI):
         stated = UsdGeom.VisibilityAPI(above.prim).GetRenderVisibilityAttr().Get(time)
         is_shown = is_shown if stated in (None, "inherited") else stated == "visible"
-    purpose_name = str(purpose.Get()) if purpose.HasAuthoredValue() else above.purpose
-    return dataclasses.replace(above, purpose=purpose_name, is_render_shown=is_shown)
-
-
-def _compute_world(visit: _Visit, time: Any) -> NDArray[np.float64]:
-    move = UsdGeom.Xformable(visit.prim)
-    if not move:
-        return visit.to_world
-    local = np.array(move.GetLocalTransformation(time)).T
-    start = visit.origin if move.GetResetXformStack() else visit.to_world
-    return np.einsum("ij,jk->ik", start, local)
+    to_world = above.to_world
+    if move := UsdGeom.Xformable(above.prim):
+        local = np.array(move.GetLocalTransformation(time)).T
+        start = above.origin if move.GetResetXformStack() else to_world
+        to_world = np.einsum("ij,jk->ik", start, local)
+    return dataclasses.replace(
+        above,
+        to_world=to_world,
+        purpose=str(purpose.Get()) if purpose.HasAuthoredValue() else above.purpose,
+        is_render_shown=is_shown,
+    )
 
 
 def _visit_instances(above: _Visit, time: Any, lost: list[str]) -> Iterator[_Visit]:

@@ -5,7 +5,6 @@ too small.
 """
 
 import dataclasses
-from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from typing import Any
@@ -195,7 +194,7 @@ def _build_solid(prim: Any, time: Any) -> Polygons:
     if kind == "Cube":
         corners = np.array([[x, y, z] for z in (-1, 1) for y in (-1, 1) for x in (-1, 1)])
         sides = [[0, 2, 3, 1], [4, 5, 7, 6], [0, 1, 5, 4], [2, 6, 7, 3], [0, 4, 6, 2], [1, 3, 7, 5]]
-        return _pack(corners * read_size("size") / 2, sides, is_smooth=False)
+        return corners * read_size("size") / 2, np.full(6, 4), np.ravel(sides), False
     axis = "Z" if kind == "Sphere" else str(prim.GetAttribute("axis").Get())
     if kind == "Plane":
         wide = read_size("width") / 2
@@ -203,9 +202,9 @@ def _build_solid(prim: Any, time: Any) -> Polygons:
         if axis != "Z":  # the permutation swaps the two directions for X and Y
             wide, long = long, wide
         flat = np.array([[-wide, -long, 0], [wide, -long, 0], [wide, long, 0], [-wide, long, 0]])
-        return _pack(flat[:, _AXES[axis]], [[0, 1, 2, 3]], is_smooth=False)
-    points, sides = _revolve(_build_profile(kind, read_size))
-    return _pack(points[:, _AXES[axis]], sides, is_smooth=True)
+        return flat[:, _AXES[axis]], np.array([4]), np.arange(4), False
+    points, counts, indices = _revolve(_build_profile(kind, read_size))
+    return points[:, _AXES[axis]], counts, indices, True
 
 
 def _build_profile(kind: str, read_size: Any) -> NDArray[np.float64]:
@@ -232,21 +231,22 @@ def _build_arc(begin: float, end: float, count: int) -> NDArray[np.float64]:
     return np.stack([np.cos(angle), np.sin(angle)], axis=1)
 
 
-def _revolve(profile: NDArray[np.float64]) -> tuple[NDArray[np.float64], list[list[int]]]:
-    """Return the points and polygons of a profile revolved around Z, facing out."""
+def _revolve(
+    profile: NDArray[np.float64],
+) -> tuple[NDArray[np.float64], NDArray[np.int64], NDArray[np.int64]]:
+    """Return the polygons of a profile revolved around Z, facing out; arrays as in `Polygons`."""
     angle = 2 * np.pi * np.arange(_SIDES) / _SIDES
     around = np.stack([np.cos(angle), np.sin(angle)], axis=1)
     rings = [np.column_stack([around * radius, np.full(_SIDES, up)]) for radius, up in profile]
-    sides = [
-        [_SIDES * row + i, _SIDES * row + j, _SIDES * (row + 1) + j, _SIDES * (row + 1) + i]
-        for row in range(len(profile) - 1)
-        for i, j in zip(range(_SIDES), [*range(1, _SIDES), 0], strict=True)
-    ]
-    on_axis = profile[:, 0] < 1e-9 * profile[:, 0].max(initial=1e-30)
-    first = np.arange(len(profile) * _SIDES) // _SIDES
-    same = np.where(on_axis[first], first * _SIDES, np.arange(len(first)))
-    distinct_sides = [list(dict.fromkeys(same[side].tolist())) for side in sides]
-    return np.concatenate(rings), [side for side in distinct_sides if len(side) > 2]
+    on_axis = profile[:, :1] < 1e-9 * profile[:, 0].max(initial=1e-30)
+    number = np.arange(len(profile) * _SIDES).reshape(-1, _SIDES)
+    number = np.where(on_axis, number[:, :1], number)  # the points of such a ring are one
+    after = np.roll(number, -1, axis=1)
+    sides = np.stack([number[:-1], after[:-1], after[1:], number[1:]], axis=-1).reshape(-1, 4)
+    is_corner = sides != np.roll(sides, 1, axis=1)
+    is_corner[is_corner.sum(axis=1) < 3] = False
+    counts = is_corner.sum(axis=1)
+    return np.concatenate(rings), counts[counts > 0], sides[is_corner]
 
 
 def _read_tetrahedra(prim: Any, time: Any) -> Polygons:
@@ -257,10 +257,3 @@ def _read_tetrahedra(prim: Any, time: Any) -> Polygons:
     points = np.array(mesh.GetPointsAttr().Get(time) or np.zeros((0, 3)), np.float64)
     sides = np.array(faces or np.zeros((0, 3)), np.int64).reshape(-1, 3)
     return points, np.full(len(sides), 3), sides.ravel(), False
-
-
-def _pack(
-    points: NDArray[np.float64], sides: Sequence[Sequence[int]], *, is_smooth: bool
-) -> Polygons:
-    counts = np.array([len(side) for side in sides], np.int64)
-    return points, counts, np.array([i for side in sides for i in side], np.int64), is_smooth

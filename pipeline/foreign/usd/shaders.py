@@ -96,6 +96,17 @@ _WEIGHTS = ("base", "base_weight")
 _PARTS = "clearcoat|coat_|opacity|transmission_|subsurface_|fuzz_|sheen_|thin_film_".split("|")
 """Prefixes of inputs that only refine an unsupported one."""
 
+_LOST = {
+    "opacity": "transparency",
+    "transmission": "transmission",
+    "clearcoat": "clearcoat",
+    "coat": "clearcoat",
+    "subsurface": "subsurface",
+    "displacement": "displacement",
+    "normal": "normal map",
+}
+"""Words for unsupported inputs, by the beginnings of their names."""
+
 _READERS: Mapping[str, tuple[str, str]] = {
     **{
         f"UsdPrimvarReader_{kind}": ("varname", "fallback")
@@ -126,9 +137,7 @@ class StatedMaterial:
     has_strength: bool = False
     """True where emission is multiplied with `strength`."""
     lost: tuple[str, ...] = ()
-    """Names of unsupported inputs that have an effect."""
-    has_networks: bool = False
-    """True where nodes that are not read, or values that are not finite, feed an input."""
+    """Words for unsupported inputs that have an effect, and for networks that feed an input."""
 
     @property
     def is_specular(self) -> bool:
@@ -232,6 +241,9 @@ def read_material(
     if material.GetDisplacementOutput().HasConnectedSource():
         opened.lost.append(f"{material.GetPath()}: its displacement has no place here")
     lost = reader.note_unsupported(known)
+    words = {word for name in lost for start, word in _LOST.items() if name.startswith(start)}
+    if reader.textures.pop("ior", None):
+        opened.lost.append(f"{shader.GetPath()}.ior: its texture is not read; 1.5 taken")
     return StatedMaterial(
         name=str(material.GetPrim().GetName()),
         where=str(shader.GetPath()),
@@ -239,8 +251,7 @@ def read_material(
         textures=reader.textures,
         primvars=reader.primvars,
         has_strength="strength" in NAMES[shader.GetShaderId()],
-        lost=lost,
-        has_networks=has_networks,
+        lost=tuple(sorted(words | {"networks of shaders"} if has_networks else words)),
     )
 
 
@@ -280,13 +291,17 @@ class ShaderReader:
 
     def constant(self, name: str) -> NDArray[np.float32]:
         """Return the constant [3] of an input; a number fills all channels."""
-        if name in self._fallbacks:
-            return self._finite(name, self._fallbacks[name])
+        default = self._defaults[name]
+        stated = self._fallbacks.get(name)
         sources = self._sources(name)
-        stated = sources[0].Get(self._time) if sources and not is_output(sources[0]) else None
-        if stated is None:
-            return self._finite(name, self._defaults[name])
-        return self._finite(name, convert_to_rec709(sources[0], np.array(stated)))
+        if sources and not is_output(sources[0]):
+            stated = sources[0].Get(self._time)
+            stated = None if stated is None else convert_to_rec709(sources[0], np.array(stated))
+        value = parse_color(default if stated is None else stated)
+        if value is None:
+            self._lose(name, "no finite number or color")
+            return np.broadcast_to(np.array(default, np.float32), 3)
+        return value
 
     def weight(self) -> NDArray[np.float32]:
         """Return the factor [3] of a base color; a textured one is not multiplied."""
@@ -326,13 +341,6 @@ class ShaderReader:
         if sources and is_output(sources[0]):
             return None
         return parse_color(read_input(self._shader, name, self._time, default))
-
-    def _finite(self, name: str, stated: Any) -> NDArray[np.float32]:
-        value = parse_color(stated)
-        if value is None:
-            self._lose(name, "no finite number or color")
-            value = np.array(self._defaults[name], np.float32)
-        return np.broadcast_to(value, 3).astype(np.float32)
 
     def _sources(self, name: str) -> Any:
         return find_sources(self._shader, self._names.get(name, name))
