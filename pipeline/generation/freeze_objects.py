@@ -336,7 +336,7 @@ class ObjectLock:
             settings=self.settings.mesh_settings,
             writer=self.writer,
             fetch=None
-            if listed.listing.is_local
+            if listed.listing.fetch is None
             else lambda of_batch: listed.fetch(of_batch, announce),
         )
         return prepare_in_batches(

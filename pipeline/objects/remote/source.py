@@ -361,4 +361,4 @@ def _fetch(folder: RemoteFolder, records: list[ObjectRecord], downloaded: CountD
             message = f"{folder.display_url(name)}: {error.message}"
             raise TransferFailed(error.reason, message) from error
 
-    return fetch_all(records, fetch, downloaded, folder.stop)
+    return fetch_all(records, fetch, downloaded, folder.stop.set)
