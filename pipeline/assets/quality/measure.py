@@ -161,7 +161,7 @@ class MeasuredSource:
         """Sample a clean mesh of the unit box."""
         self.mesh = mesh
         self.surface = Surface(mesh, rng_for(0, "asset-error").random((_NUM_POINTS, 3)))
-        component = label_components(mesh)
+        component = np.asarray(igl.facet_components(mesh.faces)[1], np.int64)  # over edges
         self._component = component[self.surface.point_faces]
         extents = _diagonals(mesh, component) / mesh.diagonal
         self.num_components = len(extents)
@@ -208,11 +208,6 @@ class MeasuredSource:
             min_angle_p5_deg=round_digits(np.percentile(smallest_angles_deg(result), 5)),
             open_edges=int((faces_of_edges(result) == 1).sum()),
         )
-
-
-def label_components(mesh: TriangleMesh) -> NDArray[np.int64]:
-    """Return the component [F] of each face; faces connect over edges."""
-    return np.asarray(igl.facet_components(mesh.faces)[1], np.int64)
 
 
 def _diagonals(mesh: TriangleMesh, part: NDArray[np.int64]) -> NDArray[np.float64]:

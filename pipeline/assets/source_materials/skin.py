@@ -34,7 +34,6 @@ from pipeline.foreign.gltf.primitives import gltf_textured_mesh
 from pipeline.foreign.material import TexturedMesh
 from pipeline.foreign.mesh import TriangleMesh
 from pipeline.foreign.mesh_materials import read_textured_mesh
-from pipeline.foreign.numbers import FINITE
 from pipeline.foreign.picture import Decode, Decoder, spread_points
 from pipeline.foreign.source_file import SourceFile
 from storage.conventions import linear_from_srgb8, srgb8
@@ -457,13 +456,12 @@ def add_skin(level: Level, surface: SourceSurface, settings: OwnMaterialSettings
         texels_per_length=round_digits(texels.density),
     )
     _require_near(quality, level.record.budget, settings)
-    glow = level_emission(mesh, surface, reach)
-    _require_lawful(textures, glow)
+    _require_lawful(textures)
     skin = LevelSkin(
         uv=uv,
         packed={name: pack_map(texture) for name, texture in textures.items()},
         quality=quality,
-        emission=glow,
+        emission=level_emission(mesh, surface, reach),
     )
     return dataclasses.replace(level, skin=skin)
 
@@ -483,14 +481,12 @@ def _require_near(quality: SkinQuality, budget: int, settings: OwnMaterialSettin
         )
 
 
-def _require_lawful(textures: Mapping[str, Texture], emission: NDArray[np.float32] | None) -> None:
+def _require_lawful(textures: Mapping[str, Texture]) -> None:
     try:
         for column in TEXTURED:
             textures[column].check(column)
     except TrilightError as error:
         raise Rejected("materials_unreadable", str(error)) from error
-    if emission is not None and not FINITE.holds(emission).all():
-        raise Rejected("materials_unreadable", f"it emits {emission.max()}; expected {FINITE}")
 
 
 def read_source_surface(

@@ -50,7 +50,7 @@ class _Furniture:
         self.splay = float(rng.choice([0.0, rng.uniform(0.02, 0.09)]))
         self.stretchers = rng.random() < 0.5  # whether bars join the legs near the floor
         self.back = rng.uniform(0.35, 0.65)  # height of a chair's back over its seat
-        # boards of a chair's back or of a bench-like top; 1 is a plain one
+        # boards of a chair's back or of a bench-like top
         self.slats = int(rng.integers(3, 8))
         self.level_slats = rng.random() < 0.4  # whether the back's boards lie level
         # thickness and height of the books on a shelf, from its lowest board upwards
@@ -80,7 +80,7 @@ def _top(params: _Furniture) -> list[Mesh]:
         outline += [(r, -z) for r, z in reversed(outline)]
         positions, faces = lathe(outline, 32)
         return [(positions + np.array([0, 0, high - half]), faces)]
-    if params.kind == "chair" or params.slats == 1:
+    if params.kind == "chair":
         size = [params.width / 2, params.depth / 2, half]
         return [box([0, 0, high - half], size, 0.25 * params.board)]
     step = params.depth / params.slats

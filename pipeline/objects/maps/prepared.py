@@ -24,6 +24,7 @@ from safetensors.numpy import save
 from scipy.sparse import csr_array
 
 from pipeline.foreign.linear_picture import clip_to_unit
+from pipeline.foreign.material_files import read_regular
 from pipeline.foreign.picture import FORMATS, UNREADABLE_PICTURE, read_linear_picture
 from pipeline.objects.maps.texture_names import PACKED, TEXTURE_PARTS
 from storage.conventions import linear_from_srgb
@@ -237,11 +238,7 @@ def unpack_parts(
 
 def _read(path: Path) -> bytes:
     try:
-        if not path.is_file():
-            raise Rejected("missing_file", f"{path.name} is no file")
-        if (size := path.stat().st_size) > MOST_BYTES:
-            raise Rejected("too_large_bytes", f"{size} bytes; expected at most {MOST_BYTES}")
-        return path.read_bytes()
+        return read_regular(path, MOST_BYTES)
     except OSError as error:
         raise Rejected("missing_file", f"cannot be read ({error.strerror})") from error
 
