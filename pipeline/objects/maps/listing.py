@@ -136,38 +136,33 @@ def _scan_pictures(
 ) -> list[ObjectRecord]:
     """Return a record of each texture or map, and add a failure for each other picture."""
     every = [name for name in drop_outputs(walk_files(root)) if not _is_hidden(name)]
-    names = sorted(name for name in every if name.lower().endswith(SUFFIXES[kind]))
-    outside = {name for name in names if not is_below(root, root / name)}
-    names = [name for name in names if name not in outside]
+    pictures = sorted(name for name in every if name.lower().endswith(SUFFIXES[kind]))
+    names = [name for name in pictures if is_below(root, root / name)]
     unused = {
         name: ("unread_format", f"expected {' '.join(SUFFIXES[kind])}; convert or unpack it")
         for name in every
         if name.lower().rpartition(".")[2] in _UNREAD[kind]
     }
     message = "it is a link out of the folder; copy the file into it"
-    unused |= dict.fromkeys(sorted(outside), ("link_outside", message))
-    bases = {name.rpartition(".")[0]: name for name in reversed(names)}
+    unused |= dict.fromkeys(sorted({*pictures} - {*names}), ("link_outside", message))
+    bases = [(name.rpartition(".")[0], name) for name in names]
     if kind == TEXTURE:
         textures, unused_pictures = group_textures(names)
-        bases = {stem: files["base"] for stem, files in textures.items()}
+        bases = [(stem, files["base"]) for stem, files in textures.items()]
         unused |= unused_pictures
-    else:
-        message = "another file of the same name is taken; rename one of them"
-        twins = [name for name in names if bases[name.rpartition(".")[0]] != name]
-        unused |= dict.fromkeys(twins, ("name_clash", message))
+    records: dict[str, ObjectRecord] = {}
+    for stem, name in bases:
+        title = printable(stem).rpartition("/")[2]
+        record = file_record(
+            f"{kind}:{printable(stem)}", {**stated, "path": str(root / name), "title": title}
+        )
+        if records.setdefault(record.uid, record) is not record:
+            message = "another file of the same name is taken; rename one of them"
+            unused[name] = ("name_clash", message)
     failures += [
         failure(f"{kind}:{printable(name)}", reason, printable(message))
         for name, (reason, message) in unused.items()
     ]
-    records: dict[str, ObjectRecord] = {}
-    for stem, name in bases.items():
-        uid = f"{kind}:{printable(stem)}"
-        if uid in records:
-            message = "another file of the same name is taken; rename one of them"
-            failures.append(failure(f"{kind}:{printable(name)}", "name_clash", message))
-        else:
-            title = printable(stem).rpartition("/")[2]
-            records[uid] = file_record(uid, {**stated, "path": str(root / name), "title": title})
     return list(records.values())
 
 
