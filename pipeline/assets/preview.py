@@ -59,15 +59,12 @@ def preview(mesh: TriangleMesh, width_px: int) -> NDArray[np.uint8]:
     """
     hits = _CameraHits(mesh, width_px * _SUPERSAMPLE)
     grey = np.where(hits.facing >= 0, 0.25 + 0.65 * hits.facing, 0.10 - 0.25 * hits.facing)
-    nearest = np.full(len(grey), np.inf)
-    for k in range(3):
-        edge = hits.corners[:, (k + 1) % 3] - hits.corners[:, k]
-        edge /= np.linalg.norm(edge, axis=1, keepdims=True)
-        across = np.linalg.norm(np.cross(hits.points - hits.corners[:, k], edge), axis=1)
-        nearest = np.minimum(nearest, across)
+    edges = np.roll(hits.corners, -1, axis=1) - hits.corners
+    edges /= np.linalg.norm(edges, axis=2, keepdims=True)
+    across = np.linalg.norm(np.cross(hits.points[:, None] - hits.corners, edges), axis=2)
     size_px = np.sqrt(hits.double_areas) / hits.pixel
     strength = np.interp(size_px, _LINED_PX, (0.0, 0.55))
-    lined = np.where(nearest < _LINE_PX * hits.pixel, (1 - strength) * grey, grey)
+    lined = np.where(across.min(axis=1) < _LINE_PX * hits.pixel, (1 - strength) * grey, grey)
     return np.round(255 * hits.picture(lined)).astype(np.uint8)
 
 

@@ -100,38 +100,26 @@ def pack_atlas(cells: NDArray[np.int64]) -> Atlas:
 
     Squares come from the largest on; two tiles of equal size share one.
     """
-    squares: list[int] = []
-    square_of = np.zeros(len(cells), np.int64)
-    is_turned = np.zeros(len(cells), np.bool_)
-    half_free = 0  # cells of the tile that would fit into the last square
-    for tile in np.argsort(-cells, kind="stable"):
-        count = int(cells[tile])
-        if count and count == half_free:
-            is_turned[tile] = True
-            half_free = 0
-        else:
-            squares.append(count + _GUTTER if count else FLAT)
-            half_free = count
-        square_of[tile] = len(squares) - 1
-    area = sum(side * side for side in squares)
-    width = max([int(np.ceil(np.sqrt(area))), *squares[:1]])
-    corners = np.zeros((len(squares), 2), np.int64)
-    x = y = tallest = 0
-    for number, side in enumerate(squares):
+    order = np.argsort(-cells, kind="stable")
+    size = cells[order]
+    rank = np.arange(len(size)) - np.searchsorted(-size, -size)  # among tiles of equal size
+    turned = (rank % 2 == 1) & (size > 0)
+    sides = np.where(size > 0, size + _GUTTER, FLAT)[~turned].tolist()
+    width = max([int(np.ceil(np.sqrt(sum(side * side for side in sides)))), *sides[:1]])
+    corners = []
+    x = y = height = 0
+    for side in sides:
         if x + side > width:
             x = 0
-            y += tallest
-            tallest = 0
-        corners[number] = x, y
+            y = height
+        corners.append((x, y))
         x += side
-        tallest = max(tallest, side)
-    return Atlas(
-        width=width,
-        height=y + tallest,
-        corner=corners[square_of],
-        is_turned=is_turned,
-        cells=cells,
-    )
+        height = max(height, y + side)
+    corner = np.zeros((len(cells), 2), np.int64)
+    corner[order] = np.array(corners)[np.cumsum(~turned) - 1]
+    is_turned = np.zeros(len(cells), np.bool_)
+    is_turned[order] = turned
+    return Atlas(width=width, height=height, corner=corner, is_turned=is_turned, cells=cells)
 
 
 _INSET = 0.02
@@ -190,8 +178,7 @@ def _bake(
     corners = np.take_along_axis(level.corners, order, axis=1)
     cells, density = _cells(corners, settings)
     texels = _bake_texels(corners, cells, source, reach, density)
-    is_flat = _is_flat(texels)
-    tile_of, first_of = _tiles(is_flat, texels)
+    tile_of, first_of, is_flat = _tiles(texels)
     plan = pack_atlas(np.where(is_flat, 0, cells)[first_of])
     uv = np.zeros((len(corners), 3, 2), np.float32)
     np.put_along_axis(uv, order, plan.uv(tile_of), axis=1)
@@ -260,14 +247,6 @@ def _codes(columns: NDArray[np.float64]) -> NDArray[np.uint8]:
     return np.concatenate([srgb8(columns[..., DIFFUSE]), numbers], axis=-1)
 
 
-def _is_flat(texels: _Texels) -> NDArray[np.bool_]:
-    """Return [F] True where all texels of a tile have the same 8-bit codes, and flat normals."""
-    starts = texels.start[:-1]
-    low = np.minimum.reduceat(texels.codes, starts, axis=0)
-    high = np.maximum.reduceat(texels.codes, starts, axis=0)
-    return (low == high).all(axis=1) & _has_flat_normals(low)
-
-
 def _has_flat_normals(codes: NDArray[np.uint8]) -> NDArray[np.bool_]:
     """Return [N] True for rows of codes whose normal is flat, or that have none."""
     normals = codes[:, NORMAL]
@@ -275,17 +254,21 @@ def _has_flat_normals(codes: NDArray[np.uint8]) -> NDArray[np.bool_]:
 
 
 def _tiles(
-    is_flat: NDArray[np.bool_], texels: _Texels
-) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
-    """Return the tile [F] of each triangle, and the first triangle [K] of each tile.
+    texels: _Texels,
+) -> tuple[NDArray[np.int64], NDArray[np.int64], NDArray[np.bool_]]:
+    """Return the tile [F] of each triangle, the first triangle [K] of each tile, and a mask [F].
 
-    Triangles of the same flat color share a tile.
+    The mask is True where all texels of a triangle have the same 8-bit codes, and flat normals.
+    Such triangles of the same color share a tile.
     """
-    codes = texels.codes[texels.start[:-1]].astype(np.int64)
+    starts = texels.start[:-1]
+    low = np.minimum.reduceat(texels.codes, starts, axis=0)
+    high = np.maximum.reduceat(texels.codes, starts, axis=0)
+    is_flat = (low == high).all(axis=1) & _has_flat_normals(low)
     number = np.where(is_flat, 0, 1 + np.arange(len(is_flat)))
-    names = np.column_stack([number, np.where(is_flat[:, None], codes, 0)])
+    names = np.column_stack([number, np.where(is_flat[:, None], low, 0)])
     _, first, tile = np.unique(names, axis=0, return_index=True, return_inverse=True)
-    return tile.ravel(), first
+    return tile.ravel(), first, is_flat
 
 
 def _atlas_codes(plan: Atlas, first_of: NDArray[np.int64], texels: _Texels) -> NDArray[np.uint8]:
