@@ -212,12 +212,11 @@ class MeasuredSource:
 
 def _diagonals(mesh: TriangleMesh, part: NDArray[np.int64]) -> NDArray[np.float64]:
     """Return [P] diagonals of the bounding box of each component."""
-    count = int(part.max()) + 1
-    low = np.full((count, 3), np.inf)
-    high = np.full((count, 3), -np.inf)
-    for corner in mesh.corners.transpose(1, 0, 2):
-        np.minimum.at(low, part, corner)
-        np.maximum.at(high, part, corner)
+    order = np.argsort(part, kind="stable")
+    starts = np.searchsorted(part[order], np.arange(part.max() + 1))
+    corners = mesh.corners[order]
+    low = np.minimum.reduceat(corners.min(axis=1), starts, axis=0)
+    high = np.maximum.reduceat(corners.max(axis=1), starts, axis=0)
     return np.linalg.norm(high - low, axis=1)
 
 
