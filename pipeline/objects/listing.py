@@ -33,13 +33,6 @@ def failure(uid: str, reason: str, message: str) -> Failure:
     return Failure(stage="objects", item=uid, reason=reason, message=message)
 
 
-def is_object_file(name: str) -> bool:
-    """Return True for the path of an object file without hidden folders."""
-    return name.lower().endswith(SUFFIXES) and not any(
-        part.startswith(".") for part in name.split("/")
-    )
-
-
 def assign_uids(names: Iterable[str]) -> tuple[dict[str, str], list[Failure]]:
     """Return the uid of every file, and a failure for each file without a unique one.
 

@@ -267,24 +267,6 @@ def check_level(
             f"p99 distance {error:.2%} at {budget} faces; expected <= {max_error_p99:.2%}",
         )
     quality = source.quality(mesh, deviation)
-    _check_shape(quality, budget, gate)
-    return mesh, quality
-
-
-def _check_vertices(result: TriangleMesh, source: TriangleMesh, max_outside: float) -> None:
-    used = result.positions[np.unique(result.faces)]
-    if len(used) == 0:
-        raise Rejected("budget_missed", "no face is left")
-    if not np.isfinite(used).all():
-        raise Rejected("nonfinite_result", "a vertex of the result is not finite")
-    low = source.positions.min(axis=0)
-    high = source.positions.max(axis=0)
-    outside = float(np.maximum(low - used, used - high).max()) / source.diagonal
-    if outside > max_outside:
-        raise Rejected("bbox_escaped", f"a vertex is {outside:.2%} of the diagonal outside the box")
-
-
-def _check_shape(quality: LevelQuality, budget: int, gate: GateSettings) -> None:
     if quality.normal_error_deg > gate.max_normal_error_deg:
         raise Rejected(
             "normals_changed",
@@ -303,6 +285,20 @@ def _check_shape(quality: LevelQuality, budget: int, gate: GateSettings) -> None
             f"parts with {quality.lost_area:.1%} of the area are gone at {budget} faces; "
             f"expected <= {gate.max_lost_area:.1%}",
         )
+    return mesh, quality
+
+
+def _check_vertices(result: TriangleMesh, source: TriangleMesh, max_outside: float) -> None:
+    used = result.positions[np.unique(result.faces)]
+    if len(used) == 0:
+        raise Rejected("budget_missed", "no face is left")
+    if not np.isfinite(used).all():
+        raise Rejected("nonfinite_result", "a vertex of the result is not finite")
+    low = source.positions.min(axis=0)
+    high = source.positions.max(axis=0)
+    outside = float(np.maximum(low - used, used - high).max()) / source.diagonal
+    if outside > max_outside:
+        raise Rejected("bbox_escaped", f"a vertex is {outside:.2%} of the diagonal outside the box")
 
 
 def require_watertight(mesh: TriangleMesh) -> None:

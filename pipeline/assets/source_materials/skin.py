@@ -430,7 +430,15 @@ def add_skin(level: Level, surface: SourceSurface, settings: OwnMaterialSettings
     reach = max(_LEAST_REACH, 1.5 * level.record.quality.error_max * surface.mesh.diagonal)
     uv, textures, texels = _bake(mesh, surface, settings, reach)
     texel = 1 / texels.density
-    error = _color_errors(mesh, uv, textures[TEXTURED[0]], surface, texel)
+    # mean color differences at points spread evenly over the source
+    uniform = rng_for(0, "own-materials").random((_NUM_POINTS, 3))
+    points, source_faces = sample_surface(surface.mesh, uniform)
+    at = FacePoints(source_faces, barycentric(surface.mesh.corners[source_faces], points))
+    source_rgb = surface.columns(at, texel)[:, DIFFUSE]
+    _, faces, nearest = igl.point_mesh_squared_distance(points, mesh.positions, mesh.faces)
+    faces = np.asarray(faces, np.int64).ravel()
+    places = np.einsum("nc,ncd->nd", barycentric(mesh.corners[faces], nearest), uv[faces])
+    error = np.abs(texture_values(textures[TEXTURED[0]], places) - source_rgb).mean(axis=1)
     quality = SkinQuality(
         colour_error=round_digits(error.mean()),
         colour_error_p95=round_digits(np.percentile(error, 95)),
@@ -501,25 +509,6 @@ def _parts(source: SourceFile, decode: Decode, settings: OwnMaterialSettings) ->
         materials = GltfMaterials(source.gltf, decode, emission=emission, normals=normals)
         return gltf_textured_mesh(source.gltf, materials)
     return read_textured_mesh(source, decode, emission=emission, normals=normals)
-
-
-def _color_errors(
-    level: TriangleMesh,
-    uv: NDArray[np.float32],
-    diffuse: Texture,
-    source: SourceSurface,
-    texel: float,
-) -> NDArray[np.float64]:
-    """Return the mean color difference [N] at points spread evenly over the source."""
-    uniform = rng_for(0, "own-materials").random((_NUM_POINTS, 3))
-    points, point_faces = sample_surface(source.mesh, uniform)
-    weights = barycentric(source.mesh.corners[point_faces], points)
-    at = FacePoints(point_faces, weights)
-    source_rgb = source.columns(at, texel)[:, DIFFUSE]
-    _, faces, nearest = igl.point_mesh_squared_distance(points, level.positions, level.faces)
-    faces = np.asarray(faces, np.int64).ravel()
-    places = np.einsum("nc,ncd->nd", barycentric(level.corners[faces], nearest), uv[faces])
-    return np.abs(texture_values(diffuse, places) - source_rgb).mean(axis=1)
 
 
 def _torn_seams(level: TriangleMesh, source: SourceSurface, reach: float, texel: float) -> float:

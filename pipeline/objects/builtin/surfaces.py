@@ -354,7 +354,15 @@ def sample_shell(rng: np.random.Generator) -> Mesh:
     rings = int(params.turns * params.rings_per_turn)
     inside = params.rings_per_turn // 2
     winding = np.linspace(-params.turns, 0, rings)
-    outer = _rings(winding, 1 + _relief(winding, params), params)
+    around = 2 * np.pi * np.arange(params.columns) / params.columns
+    relief = np.zeros((rings, params.columns))  # height of ribs, spines and cords, at least 0
+    if params.ribs:
+        crest = (0.5 + 0.5 * np.cos(2 * np.pi * params.ribs * winding)) ** 2
+        shoulder = np.maximum(np.cos(around + 0.7), 0) ** 6
+        relief += params.rib_height * crest[:, None] * (1 + params.spines * shoulder)
+    if params.cords:
+        relief += params.cord_height * (0.5 + 0.5 * np.cos(params.cords * around))
+    outer = _rings(winding, 1 + relief, params)
     # The lip's two edges lie on one ring of angles, the mouth's.
     back = winding[: -inside - 1 : -1]
     fade = np.linspace(1 - params.wall, 0.5 * (1 - params.wall), inside)[:, None]
@@ -366,19 +374,6 @@ def sample_shell(rng: np.random.Generator) -> Mesh:
     lean = np.array([[1, 0, 0], [0, cosine, -sine], [0, sine, cosine]])
     faces = sphere_faces(rings + inside, params.columns)
     return np.concatenate([grid, poles]) @ lean.T, faces
-
-
-def _relief(winding: NDArray[np.float64], params: _Shell) -> NDArray[np.float64]:
-    """Return the height [rings, columns] of ribs, spines and cords, at least 0."""
-    around = 2 * np.pi * np.arange(params.columns) / params.columns
-    relief = np.zeros((len(winding), params.columns))
-    if params.ribs:
-        crest = (0.5 + 0.5 * np.cos(2 * np.pi * params.ribs * winding)) ** 2
-        shoulder = np.maximum(np.cos(around + 0.7), 0) ** 6
-        relief += params.rib_height * crest[:, None] * (1 + params.spines * shoulder)
-    if params.cords:
-        relief += params.cord_height * (0.5 + 0.5 * np.cos(params.cords * around))
-    return relief
 
 
 def _rings(

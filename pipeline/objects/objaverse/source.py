@@ -112,14 +112,14 @@ def list_objaverse(source: str, allowed: Sequence[str]) -> Listing:
     stated = _read_list("object-paths.json.gz")
     paths = {uid: stated[uid] for uid in uids if _PLACE.fullmatch(str(stated.get(uid)))}
     failures = [
-        failure(_name(uid), "unknown_uid", "Objaverse 1.0 has no object of this uid")
+        failure(f"objaverse/{uid}", "unknown_uid", "Objaverse 1.0 has no object of this uid")
         for uid in uids
         if uid not in paths
     ]
     records, lost = _records(paths, allowed, count)
 
     def fetch(chosen: list[ObjectRecord], downloaded: CountDone) -> Fetched:
-        files = {_name(uid): path for uid, path in paths.items()}
+        files = {f"objaverse/{uid}": path for uid, path in paths.items()}
         return fetch_all(chosen, lambda record: _fetch_file(files[record.uid]), downloaded)
 
     return Listing(records=records, failures=[*failures, *lost], fetch=fetch)
@@ -144,7 +144,7 @@ def _records(
         annotations = read_annotations(path.split("/")[1])
         if isinstance(annotations, TransferFailed):
             message = f"annotations: {annotations.message}"
-            failures.append(failure(_name(uid), annotations.reason, message))
+            failures.append(failure(f"objaverse/{uid}", annotations.reason, message))
             continue
         record = _record(uid, annotations.get(uid) or {})
         records.append(record)
@@ -164,7 +164,7 @@ def _record(uid: str, annotation: dict[str, Any]) -> ObjectRecord:
     date = _DATE.match(_text(annotation, "publishedAt"))
     published = f"published {date[0]}" if date else "of unknown date"
     return ObjectRecord(
-        uid=_name(uid),
+        uid=f"objaverse/{uid}",
         path="",
         title=title,
         licence=_LICENCES.get(_text(annotation, "license"), UNKNOWN),
@@ -172,10 +172,6 @@ def _record(uid: str, annotation: dict[str, Any]) -> ObjectRecord:
         attribution=f"{title} by {author}" + (f" ({profile})" if profile else ""),
         source_url=_text(annotation, "viewerUrl"),
     )
-
-
-def _name(uid: str) -> str:
-    return f"objaverse/{uid}"
 
 
 def _text(row: dict[str, Any], field: str) -> str:

@@ -122,12 +122,12 @@ class RemoteFolder:
     def _names_by_find(self) -> list[str]:
         start = f"{self.url.root}/"
         listing = with_tries(lambda: self.driver.find(self.url.root, detail=True))
-        for address, facts in listing.items():
-            name = address.removeprefix(start)
-            if address.startswith(start) and name:
-                self._addresses[name] = address
-                self._facts[name] = facts
-        return sorted(self._addresses)
+        self._facts = {
+            address.removeprefix(start): facts
+            for address, facts in listing.items()
+            if address.startswith(start) and address != start
+        }
+        return sorted(self._facts)
 
     def _names_by_links(self) -> list[str]:
         """Follow the links of the server's listings, only those below the folder."""
