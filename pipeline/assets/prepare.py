@@ -5,7 +5,6 @@ from functools import partial
 from pathlib import Path
 
 import numpy as np
-from numpy.typing import NDArray
 
 from pipeline.assets.cleaning.clean import check_clean, check_raw, clean, geometry_sha256, normalize
 from pipeline.assets.cleaning.orient import orient_outward
@@ -84,13 +83,11 @@ def prepare_asset(
 
 def _count_flipped(before: TriangleMesh, after: TriangleMesh) -> int:
     """Count the faces whose winding changed: their canonical rows differ in the last two."""
-
-    def second_corners(faces: NDArray[np.int64]) -> NDArray[np.int64]:
-        low = faces[:, 1:].min(axis=1)
-        high = faces[:, 1:].max(axis=1)
-        return faces[np.lexsort((high, low, faces[:, 0])), 1]
-
-    return int((second_corners(before.faces) != second_corners(after.faces)).sum())
+    seconds = []
+    for faces in (before.faces, after.faces):
+        low, high = np.sort(faces[:, 1:], axis=1).T
+        seconds.append(faces[np.lexsort((high, low, faces[:, 0])), 1])
+    return int((seconds[0] != seconds[1]).sum())
 
 
 def _levels(

@@ -202,7 +202,10 @@ class _Preparation:
                     raise
                 death = failure
                 continue
-            asset = _carry_materials_reason(asset, attempt.asset)
+            earlier = None if asset is None else asset.materials
+            asset = attempt.asset
+            if earlier is not None and earlier.reason:  # why an earlier one lost the materials
+                asset = dataclasses.replace(asset, materials=earlier)
             unread = attempt.unread
             if attempt.method in waiting:  # it replaced a method that is not safe for this mesh
                 waiting = waiting[waiting.index(attempt.method) + 1 :]
@@ -243,13 +246,6 @@ def source_digest(
     """
     source_file = read_source(source, settings.read_limits, root)
     return source_file.kind, source_file.sha256
-
-
-def _carry_materials_reason(before: Asset | None, now: Asset) -> Asset:
-    """Return an attempt's asset, with the reason of an earlier one for missing materials."""
-    if before is None or before.materials is None or not before.materials.reason:
-        return now
-    return dataclasses.replace(now, materials=before.materials)
 
 
 def _drop_wasteful_levels(levels: list[Level]) -> tuple[Level, ...]:

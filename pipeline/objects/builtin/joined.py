@@ -244,71 +244,54 @@ def sample_tree(rng: np.random.Generator) -> Mesh:
     return join(parts)
 
 
-@dataclass(frozen=True, kw_only=True)
-class _Branch:
-    """Parameters of one branch: foot [3], direction [3], length, radius and order."""
-
-    foot: NDArray[np.float64]
-    direction: NDArray[np.float64]
-    length: float
-    radius: float
-    order: int
-
-
 def _branches(
     params: _Tree, rng: np.random.Generator
 ) -> tuple[list[Mesh], list[NDArray[np.float64]]]:
-    """Return all branches as tubes, and the ends [3] of branches without children."""
+    """Return all branches as tubes, and the ends [3] of branches without children.
+
+    Children grow along the trunk, but near the ends of other branches.
+    """
     up = np.array([0.0, 0.0, 1.0])
-    waiting = [_Branch(foot=0 * up, direction=up, length=1.0, radius=params.thickness, order=0)]
     parts: list[Mesh] = []
     ends: list[NDArray[np.float64]] = []
-    while waiting:
-        branch = waiting.pop()
-        order = branch.order
-        fraction = np.linspace(0, 1, _RINGS[order])[:, None]
+
+    def grow(
+        foot: NDArray[np.float64],
+        direction: NDArray[np.float64],
+        length: float,
+        radius: float,
+        order: int,
+    ) -> None:
+        fractions = np.linspace(0, 1, _RINGS[order])[:, None]
         bend = rng.normal(size=3) * 0.12 + params.rise * (order > 0) * up
-        path = branch.foot + branch.length * (
-            fraction * branch.direction + 0.5 * fraction**2 * bend
-        )
-        radii = branch.radius * (1 - _TAPER * fraction[:, 0])
+        path = foot + length * (fractions * direction + 0.5 * fractions**2 * bend)
+        radii = radius * (1 - _TAPER * fractions[:, 0])
         radii[0] *= 1.0 if order else 1.5
         parts.append(tube(path, radii, _SIDES[order]))
-        if order < len(params.children):
-            waiting += _children(branch, path, params, rng)
-        else:
+        if order == len(params.children):
             ends.append(path[-1])
+            return
+        count = params.children[order]
+        first = rng.uniform(0, 2 * np.pi)
+        children = []
+        for number in range(count):
+            along = 0.98 - 0.05 * number if order else 0.55 + 0.43 * number / max(count - 1, 1)
+            step = along * (len(path) - 1)
+            index = min(int(step), len(path) - 2)
+            ahead = path[index + 1] - path[index]
+            turn = (2 * np.pi / count if order else _GOLDEN) * number
+            azimuth = first + turn + rng.uniform(-0.3, 0.3)
+            heading = _branch_direction(ahead, params.spread_rad * rng.uniform(0.75, 1.2), azimuth)
+            reach = params.shrink * rng.uniform(0.85, 1.1) * length
+            # Thinner than the parent there, which hides the foot.
+            thickness = 0.75 * radius * (1 - _TAPER * along)
+            start = path[index] + (step - index) * ahead
+            children.append((start, heading, reach, thickness, order + 1))
+        for child in reversed(children):  # after all draws of this branch
+            grow(*child)
+
+    grow(0 * up, up, 1.0, params.thickness, 0)
     return parts, ends
-
-
-def _children(
-    parent: _Branch, path: NDArray[np.float64], params: _Tree, rng: np.random.Generator
-) -> list[_Branch]:
-    """Return the children of a branch: along the trunk, but near the ends of other branches."""
-    count = params.children[parent.order]
-    trunk = parent.order == 0
-    first = rng.uniform(0, 2 * np.pi)
-    branches = []
-    for number in range(count):
-        fraction = 0.55 + 0.43 * number / max(count - 1, 1) if trunk else 0.98 - 0.05 * number
-        step = fraction * (len(path) - 1)
-        index = min(int(step), len(path) - 2)
-        ahead = path[index + 1] - path[index]
-        azimuth = (
-            first + (_GOLDEN if trunk else 2 * np.pi / count) * number + rng.uniform(-0.3, 0.3)
-        )
-        spread = params.spread_rad * rng.uniform(0.75, 1.2)
-        branches.append(
-            _Branch(
-                foot=path[index] + (step - index) * ahead,
-                direction=_branch_direction(ahead, spread, azimuth),
-                length=params.shrink * rng.uniform(0.85, 1.1) * parent.length,
-                # Thinner than the parent there, which hides the foot.
-                radius=0.75 * parent.radius * (1 - _TAPER * fraction),
-                order=parent.order + 1,
-            )
-        )
-    return branches
 
 
 def _branch_direction(
