@@ -49,21 +49,10 @@ class FoundMap:
     """Picture files by component (pipeline.objects.maps.texture_names); a map has one, "map"."""
 
 
-@dataclass(frozen=True, kw_only=True)
-class FoundMaps:
-    """The usable textures or maps of a folder, and the failures."""
-
-    maps: tuple[FoundMap, ...]
-    """Textures or maps with an allowed licence, sorted by uid."""
-    failures: tuple[Failure, ...]
-    """Failures of the stage `objects` for the other files: licence_refused, no_base_colour,
-    map_not_used, unknown_map, unread_format, name_clash, link_outside."""
-
-
 def find_maps(
     kind: str, folder: str, *, licence: str | None, allowed_licences: Sequence[str]
-) -> FoundMaps:
-    """Return the usable textures or maps of a local folder.
+) -> tuple[list[FoundMap], list[Failure]]:
+    """Return the usable textures or maps of a local folder, and the failures of its other files.
 
     Args:
         kind: TEXTURE or SKY.
@@ -72,6 +61,11 @@ def find_maps(
             it count, each under the user's licence.
         licence: licence of files without a catalogue; by default user-provided.
         allowed_licences: SPDX identifiers, `LicenseRef-...`, or compound expressions.
+
+    Returns:
+        Textures or maps with an allowed licence, sorted by uid, and failures of the stage
+        `objects`: licence_refused, no_base_colour, map_not_used, unknown_map, unread_format,
+        name_clash, link_outside.
 
     Raises:
         TrilightError: the folder is missing or holds nothing, or its catalogue has a mistake.
@@ -99,10 +93,8 @@ def find_maps(
             f"{plural}.csv that lists some."
         )
     allowed, refused = refuse_licences(records, allowed_licences)
-    return FoundMaps(
-        maps=tuple(_with_files(kind, root, sorted(allowed, key=attrgetter("uid")))),
-        failures=tuple(sorted([*failures, *refused], key=attrgetter("item"))),
-    )
+    maps = _with_files(kind, root, sorted(allowed, key=attrgetter("uid")))
+    return maps, sorted([*failures, *refused], key=attrgetter("item"))
 
 
 def _with_files(kind: str, root: Path, records: Sequence[ObjectRecord]) -> list[FoundMap]:
