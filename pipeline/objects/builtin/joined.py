@@ -407,7 +407,11 @@ def sample_plant(rng: np.random.Generator) -> Mesh:
     flattest_rad = rises[1] + rng.uniform(-0.2, 0.2)  # rise of the lowest leaf
     smallest = rng.uniform(0.4, 0.8)  # size of the uppermost leaf, as a share of the largest
     pot_height = rng.uniform(0.22, 0.42)
-    parts = [_pot(pot_height, pot_foot=rng.uniform(0.55, 1.0))]
+    pot_foot = 0.28 * rng.uniform(0.55, 1.0)  # radius of the pot's foot
+    outline = [(0.9 * pot_foot, 0.0), (pot_foot, 0.02), (0.28, pot_height - 0.1)]
+    outline += [(0.31, pot_height - 0.09), (0.31, pot_height), (0.28, pot_height)]  # rim
+    outline += [(0.27, pot_height - 0.03), (0.14, pot_height - 0.025)]  # earth to just below it
+    parts = [lathe(outline, 20)]
     top = pot_height - 0.03
     if stem:
         bend = np.linspace(0, 1, 10)
@@ -453,14 +457,3 @@ def _leaf_on_stalk(
         path = foot + np.linspace(-0.02, stalk + 0.02, 5)[:, None] * direction
         parts.append(tube(path, np.linspace(0.014, 0.008, 5) * (1 + stalk), 5))
     return parts
-
-
-def _pot(height: float, pot_foot: float) -> Mesh:
-    """Return a pot with a rim, filled with earth to just below it.
-
-    `pot_foot` is the radius of its foot over that of its rim.
-    """
-    foot = 0.28 * pot_foot
-    outline = [(0.9 * foot, 0.0), (foot, 0.02), (0.28, height - 0.1), (0.31, height - 0.09)]
-    outline += [(0.31, height), (0.28, height), (0.27, height - 0.03), (0.14, height - 0.025)]
-    return lathe(outline, 20)
