@@ -202,10 +202,10 @@ class _Preparation:
                     raise
                 death = failure
                 continue
-            earlier = None if asset is None else asset.materials
+            materials = None if asset is None else asset.materials
             asset = attempt.asset
-            if earlier is not None and earlier.reason:  # why an earlier one lost the materials
-                asset = dataclasses.replace(asset, materials=earlier)
+            if materials is not None and materials.reason:  # lost in an earlier attempt
+                asset = dataclasses.replace(asset, materials=materials)
             unread = attempt.unread
             if attempt.method in waiting:  # it replaced a method that is not safe for this mesh
                 waiting = waiting[waiting.index(attempt.method) + 1 :]

@@ -94,7 +94,7 @@ def sample_rock(rng: np.random.Generator) -> Mesh:
 
 
 def _rand_cuts(rng: np.random.Generator, count: int) -> NDArray[np.float64]:
-    """Return planes [count, 4]: unit directions, even but for noise, and distances from the center."""
+    """Return planes [count, 4]: unit directions, even but for noise, and their distances."""
     index = np.arange(count) + 0.5
     z = 1 - 2 * index / count
     azimuth = np.pi * (1 + np.sqrt(5)) * index + rng.uniform(0, 6)
