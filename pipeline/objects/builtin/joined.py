@@ -279,8 +279,8 @@ def _branches(
             step = along * (len(path) - 1)
             index = min(int(step), len(path) - 2)
             ahead = path[index + 1] - path[index]
-            turn = (2 * np.pi / count if order else _GOLDEN) * number
-            azimuth = first + turn + rng.uniform(-0.3, 0.3)
+            spacing = (2 * np.pi / count if order else _GOLDEN) * number
+            azimuth = first + spacing + rng.uniform(-0.3, 0.3)
             heading = _branch_direction(ahead, params.spread_rad * rng.uniform(0.75, 1.2), azimuth)
             reach = params.shrink * rng.uniform(0.85, 1.1) * length
             # Thinner than the parent there, which hides the foot.
