@@ -176,22 +176,6 @@ def _bake(
     opposite = np.linalg.norm(edges, axis=2).argmax(axis=1)  # of the longest edge
     order = ((opposite[:, None] + np.arange(3)) % 3)[..., None]
     corners = np.take_along_axis(level.corners, order, axis=1)
-    cells, density = _cells(corners, settings)
-    texels = _bake_texels(corners, cells, source, reach, density)
-    tile_of, first_of, is_flat = _tiles(texels)
-    plan = pack_atlas(np.where(is_flat, 0, cells)[first_of])
-    uv = np.zeros((len(corners), 3, 2), np.float32)
-    np.put_along_axis(uv, order, plan.uv(tile_of), axis=1)
-    return uv, _textures(_atlas_codes(plan, first_of, texels), texels), texels
-
-
-def _cells(
-    corners: NDArray[np.float64], settings: OwnMaterialSettings
-) -> tuple[NDArray[np.int64], float]:
-    """Return the cells of each tile, and the density at which the atlas fits its size.
-
-    The first corner of each triangle lies opposite its longest edge.
-    """
     legs = np.linalg.norm(corners[:, 1:] - corners[:, :1], axis=2).max(axis=1)
     density = float(settings.texels)
     while True:
@@ -199,8 +183,14 @@ def _cells(
         cells = _SIDES[np.searchsorted(_SIDES, np.clip(least, 1, _SIDES[-1]))]
         plan = pack_atlas(cells)
         if max(plan.width, plan.height) <= settings.size or (cells == 1).all():
-            return cells, density
+            break
         density *= _SHRINK
+    texels = _bake_texels(corners, cells, source, reach, density)
+    tile_of, first_of, is_flat = _tiles(texels)
+    plan = pack_atlas(np.where(is_flat, 0, cells)[first_of])
+    uv = np.zeros((len(corners), 3, 2), np.float32)
+    np.put_along_axis(uv, order, plan.uv(tile_of), axis=1)
+    return uv, _textures(_atlas_codes(plan, first_of, texels), texels), texels
 
 
 def _bake_texels(
@@ -447,7 +437,11 @@ def add_skin(level: Level, surface: SourceSurface, settings: OwnMaterialSettings
         texels_per_length=round_digits(texels.density),
     )
     _require_near(quality, level.record.budget, settings)
-    _require_lawful(textures)
+    try:
+        for column in TEXTURED:
+            textures[column].check(column)
+    except TrilightError as error_of_law:
+        raise Rejected("materials_unreadable", str(error_of_law)) from error_of_law
     skin = LevelSkin(
         uv=uv,
         packed={name: pack_map(texture) for name, texture in textures.items()},
@@ -470,14 +464,6 @@ def _require_near(quality: SkinQuality, budget: int, settings: OwnMaterialSettin
             f"{quality.missed_cells:.1%} of the texels have no surface of the source near at "
             f"{budget} faces; expected <= {settings.max_missed:.1%}",
         )
-
-
-def _require_lawful(textures: Mapping[str, Texture]) -> None:
-    try:
-        for column in TEXTURED:
-            textures[column].check(column)
-    except TrilightError as error:
-        raise Rejected("materials_unreadable", str(error)) from error
 
 
 def read_source_surface(

@@ -362,7 +362,12 @@ def leaf_sheet(leaf: LeafParams, rise_rad: float) -> Mesh:
     slope = rise_rad - leaf.arch_rad * np.append(along, 1.0)
     steps = np.stack([np.cos(slope), 0 * slope, np.sin(slope)], axis=1) * leaf.length / leaf.rows
     rib = np.concatenate([[[0.0, 0.0, 0.0]], np.cumsum(steps[:-1], axis=0)])
-    half = 0.5 * leaf.length * leaf.width * _width(along, leaf)
+    rising = leaf.base + (1 - leaf.base) * np.sin(0.5 * np.pi * along / leaf.widest)
+    falling = np.sin(0.5 * np.pi * (1 - along) / (1 - leaf.widest)) ** 0.8
+    width = np.where(along < leaf.widest, rising, falling)
+    if leaf.teeth:
+        width = width * (1 - leaf.tooth_depth * (np.arange(leaf.rows) % 2))
+    half = 0.5 * leaf.length * leaf.width * width
     over = np.stack([-np.sin(slope), 0 * slope, np.cos(slope)], axis=1)[:-1]
     out = half[:, None] * across
     lift = np.abs(out) * np.sin(leaf.fold_rad)
@@ -428,16 +433,6 @@ def sample_plant(rng: np.random.Generator) -> Mesh:
         scaled = replace(shape, length=shape.length * size)
         parts += _leaf_on_stalk(scaled, stalk * size, foot, azimuth, rise)
     return join(parts)
-
-
-def _width(along: NDArray[np.float64], leaf: LeafParams) -> NDArray[np.float64]:
-    """Return half widths [N] over the largest: a smooth rise, a smooth fall, and notches."""
-    rising = leaf.base + (1 - leaf.base) * np.sin(0.5 * np.pi * along / leaf.widest)
-    falling = np.sin(0.5 * np.pi * (1 - along) / (1 - leaf.widest)) ** 0.8
-    width = np.where(along < leaf.widest, rising, falling)
-    if leaf.teeth:
-        width = width * (1 - leaf.tooth_depth * (np.arange(len(along)) % 2))
-    return width
 
 
 def _leaf_on_stalk(

@@ -215,20 +215,17 @@ class RemoteFolder:
         versions = self.files.parent / "versions"
         note = versions / f"{sha256_hex(os.fsencode(name))}.json"
         if not version or not _is_here(path, note, version):
-            self._transfer(name, path, size)
+            try:
+                with atomic_writer(path) as stream:
+                    target = cast(BinaryIO, _StoppableStream(stream, self.stop))
+                    download(self.url_of(name), target, num_bytes=size, max_bytes=MAX_BYTES)
+            except TrilightError as error:
+                if isinstance(error.__cause__, OSError) and error.__cause__.errno in _NAME_ERRORS:
+                    message = f"the name {printable(name)[:100]!r} clashes with another one here"
+                    raise TransferFailed("unsafe_name", message) from error
+                raise
             write_atomically(note, json.dumps(version, sort_keys=True).encode())
         return path
-
-    def _transfer(self, name: str, path: Path, size: int | None) -> None:
-        try:
-            with atomic_writer(path) as stream:
-                target = cast(BinaryIO, _StoppableStream(stream, self.stop))
-                download(self.url_of(name), target, num_bytes=size, max_bytes=MAX_BYTES)
-        except TrilightError as error:
-            if isinstance(error.__cause__, OSError) and error.__cause__.errno in _NAME_ERRORS:
-                message = f"the name {printable(name)[:100]!r} clashes with another one here"
-                raise TransferFailed("unsafe_name", message) from error
-            raise
 
     def _check_size(self, size: int) -> None:
         if size > MAX_BYTES:
