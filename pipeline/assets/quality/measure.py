@@ -163,8 +163,12 @@ class MeasuredSource:
         self.surface = Surface(mesh, rng_for(0, "asset-error").random((_NUM_POINTS, 3)))
         component = np.asarray(igl.facet_components(mesh.faces)[1], np.int64)  # over edges
         self._component = component[self.surface.point_faces]
-        extents = _diagonals(mesh, component) / mesh.diagonal
-        self.num_components = len(extents)
+        self.num_components = int(component.max()) + 1
+        order = np.argsort(component, kind="stable")
+        starts = np.searchsorted(component[order], np.arange(self.num_components))
+        low = np.minimum.reduceat(mesh.corners[order].min(axis=1), starts, axis=0)
+        high = np.maximum.reduceat(mesh.corners[order].max(axis=1), starts, axis=0)
+        extents = np.linalg.norm(high - low, axis=1) / mesh.diagonal
         self._lost_beyond = np.maximum(_OWN_SIZE * extents, _VISIBLE)[self._component]
         self._silhouette = silhouette(mesh)
         self._area = float(mesh.areas.sum())
@@ -208,16 +212,6 @@ class MeasuredSource:
             min_angle_p5_deg=round_digits(np.percentile(smallest_angles_deg(result), 5)),
             open_edges=int((faces_of_edges(result) == 1).sum()),
         )
-
-
-def _diagonals(mesh: TriangleMesh, part: NDArray[np.int64]) -> NDArray[np.float64]:
-    """Return [P] diagonals of the bounding box of each component."""
-    order = np.argsort(part, kind="stable")
-    starts = np.searchsorted(part[order], np.arange(part.max() + 1))
-    corners = mesh.corners[order]
-    low = np.minimum.reduceat(corners.min(axis=1), starts, axis=0)
-    high = np.maximum.reduceat(corners.max(axis=1), starts, axis=0)
-    return np.linalg.norm(high - low, axis=1)
 
 
 def silhouette(mesh: TriangleMesh) -> NDArray[np.bool_]:
