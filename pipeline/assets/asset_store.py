@@ -9,6 +9,7 @@ while no process uses it; its files are then computed again.
 from contextlib import AbstractContextManager
 from dataclasses import asdict, dataclass
 from pathlib import Path
+from typing import TypeVar
 
 from pipeline.assets.recipe import READERS, RECIPE
 from pipeline.assets.settings import AssetSettings
@@ -19,6 +20,10 @@ from storage.file_locks import hold_lock
 from storage.records.asset import Asset, encode_asset
 from storage.typed_json import read_json
 
+T = TypeVar("T")
+
+_REFUSAL = ".json"
+_UNREAD = ".unread.json"
 _FAN_OUT = 2
 """Letters of the key that choose a sub-folder, so that no folder holds every outcome."""
 
@@ -63,29 +68,25 @@ class AssetStore:
 
     def refusal(self, key: str) -> Rejected | None:
         """Return the refusal of a source, if any; raises TrilightError for a damaged file."""
-        path = self._refusal_path(key)
-        if not path.exists():
-            return None
-        refusal = read_json(path.read_bytes(), _Refusal, _label(path))
-        return Rejected(refusal.reason, refusal.message)
+        refusal = self._read(key, _REFUSAL, _Refusal)
+        return Rejected(refusal.reason, refusal.message) if refusal else None
 
     def unread(self, key: str) -> tuple[str, ...]:
         """Return notes on unread parts of the source; raises TrilightError for a damaged file."""
-        path = self._unread_path(key)
-        return tuple(read_json(path.read_bytes(), list[str], _label(path))) if path.exists() else ()
+        return tuple(self._read(key, _UNREAD, list[str]) or ())
 
     def save_asset(self, key: str, asset: Asset, unread: tuple[str, ...] = ()) -> None:
         """Store an asset; raises TrilightError where the store cannot be written."""
         path = self.asset_path(key)
         if unread:
-            write_atomically(self._unread_path(key), canonical_json(unread))
+            write_atomically(path.with_suffix(_UNREAD), canonical_json(unread))
         write_atomically(path, encode_asset(asset))
         remove_leftovers(path.parent, older_than_s=_OLD_S)
 
     def save_refusal(self, key: str, reason: str, message: str) -> None:
         """Store a refusal; raises TrilightError where the store cannot be written."""
         outcome = canonical_json({"reason": reason, "message": message})
-        write_atomically(self._refusal_path(key), outcome)
+        write_atomically(self.asset_path(key).with_suffix(_REFUSAL), outcome)
 
     def lock(self, key: str) -> AbstractContextManager[bool]:
         """Hold the lock of a key; wait until no other process computes its outcome.
@@ -95,12 +96,7 @@ class AssetStore:
         """
         return hold_lock(self.root / "locks" / key[:_LOCKS], wait=True)
 
-    def _unread_path(self, key: str) -> Path:
-        return self.asset_path(key).with_suffix(".unread.json")
-
-    def _refusal_path(self, key: str) -> Path:
-        return self.asset_path(key).with_suffix(".json")
-
-
-def _label(path: Path) -> str:
-    return f"{path} of the asset store (delete it, and it is made again)"
+    def _read(self, key: str, suffix: str, kind: type[T]) -> T | None:
+        path = self.asset_path(key).with_suffix(suffix)
+        label = f"{path} of the asset store (delete it, and it is made again)"
+        return read_json(path.read_bytes(), kind, label) if path.exists() else None

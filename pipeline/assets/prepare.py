@@ -1,10 +1,10 @@
 """Prepares one object: from a file to an `Asset`, in a child process that may crash."""
 
 import contextlib
+from functools import partial
 from pathlib import Path
 
 import numpy as np
-from numpy.typing import NDArray
 
 from pipeline.assets.cleaning.clean import check_clean, check_raw, clean, geometry_sha256, normalize
 from pipeline.assets.cleaning.orient import orient_outward
@@ -83,13 +83,11 @@ def prepare_asset(
 
 def _count_flipped(before: TriangleMesh, after: TriangleMesh) -> int:
     """Count the faces whose winding changed: their canonical rows differ in the last two."""
-
-    def second_corners(faces: NDArray[np.int64]) -> NDArray[np.int64]:
-        low = faces[:, 1:].min(axis=1)
-        high = faces[:, 1:].max(axis=1)
-        return faces[np.lexsort((high, low, faces[:, 0])), 1]
-
-    return int((second_corners(before.faces) != second_corners(after.faces)).sum())
+    seconds = []
+    for faces in (before.faces, after.faces):
+        low, high = np.sort(faces[:, 1:], axis=1).T
+        seconds.append(faces[np.lexsort((high, low, faces[:, 0])), 1])
+    return int((seconds[0] != seconds[1]).sum())
 
 
 def _levels(
@@ -97,39 +95,15 @@ def _levels(
 ) -> tuple[tuple[Level, ...], dict[int, tuple[str, str]]]:
     """Return the levels from the largest budget, and the reasons of the missing ones.
 
-    A budget that the level before it meets as well gets no level.
-    """
-    levels: list[Level] = []
-    missed: dict[int, tuple[str, str]] = {}
-    for budget in settings.budgets:
-        if levels and len(levels[-1].faces) <= budget:
-            continue
-        epsilon = settings.epsilon if budget == settings.budgets[0] else None
-        try:
-            levels.append(_level(source, base, settings, method, budget, epsilon))
-        except Rejected as failure:
-            missed[budget] = (failure.reason, failure.message)
-    return tuple(levels), missed
-
-
-def _level(
-    source: MeasuredSource,
-    base: LevelBase,
-    settings: AssetSettings,
-    method: str,
-    budget: int,
-    epsilon: float | None,
-) -> Level:
-    """Return the smallest level within the mesh tolerance `epsilon`, or else that of `budget`.
-
-    Raises Rejected where that one fails the quality checks.
+    A budget that the level before it meets as well gets no level. At the largest budget, the
+    smallest level within the mesh tolerance `epsilon` is taken where there is one.
     """
     num_faces = len(base.mesh.faces)
     # A source within budget is used unchanged where its triangles need not be even.
     keeps_source = settings.profile == "faithful"
     is_source = base.form == "source"
 
-    def make(faces: int, max_error_p99: float) -> tuple[str, TriangleMesh, LevelQuality]:
+    def make(max_error_p99: float, faces: int) -> tuple[str, TriangleMesh, LevelQuality]:
         if keeps_source and num_faces <= faces and is_source:
             return "source", source.mesh, source.source_quality()
         result = decimate(base.start, faces, method)
@@ -138,14 +112,26 @@ def _level(
             require_watertight(mesh)
         return method if is_source else f"{base.form} {method}", mesh, quality
 
-    made = None
-    if epsilon is not None:
-        largest = min(budget, num_faces) if keeps_source else budget
-        with contextlib.suppress(Rejected):
-            made = smallest_passing(lambda faces: make(faces, epsilon), largest)
-    used_method, mesh, quality = made or make(budget, settings.gate.max_error_p99)
-    return Level(
-        record=LevelRecord(budget=budget, method=used_method, quality=quality),
-        positions=mesh.positions.astype(np.float32),  # which holds the grid of clean ones exactly
-        faces=mesh.faces.astype(np.uint32),
-    )
+    levels: list[Level] = []
+    missed: dict[int, tuple[str, str]] = {}
+    for budget in settings.budgets:
+        if levels and len(levels[-1].faces) <= budget:
+            continue
+        made = None
+        if settings.epsilon is not None and budget == settings.budgets[0]:
+            largest = min(budget, num_faces) if keeps_source else budget
+            with contextlib.suppress(Rejected):
+                made = smallest_passing(partial(make, settings.epsilon), largest)
+        try:
+            used_method, mesh, quality = made or make(settings.gate.max_error_p99, budget)
+        except Rejected as failure:
+            missed[budget] = (failure.reason, failure.message)
+            continue
+        levels.append(
+            Level(
+                record=LevelRecord(budget=budget, method=used_method, quality=quality),
+                positions=mesh.positions.astype(np.float32),  # holds the grid of clean ones exactly
+                faces=mesh.faces.astype(np.uint32),
+            )
+        )
+    return tuple(levels), missed

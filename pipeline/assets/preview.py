@@ -13,7 +13,7 @@ from pipeline.assets.source_materials.source_surface import barycentric
 from pipeline.foreign.mesh import TriangleMesh
 from pipeline.foreign.source_file import load_mesh, read_source
 from storage.conventions import srgb8
-from storage.records.asset import Level, LevelSkin
+from storage.records.asset import Level
 from storage.records.lookup import texture_values
 
 _TOWARDS_CAMERA = np.array([0.62, -0.62, 0.48])
@@ -41,15 +41,11 @@ def preview_source_and_level(
     simplified = level_mesh(level)
     if level.skin is None:
         return preview(mesh, width_px), preview(simplified, width_px)
-    return preview(mesh, width_px), _colors(simplified, level.skin, width_px)
-
-
-def _colors(mesh: TriangleMesh, skin: LevelSkin, width_px: int) -> NDArray[np.uint8]:
-    """Return a picture [W, W, 3] of a mesh with its textures, without edge lines."""
-    hits = _CameraHits(mesh, width_px * _SUPERSAMPLE)
-    uv = np.einsum("nc,ncd->nd", barycentric(hits.corners, hits.points), skin.uv[hits.face])
-    diffuse, specular = (texture_values(texture, uv) for texture in skin.textures[:2])
-    return srgb8(hits.picture((diffuse + specular) * (0.25 + 0.75 * np.abs(hits.facing))[:, None]))
+    hits = _CameraHits(simplified, width_px * _SUPERSAMPLE)  # in color without edge lines
+    uv = np.einsum("nc,ncd->nd", barycentric(hits.corners, hits.points), level.skin.uv[hits.face])
+    diffuse, specular = (texture_values(texture, uv) for texture in level.skin.textures[:2])
+    colors = (diffuse + specular) * (0.25 + 0.75 * np.abs(hits.facing))[:, None]
+    return preview(mesh, width_px), srgb8(hits.picture(colors))
 
 
 def preview(mesh: TriangleMesh, width_px: int) -> NDArray[np.uint8]:
@@ -59,15 +55,12 @@ def preview(mesh: TriangleMesh, width_px: int) -> NDArray[np.uint8]:
     """
     hits = _CameraHits(mesh, width_px * _SUPERSAMPLE)
     grey = np.where(hits.facing >= 0, 0.25 + 0.65 * hits.facing, 0.10 - 0.25 * hits.facing)
-    nearest = np.full(len(grey), np.inf)
-    for k in range(3):
-        edge = hits.corners[:, (k + 1) % 3] - hits.corners[:, k]
-        edge /= np.linalg.norm(edge, axis=1, keepdims=True)
-        across = np.linalg.norm(np.cross(hits.points - hits.corners[:, k], edge), axis=1)
-        nearest = np.minimum(nearest, across)
+    edges = np.roll(hits.corners, -1, axis=1) - hits.corners
+    edges /= np.linalg.norm(edges, axis=2, keepdims=True)
+    across = np.linalg.norm(np.cross(hits.points[:, None] - hits.corners, edges), axis=2)
     size_px = np.sqrt(hits.double_areas) / hits.pixel
     strength = np.interp(size_px, _LINED_PX, (0.0, 0.55))
-    lined = np.where(nearest < _LINE_PX * hits.pixel, (1 - strength) * grey, grey)
+    lined = np.where(across.min(axis=1) < _LINE_PX * hits.pixel, (1 - strength) * grey, grey)
     return np.round(255 * hits.picture(lined)).astype(np.uint8)
 
 

@@ -1,9 +1,8 @@
 """Stage "assets": every object becomes a prepared asset or a rejection, each computed once."""
 
-import contextlib
 import dataclasses
 import logging
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Mapping
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import AbstractContextManager
 from dataclasses import dataclass
@@ -13,7 +12,7 @@ from pipeline.assets.asset_store import AssetStore
 from pipeline.assets.recipe import library_versions, methods_of
 from pipeline.assets.settings import AssetSettings
 from pipeline.foreign.source_file import needs_child, read_source
-from pipeline.isolation import ChildFailed, IsolatedChild, call_with_retries, reach
+from pipeline.isolation import ChildFailed, IsolatedChild, call_with_retries
 from storage.digests import sha256_hex
 from storage.errors import EnvironmentFailure, Rejected, TrilightError
 from storage.records.asset import Asset, Level, decode_asset
@@ -71,7 +70,7 @@ def prepare_assets(
 
     Args:
         records: the objects; outcomes of earlier runs come from `store`.
-        borrow_child: lends a child with the limits of this stage.
+        borrow_child: lends a child with the limits of this stage, which may read the objects.
         workers: objects that are prepared at a time.
         done: called after each object, from any thread.
 
@@ -95,28 +94,19 @@ def prepare_assets(
     return prepared, [outcome for outcome in outcomes if isinstance(outcome, Failure)]
 
 
+@dataclass(frozen=True)
 class _Preparation:
     """The preparation of one object."""
 
-    def __init__(
-        self,
-        record: ObjectRecord,
-        settings: AssetSettings,
-        store: AssetStore,
-        methods: tuple[str, ...],
-        borrow_child: BorrowChild,
-    ) -> None:
-        self._record = record
-        self._settings = settings
-        self._store = store
-        self._methods = methods
-        self._borrow_child = borrow_child
-        self._source = Path(record.path)
-        self._root = Path(record.root) if record.root else None
+    record: ObjectRecord
+    settings: AssetSettings
+    store: AssetStore
+    methods: tuple[str, ...]
+    borrow_child: BorrowChild
 
     def run(self) -> PreparedObject:
         """Load or compute the outcome; raises Rejected where there is no asset."""
-        store = self._store
+        store = self.store
         key = self._key()
         path = store.asset_path(key)
         with store.lock(key):
@@ -133,7 +123,7 @@ class _Preparation:
         data = path.read_bytes()
         asset = decode_asset(data)
         return PreparedObject(
-            record=self._record,
+            record=self.record,
             asset_name=key,
             asset_sha256=sha256_hex(data),
             geometry_sha256=asset.geometry_sha256,
@@ -142,26 +132,28 @@ class _Preparation:
             unread=(*store.unread(key), *_list_lost_properties(asset)),
         )
 
-    @contextlib.contextmanager
-    def _child(self) -> Iterator[IsolatedChild]:
-        with self._borrow_child() as child:
-            child.allow_files(reach(files=[self._source, self._root or self._source]))
-            yield child
+    @property
+    def _source(self) -> Path:
+        return Path(self.record.path)
+
+    @property
+    def _root(self) -> Path | None:
+        return Path(self.record.root) if self.record.root else None
 
     def _key(self) -> str:
         """Return the store's key; raises Rejected where the pre-flight refuses the source."""
-        arguments = self._source, self._settings, self._root
+        arguments = self._source, self.settings, self._root
         try:
             if not needs_child(self._source):
                 kind, digest = source_digest(*arguments)
             else:
-                with self._child() as child:
+                with self.borrow_child() as child:
                     kind, digest = call_with_retries(child, source_digest, *arguments)
         except ChildFailed as failure:
             raise Rejected(failure.reason, failure.sentence) from failure
         except OSError as error:
             raise Rejected("unreadable_file", f"cannot be read ({error.strerror})") from error
-        return self._store.key(kind, digest, self._settings)
+        return self.store.key(kind, digest, self.settings)
 
     def _prepare_in_child(self) -> tuple[Asset, tuple[str, ...]] | Rejected:
         """Return what the store keeps: an asset with its unread parts, or a rejection.
@@ -170,7 +162,7 @@ class _Preparation:
             Rejected: the environment failed; the store keeps nothing, and the next run tries again.
         """
         try:
-            with self._child() as child:
+            with self.borrow_child() as child:
                 return self._try_methods(child)
         except Rejected as rejection:
             return rejection
@@ -195,12 +187,12 @@ class _Preparation:
         levels: list[Level] = []
         first_miss: tuple[str, str] | None = None
         death: ChildFailed | None = None
-        missing = self._settings.budgets
-        waiting = list(self._methods)
+        missing = self.settings.budgets
+        waiting = list(self.methods)
         while waiting:
             method = waiting.pop(0)
-            settings = dataclasses.replace(self._settings, budgets=missing)
-            if missing[0] != self._settings.budgets[0]:  # epsilon is about the finest level
+            settings = dataclasses.replace(self.settings, budgets=missing)
+            if missing[0] != self.settings.budgets[0]:  # epsilon is about the finest level
                 settings = dataclasses.replace(settings, epsilon=None)
             arguments = self._source, settings, method, self._root
             try:
@@ -210,7 +202,10 @@ class _Preparation:
                     raise
                 death = failure
                 continue
-            asset = _carry_materials_reason(asset, attempt.asset)
+            materials = None if asset is None else asset.materials
+            asset = attempt.asset
+            if materials is not None and materials.reason:  # lost in an earlier attempt
+                asset = dataclasses.replace(asset, materials=materials)
             unread = attempt.unread
             if attempt.method in waiting:  # it replaced a method that is not safe for this mesh
                 waiting = waiting[waiting.index(attempt.method) + 1 :]
@@ -251,13 +246,6 @@ def source_digest(
     """
     source_file = read_source(source, settings.read_limits, root)
     return source_file.kind, source_file.sha256
-
-
-def _carry_materials_reason(before: Asset | None, now: Asset) -> Asset:
-    """Return an attempt's asset, with the reason of an earlier one for missing materials."""
-    if before is None or before.materials is None or not before.materials.reason:
-        return now
-    return dataclasses.replace(now, materials=before.materials)
 
 
 def _drop_wasteful_levels(levels: list[Level]) -> tuple[Level, ...]:

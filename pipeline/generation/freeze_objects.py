@@ -285,8 +285,8 @@ class ObjectLock:
         rows: list[tuple[LockedObject, Path]] = []
         failures: list[Failure] = []
         for kind, folder in self.map_folders.items():
-            listing = find_maps(kind, folder, licence=licence, allowed_licences=allowed)
-            outcomes = _prepare_maps(kind, listing.maps, self.settings)
+            maps, refused = find_maps(kind, folder, licence=licence, allowed_licences=allowed)
+            outcomes = _prepare_maps(kind, maps, self.settings)
             usable = [outcome for outcome in outcomes if not isinstance(outcome, Failure)]
             failures += [
                 failure(locked.uid, "not_read", notes.read_text("utf-8"))
@@ -294,11 +294,11 @@ class ObjectLock:
                 if (notes := _notes(path)).exists()
             ]
             lost = [outcome for outcome in outcomes if isinstance(outcome, Failure)]
-            failures += [*listing.failures, *lost]
+            failures += [*refused, *lost]
             if not usable:
-                first = (*lost, *listing.failures)[0]
+                first = (*lost, *refused)[0]
                 raise TrilightError(
-                    f"{PLURALS[kind]}: none of {len(lost) + len(listing.failures)} files can be "
+                    f"{PLURALS[kind]}: none of {len(lost) + len(refused)} files can be "
                     f"used; the first is {first.item}: {first.reason} ({first.message}). Fix or "
                     "replace it."
                 )
@@ -335,7 +335,7 @@ class ObjectLock:
             settings=self.settings.mesh_settings,
             writer=self.writer,
             fetch=None
-            if listed.listing.is_local
+            if listed.listing.fetch is None
             else lambda of_batch: listed.fetch(of_batch, announce),
         )
         return prepare_in_batches(

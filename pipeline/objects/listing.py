@@ -1,6 +1,5 @@
 """The listing of a source: its objects before the licence check, their uids, their downloads."""
 
-import threading
 from collections.abc import Callable, Iterable
 from concurrent.futures import ThreadPoolExecutor, as_completed
 from dataclasses import dataclass, field, replace
@@ -16,10 +15,6 @@ CountDone = Callable[[int, int], None]
 THREADS = 8
 
 
-def _already_local(records: list[ObjectRecord], downloaded: CountDone) -> Fetched:
-    return records, []
-
-
 @dataclass(frozen=True, kw_only=True)
 class Listing:
     """The objects of a source, and the function that fetches them."""
@@ -28,26 +23,14 @@ class Listing:
     """Objects in any order; the path of an object that must be fetched has no meaning yet."""
     failures: list[Failure] = field(default_factory=list)
     """Objects that are unusable, whatever their licence."""
-    fetch: Callable[[list[ObjectRecord], CountDone], Fetched] = _already_local
+    fetch: Callable[[list[ObjectRecord], CountDone], Fetched] | None = None
     """Downloads objects; returns them with their paths, and a failure for each that could not be
-    fetched. Files of this machine stay in place."""
-
-    @property
-    def is_local(self) -> bool:
-        """True where the files of all objects are on this machine already."""
-        return self.fetch is _already_local
+    fetched. None where all files are on this machine."""
 
 
 def failure(uid: str, reason: str, message: str) -> Failure:
     """Return the failure of an object that the stage `objects` refuses."""
     return Failure(stage="objects", item=uid, reason=reason, message=message)
-
-
-def is_object_file(name: str) -> bool:
-    """Return True for the path of an object file without hidden folders."""
-    return name.lower().endswith(SUFFIXES) and not any(
-        part.startswith(".") for part in name.split("/")
-    )
 
 
 def assign_uids(names: Iterable[str]) -> tuple[dict[str, str], list[Failure]]:
@@ -81,7 +64,7 @@ def fetch_all(
     records: list[ObjectRecord],
     fetch: Callable[[ObjectRecord], Path],
     downloaded: CountDone,
-    stop: threading.Event,
+    cancel: Callable[[], object] = lambda: None,
 ) -> Fetched:
     """Fetch every object; a TransferFailed of `fetch` is a failure of that object alone.
 
@@ -90,7 +73,7 @@ def fetch_all(
         fetch: returns the local path of a record's file; called in THREADS threads.
         downloaded: called in this thread with the number of finished objects, failed ones
             included, and the total.
-        stop: set where the run ends early, so that `fetch` may give up.
+        cancel: called where the run ends early, so that `fetch` may give up.
 
     Raises:
         Exception: any other error of `fetch`; fetches that have not begun are cancelled.
@@ -108,7 +91,7 @@ def fetch_all(
                     failures.append(failure(waiting[future].uid, error.reason, error.message))
                 downloaded(done, len(records))
         except BaseException:
-            stop.set()
+            cancel()
             pool.shutdown(wait=False, cancel_futures=True)
             raise
     return fetched, failures

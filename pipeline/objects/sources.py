@@ -156,7 +156,9 @@ class ListedObjects:
         return len(self.allowed) + len(self.refused)
 
     def fetch(self, records: list[ObjectRecord], downloaded: CountDone) -> Fetched:
-        """Download some of the allowed objects, as `Listing.fetch`."""
+        """Download some of the allowed objects, as `Listing.fetch`; local files stay in place."""
+        if self.listing.fetch is None:
+            return records, []
         with _resolve_source(self.source):
             return self.listing.fetch(records, downloaded)
 

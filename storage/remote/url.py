@@ -77,9 +77,9 @@ class RemoteUrl:
 
     def child(self, name: str) -> "RemoteUrl":
         """Return a file below this folder by its name, which must be a safe one."""
-        return dataclasses.replace(
-            self, root=f"{self.root}/{quote(name) if self.is_http else name}"
-        )
+        # bytes that are not UTF-8 are lone surrogates in `name`
+        inner = quote(name, errors="surrogateescape") if self.is_http else name
+        return dataclasses.replace(self, root=f"{self.root}/{inner}")
 
 
 def parse_url(source: str, *, what: str) -> RemoteUrl | Path:

@@ -72,7 +72,7 @@ def test_a_surface_repeats_and_lies_in_scenes(copied: Callable[[str], Path]) -> 
         changes = {"scenes.textures.surfaces.families": ["polka_dots"], "scenes.textures.share": 1}
         settings = preset_settings("smoke", changes=changes).scenes.textures
         look = draw_look(rng_for(0, "look"), settings)
-    assert look is not None and look.maps.family == "polka_dots"
+    assert look is not None and look.maps.source.name == "polka_dots"
     diffuse = look.maps.diffuse_rgb
     # dots in rows: half of the texels of a spacing are on the ground at least, and both paints show
     assert 2 <= len(np.unique(diffuse.reshape(-1, 3), axis=0)) < diffuse[..., 0].size / 2

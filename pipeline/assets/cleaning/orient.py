@@ -70,7 +70,12 @@ def orient_outward(mesh: TriangleMesh) -> tuple[TriangleMesh, float]:
     faces, patch = igl.bfs_orient(np.ascontiguousarray(mesh.faces))
     turned = TriangleMesh(positions=mesh.positions, faces=faces)
     votes = _front_votes(turned, patch)
-    volume = np.bincount(patch, weights=_signed_volume(turned, patch))
+    # volumes of the tetrahedra between each face and the center of its patch
+    centers = turned.corners.mean(axis=1)
+    sums = [np.bincount(patch, weights=axis) for axis in centers.T]
+    middle = np.stack(sums, axis=1) / np.bincount(patch)[:, None]
+    across = np.einsum("ij,ij->i", turned.double_area_vectors, centers - middle[patch]) / 6
+    volume = np.bincount(patch, weights=across)
     flip = (votes[0] < votes[1]) | ((votes[0] == votes[1]) & (volume < 0))
     faces = np.where(flip[patch][:, None], faces[:, [0, 2, 1]], faces)
     fronts = float(np.where(flip, votes[1], votes[0]).sum())
@@ -89,11 +94,3 @@ def _front_votes(mesh: TriangleMesh, patch: NDArray[np.int64]) -> NDArray[np.int
     num_patches = int(patch.max()) + 1
     sides = (facing < 0, facing > 0)
     return np.stack([np.bincount(seen[side], minlength=num_patches) for side in sides])
-
-
-def _signed_volume(mesh: TriangleMesh, patch: NDArray[np.int64]) -> NDArray[np.float64]:
-    """Return [F] volumes of the tetrahedra between each face and the center of its patch."""
-    centres = mesh.corners.mean(axis=1)
-    count = np.bincount(patch)
-    middle = np.stack([np.bincount(patch, weights=axis) / count for axis in centres.T], axis=1)
-    return np.einsum("ij,ij->i", mesh.double_area_vectors, centres - middle[patch]) / 6

@@ -26,7 +26,7 @@ _NO_LOCKS = _NO_OPTIONS = _NO_ERROR = 0
 
 def simplify(mesh: TriangleMesh, budget: int) -> TriangleMesh:
     """Return the mesh with at most `budget` faces where its topology allows that many collapses."""
-    return _library("0.22.0").run(
+    return _Library("0.22.0").run(
         "meshopt_simplify", mesh, (3 * budget, _ANY_ERROR, _NO_OPTIONS, _NO_ERROR)
     )
 
@@ -36,15 +36,17 @@ def simplify_sloppily(mesh: TriangleMesh, budget: int) -> TriangleMesh:
 
     Vertices that share a cell of a grid become one (Rossignac and Borrel 1993).
     """
-    return _library("0.25.0").run(
+    return _Library("0.25.0").run(
         "meshopt_simplifySloppy", mesh, (_NO_LOCKS, 3 * budget, _ANY_ERROR, _NO_ERROR)
     )
 
 
+@functools.cache
 class _Library:
     """Instance of a version of the library, with memory of its own."""
 
-    def __init__(self, path: Path) -> None:
+    def __init__(self, version: str) -> None:
+        path = Path(__file__).with_name(f"meshoptimizer-{version}.wasm")
         config = wasmtime.Config()
         config.memory_reservation = 0  # else 4 GiB of address space, which a child may not have
         config.memory_reservation_for_growth = 16 << 20
@@ -83,8 +85,3 @@ class _Library:
 
     def _call(self, function: str, *arguments: float) -> int:
         return self._exports[function](self._store, *arguments)
-
-
-@functools.cache
-def _library(version: str) -> _Library:
-    return _Library(Path(__file__).with_name(f"meshoptimizer-{version}.wasm"))

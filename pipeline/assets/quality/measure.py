@@ -161,10 +161,14 @@ class MeasuredSource:
         """Sample a clean mesh of the unit box."""
         self.mesh = mesh
         self.surface = Surface(mesh, rng_for(0, "asset-error").random((_NUM_POINTS, 3)))
-        component = label_components(mesh)
+        component = np.asarray(igl.facet_components(mesh.faces)[1], np.int64)  # over edges
         self._component = component[self.surface.point_faces]
-        extents = _diagonals(mesh, component) / mesh.diagonal
-        self.num_components = len(extents)
+        self.num_components = int(component.max()) + 1
+        order = np.argsort(component, kind="stable")
+        starts = np.searchsorted(component[order], np.arange(self.num_components))
+        low = np.minimum.reduceat(mesh.corners[order].min(axis=1), starts, axis=0)
+        high = np.maximum.reduceat(mesh.corners[order].max(axis=1), starts, axis=0)
+        extents = np.linalg.norm(high - low, axis=1) / mesh.diagonal
         self._lost_beyond = np.maximum(_OWN_SIZE * extents, _VISIBLE)[self._component]
         self._silhouette = silhouette(mesh)
         self._area = float(mesh.areas.sum())
@@ -208,22 +212,6 @@ class MeasuredSource:
             min_angle_p5_deg=round_digits(np.percentile(smallest_angles_deg(result), 5)),
             open_edges=int((faces_of_edges(result) == 1).sum()),
         )
-
-
-def label_components(mesh: TriangleMesh) -> NDArray[np.int64]:
-    """Return the component [F] of each face; faces connect over edges."""
-    return np.asarray(igl.facet_components(mesh.faces)[1], np.int64)
-
-
-def _diagonals(mesh: TriangleMesh, part: NDArray[np.int64]) -> NDArray[np.float64]:
-    """Return [P] diagonals of the bounding box of each component."""
-    count = int(part.max()) + 1
-    low = np.full((count, 3), np.inf)
-    high = np.full((count, 3), -np.inf)
-    for corner in mesh.corners.transpose(1, 0, 2):
-        np.minimum.at(low, part, corner)
-        np.maximum.at(high, part, corner)
-    return np.linalg.norm(high - low, axis=1)
 
 
 def silhouette(mesh: TriangleMesh) -> NDArray[np.bool_]:
@@ -273,24 +261,6 @@ def check_level(
             f"p99 distance {error:.2%} at {budget} faces; expected <= {max_error_p99:.2%}",
         )
     quality = source.quality(mesh, deviation)
-    _check_shape(quality, budget, gate)
-    return mesh, quality
-
-
-def _check_vertices(result: TriangleMesh, source: TriangleMesh, max_outside: float) -> None:
-    used = result.positions[np.unique(result.faces)]
-    if len(used) == 0:
-        raise Rejected("budget_missed", "no face is left")
-    if not np.isfinite(used).all():
-        raise Rejected("nonfinite_result", "a vertex of the result is not finite")
-    low = source.positions.min(axis=0)
-    high = source.positions.max(axis=0)
-    outside = float(np.maximum(low - used, used - high).max()) / source.diagonal
-    if outside > max_outside:
-        raise Rejected("bbox_escaped", f"a vertex is {outside:.2%} of the diagonal outside the box")
-
-
-def _check_shape(quality: LevelQuality, budget: int, gate: GateSettings) -> None:
     if quality.normal_error_deg > gate.max_normal_error_deg:
         raise Rejected(
             "normals_changed",
@@ -309,6 +279,20 @@ def _check_shape(quality: LevelQuality, budget: int, gate: GateSettings) -> None
             f"parts with {quality.lost_area:.1%} of the area are gone at {budget} faces; "
             f"expected <= {gate.max_lost_area:.1%}",
         )
+    return mesh, quality
+
+
+def _check_vertices(result: TriangleMesh, source: TriangleMesh, max_outside: float) -> None:
+    used = result.positions[np.unique(result.faces)]
+    if len(used) == 0:
+        raise Rejected("budget_missed", "no face is left")
+    if not np.isfinite(used).all():
+        raise Rejected("nonfinite_result", "a vertex of the result is not finite")
+    low = source.positions.min(axis=0)
+    high = source.positions.max(axis=0)
+    outside = float(np.maximum(low - used, used - high).max()) / source.diagonal
+    if outside > max_outside:
+        raise Rejected("bbox_escaped", f"a vertex is {outside:.2%} of the diagonal outside the box")
 
 
 def require_watertight(mesh: TriangleMesh) -> None:

@@ -34,7 +34,6 @@ from pipeline.foreign.gltf.primitives import gltf_textured_mesh
 from pipeline.foreign.material import TexturedMesh
 from pipeline.foreign.mesh import TriangleMesh
 from pipeline.foreign.mesh_materials import read_textured_mesh
-from pipeline.foreign.numbers import FINITE
 from pipeline.foreign.picture import Decode, Decoder, spread_points
 from pipeline.foreign.source_file import SourceFile
 from storage.conventions import linear_from_srgb8, srgb8
@@ -83,20 +82,17 @@ class Atlas:
     cells: NDArray[np.int64]
     """[K] cells a side of each tile; 0 for a flat color."""
 
-    def texels(self, tile: int, tile_texels: NDArray[np.int64]) -> NDArray[np.int64]:
-        """Return the atlas texels [P, 2] of a tile's texels [P, 2]."""
-        last = self.cells[tile] + _GUTTER - 1
-        return self.corner[tile] + (last - tile_texels if self.is_turned[tile] else tile_texels)
+    def texels(self, tile: NDArray[np.int64], tile_texels: NDArray[np.int64]) -> NDArray[np.int64]:
+        """Return the atlas texels [..., 2] of texels [..., 2] of tiles [...]."""
+        last = (self.cells[tile] + _GUTTER - 1)[..., None]
+        turned = self.is_turned[tile][..., None]
+        return self.corner[tile] + np.where(turned, last - tile_texels, tile_texels)
 
-    def uv(self, tile: int) -> NDArray[np.float64]:
-        """Return the texture coordinates [3, 2] of a tile's corners, v up."""
-        cells = int(self.cells[tile])
-        if cells == 0:
-            at = np.broadcast_to(self.corner[tile] + FLAT / 2, (3, 2)).astype(np.float64)
-        else:
-            corners = np.array([[0, 0], [cells, 0], [0, cells]])
-            at = self.texels(tile, corners).astype(np.float64) + 0.5
-        return at / np.array([self.width, self.height])
+    def uv(self, tile: NDArray[np.int64]) -> NDArray[np.float64]:
+        """Return the texture coordinates [K, 3, 2] of the corners of tiles [K], v up."""
+        cells = self.cells[tile][:, None, None]
+        texels = self.texels(tile[:, None], cells * np.array([[0, 0], [1, 0], [0, 1]]))
+        return (texels + np.where(cells == 0, FLAT / 2, 0.5)) / np.array([self.width, self.height])
 
 
 def pack_atlas(cells: NDArray[np.int64]) -> Atlas:
@@ -104,38 +100,26 @@ def pack_atlas(cells: NDArray[np.int64]) -> Atlas:
 
     Squares come from the largest on; two tiles of equal size share one.
     """
-    squares: list[int] = []
-    square_of = np.zeros(len(cells), np.int64)
-    is_turned = np.zeros(len(cells), np.bool_)
-    half_free = 0  # cells of the tile that would fit into the last square
-    for tile in np.argsort(-cells, kind="stable"):
-        count = int(cells[tile])
-        if count and count == half_free:
-            is_turned[tile] = True
-            half_free = 0
-        else:
-            squares.append(count + _GUTTER if count else FLAT)
-            half_free = count
-        square_of[tile] = len(squares) - 1
-    area = sum(side * side for side in squares)
-    width = max([int(np.ceil(np.sqrt(area))), *squares[:1]])
-    corners = np.zeros((len(squares), 2), np.int64)
-    x = y = tallest = 0
-    for number, side in enumerate(squares):
+    order = np.argsort(-cells, kind="stable")
+    size = cells[order]
+    rank = np.arange(len(size)) - np.searchsorted(-size, -size)  # among tiles of equal size
+    turned = (rank % 2 == 1) & (size > 0)
+    sides = np.where(size > 0, size + _GUTTER, FLAT)[~turned].tolist()
+    width = max([int(np.ceil(np.sqrt(sum(side * side for side in sides)))), *sides[:1]])
+    corners = []
+    x = y = height = 0
+    for side in sides:
         if x + side > width:
             x = 0
-            y += tallest
-            tallest = 0
-        corners[number] = x, y
+            y = height
+        corners.append((x, y))
         x += side
-        tallest = max(tallest, side)
-    return Atlas(
-        width=width,
-        height=y + tallest,
-        corner=corners[square_of],
-        is_turned=is_turned,
-        cells=cells,
-    )
+        height = max(height, y + side)
+    corner = np.zeros((len(cells), 2), np.int64)
+    corner[order] = np.array(corners)[np.cumsum(~turned) - 1]
+    is_turned = np.zeros(len(cells), np.bool_)
+    is_turned[order] = turned
+    return Atlas(width=width, height=height, corner=corner, is_turned=is_turned, cells=cells)
 
 
 _INSET = 0.02
@@ -157,24 +141,11 @@ SPECULAR = slice(3, 6)
 ROUGHNESS = slice(6, 7)
 """Slices of a texel's first columns, in the order of `material.source_columns`."""
 NORMAL = slice(7, 10)
-"""Slice of the columns of the normal map, where there is one."""
+SLOPES = slice(7, 9)
+"""Slices of the columns of the normal map, and of its x and y, where there is one."""
 _LEAST_SLOPE = 1.5 / 255
 """Components of a normal that 8 bits take for a flat one, whichever of two codes stands for 0."""
 _FLAT_CODE = np.round(255 * np.array(FLAT_NORMAL)).astype(np.uint8)
-
-
-@dataclass(frozen=True, kw_only=True, eq=False)
-class BakedTextures:
-    """The textures of a level, before their quality is measured."""
-
-    uv: NDArray[np.float32]
-    """[F, 3, 2] texture coordinates of the corners, v up."""
-    textures: Mapping[str, Texture]
-    """Textures by the names of TEXTURED, and the normal map where it is not flat."""
-    missed: float
-    """Fraction of the texels without a source surface nearby."""
-    density: float
-    """Texels per unit of length."""
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -184,13 +155,16 @@ class _Texels:
     start: NDArray[np.int64]  # [F + 1] first texel of each
     columns: NDArray[np.float64]  # [P, 7], or 10 with a normal map
     codes: NDArray[np.uint8]  # as they would be stored in 8 bits
-    missed: float
+    missed: float  # fraction of the texels without a source surface nearby
+    density: float  # texels per unit of length
 
 
-def bake(
+def _bake(
     level: TriangleMesh, source: SourceSurface, settings: OwnMaterialSettings, reach: float
-) -> BakedTextures:
-    """Return the baked textures of a level.
+) -> tuple[NDArray[np.float32], dict[str, Texture], _Texels]:
+    """Return texture coordinates [F, 3, 2] of a level, v up, its textures and their texels.
+
+    The textures have the names of TEXTURED; a normal map that is not flat comes with them.
 
     Args:
         level: mesh in the unit box.
@@ -200,32 +174,8 @@ def bake(
     """
     edges = np.roll(level.corners, -2, axis=1) - np.roll(level.corners, -1, axis=1)
     opposite = np.linalg.norm(edges, axis=2).argmax(axis=1)  # of the longest edge
-    order = (opposite[:, None] + np.arange(3)) % 3
-    corners = np.take_along_axis(level.corners, order[..., None], axis=1)
-    cells, density = _cells(corners, settings)
-    texels = _bake_texels(corners, cells, source, reach, density)
-    is_flat = _is_flat(texels)
-    tile_of, first_of = _tiles(is_flat, texels)
-    plan = pack_atlas(np.where(is_flat, 0, cells)[first_of])
-    uv = np.zeros((len(corners), 3, 2))
-    for face, tile in enumerate(tile_of):
-        uv[face, order[face]] = plan.uv(int(tile))
-    values = _atlas_values(plan, first_of, texels)
-    return BakedTextures(
-        uv=uv.astype(np.float32),
-        textures=_textures(values, texels),
-        missed=texels.missed,
-        density=density,
-    )
-
-
-def _cells(
-    corners: NDArray[np.float64], settings: OwnMaterialSettings
-) -> tuple[NDArray[np.int64], float]:
-    """Return the cells of each tile, and the density at which the atlas fits its size.
-
-    The first corner of each triangle lies opposite its longest edge.
-    """
+    order = ((opposite[:, None] + np.arange(3)) % 3)[..., None]
+    corners = np.take_along_axis(level.corners, order, axis=1)
     legs = np.linalg.norm(corners[:, 1:] - corners[:, :1], axis=2).max(axis=1)
     density = float(settings.texels)
     while True:
@@ -233,8 +183,14 @@ def _cells(
         cells = _SIDES[np.searchsorted(_SIDES, np.clip(least, 1, _SIDES[-1]))]
         plan = pack_atlas(cells)
         if max(plan.width, plan.height) <= settings.size or (cells == 1).all():
-            return cells, density
+            break
         density *= _SHRINK
+    texels = _bake_texels(corners, cells, source, reach, density)
+    tile_of, first_of, is_flat = _tiles(texels)
+    plan = pack_atlas(np.where(is_flat, 0, cells)[first_of])
+    uv = np.zeros((len(corners), 3, 2), np.float32)
+    np.put_along_axis(uv, order, plan.uv(tile_of), axis=1)
+    return uv, _textures(_atlas_codes(plan, first_of, texels), texels), texels
 
 
 def _bake_texels(
@@ -266,17 +222,19 @@ def _bake_texels(
             mapped[np.abs(mapped[:, :2]).max(axis=1) < _LEAST_SLOPE] = 0, 0, 1
             columns[part, NORMAL] = (mapped + 1) / 2
         missed += int(is_missed.sum())
-    numbers = np.round(columns[:, DIFFUSE.stop :] * 255).astype(np.uint8)
-    codes = np.concatenate([srgb8(columns[:, DIFFUSE]), numbers], axis=1)
-    return _Texels(start=start, columns=columns, codes=codes, missed=missed / len(points))
+    return _Texels(
+        start=start,
+        columns=columns,
+        codes=_codes(columns),
+        missed=missed / len(points),
+        density=density,
+    )
 
 
-def _is_flat(texels: _Texels) -> NDArray[np.bool_]:
-    """Return [F] True where all texels of a tile have the same 8-bit codes, and flat normals."""
-    starts = texels.start[:-1]
-    low = np.minimum.reduceat(texels.codes, starts, axis=0)
-    high = np.maximum.reduceat(texels.codes, starts, axis=0)
-    return (low == high).all(axis=1) & _has_flat_normals(low)
+def _codes(columns: NDArray[np.float64]) -> NDArray[np.uint8]:
+    """Return columns [..., 7 or 10] in 8 bits, diffuse ones sRGB-encoded."""
+    numbers = np.round(columns[..., DIFFUSE.stop :] * 255).astype(np.uint8)
+    return np.concatenate([srgb8(columns[..., DIFFUSE]), numbers], axis=-1)
 
 
 def _has_flat_normals(codes: NDArray[np.uint8]) -> NDArray[np.bool_]:
@@ -286,46 +244,46 @@ def _has_flat_normals(codes: NDArray[np.uint8]) -> NDArray[np.bool_]:
 
 
 def _tiles(
-    is_flat: NDArray[np.bool_], texels: _Texels
-) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
-    """Return the tile [F] of each triangle, and the first triangle [K] of each tile.
+    texels: _Texels,
+) -> tuple[NDArray[np.int64], NDArray[np.int64], NDArray[np.bool_]]:
+    """Return the tile [F] of each triangle, the first triangle [K] of each tile, and a mask [F].
 
-    Triangles of the same flat color share a tile.
+    The mask is True where all texels of a triangle have the same 8-bit codes, and flat normals.
+    Such triangles of the same color share a tile.
     """
-    codes = texels.codes[texels.start[:-1]].astype(np.int64)
+    starts = texels.start[:-1]
+    low = np.minimum.reduceat(texels.codes, starts, axis=0)
+    high = np.maximum.reduceat(texels.codes, starts, axis=0)
+    is_flat = (low == high).all(axis=1) & _has_flat_normals(low)
     number = np.where(is_flat, 0, 1 + np.arange(len(is_flat)))
-    names = np.column_stack([number, np.where(is_flat[:, None], codes, 0)])
+    names = np.column_stack([number, np.where(is_flat[:, None], low, 0)])
     _, first, tile = np.unique(names, axis=0, return_index=True, return_inverse=True)
-    return tile.ravel(), first
+    return tile.ravel(), first, is_flat
 
 
-def _atlas_values(plan: Atlas, first_of: NDArray[np.int64], texels: _Texels) -> NDArray[np.float64]:
-    """Return the columns of the atlas, [H, W, 7 or 10]."""
-    values = np.zeros((plan.height, plan.width, texels.columns.shape[1]))
+def _atlas_codes(plan: Atlas, first_of: NDArray[np.int64], texels: _Texels) -> NDArray[np.uint8]:
+    """Return the codes of the atlas, [H, W, 7 or 10]."""
     # Texels without a tile get a color of the object, for means over the map.
-    values[:] = texels.columns[0]
+    codes = np.tile(texels.codes[0], (plan.height, plan.width, 1))
     for tile, face in enumerate(first_of):
-        mine = slice(texels.start[face], texels.start[face + 1])
-        column, row = plan.corner[tile]
+        mine = slice(*texels.start[face : face + 2])
         cells = int(plan.cells[tile])
         if cells == 0:
-            square = slice(row, row + FLAT), slice(column, column + FLAT)
-            values[square] = texels.columns[mine].mean(axis=0)
-        else:
-            at = plan.texels(tile, tile_weights(cells)[0])
-            columns = texels.columns[mine].copy()
-            if plan.is_turned[tile]:  # and its frame with it
-                slopes = columns[:, NORMAL.start : NORMAL.start + 2]
-                slopes[:] = 1 - slopes
-            values[at[:, 1], at[:, 0]] = columns
-    return values
+            column, row = plan.corner[tile]
+            flat = texels.columns[mine].mean(axis=0)
+            codes[row : row + FLAT, column : column + FLAT] = _codes(flat)
+            continue
+        column, row = plan.texels(np.array(tile), tile_weights(cells)[0]).T
+        codes[row, column] = texels.codes[mine]
+        if plan.is_turned[tile]:  # and its frame with it
+            codes[row, column, SLOPES] = np.round((1 - texels.columns[mine, SLOPES]) * 255)
+    return codes
 
 
-def _textures(values: NDArray[np.float64], texels: _Texels) -> dict[str, Texture]:
+def _textures(codes: NDArray[np.uint8], texels: _Texels) -> dict[str, Texture]:
     """Return the maps in 8 bits; a constant map is one texel in float32."""
     constants = [_constant(texels, part) for part in _PARTS]
-    stored = [srgb8(values[..., DIFFUSE])]
-    stored += [np.round(values[..., part] * 255).astype(np.uint8) for part in _PARTS[1:]]
+    stored = [codes[..., part] for part in _PARTS]
     if constants[0] is None:
         specular = stored[1] / 255 if constants[1] is None else constants[1]
         stored[0] = _limit_diffuse(stored[0], specular)
@@ -339,8 +297,7 @@ def _textures(values: NDArray[np.float64], texels: _Texels) -> dict[str, Texture
         for name, coded, constant in zip(TEXTURED, stored, constants, strict=True)
     }
     if not _has_flat_normals(texels.codes).all():
-        normal = np.round(values[..., NORMAL] * 255).astype(np.uint8)
-        textures[NORMAL_MAP] = Texture(texels=normal)
+        textures[NORMAL_MAP] = Texture(texels=np.ascontiguousarray(codes[..., NORMAL]))
     return textures
 
 
@@ -370,7 +327,7 @@ def level_emission(
 ) -> NDArray[np.float32] | None:
     """Return the radiance [F, 3] of a level's triangles; None where nothing emits.
 
-    Arguments as those of `bake`.
+    Arguments as those of `_bake`.
 
     Raises:
         Rejected: materials_unreadable where the radiance is not a number, or too large for float32.
@@ -461,23 +418,35 @@ def add_skin(level: Level, surface: SourceSurface, settings: OwnMaterialSettings
     """
     mesh = level_mesh(level)
     reach = max(_LEAST_REACH, 1.5 * level.record.quality.error_max * surface.mesh.diagonal)
-    baked = bake(mesh, surface, settings, reach)
-    error = _color_errors(mesh, baked, surface)
+    uv, textures, texels = _bake(mesh, surface, settings, reach)
+    texel = 1 / texels.density
+    # mean color differences at points spread evenly over the source
+    uniform = rng_for(0, "own-materials").random((_NUM_POINTS, 3))
+    points, source_faces = sample_surface(surface.mesh, uniform)
+    at = FacePoints(source_faces, barycentric(surface.mesh.corners[source_faces], points))
+    source_rgb = surface.columns(at, texel)[:, DIFFUSE]
+    _, faces, nearest = igl.point_mesh_squared_distance(points, mesh.positions, mesh.faces)
+    faces = np.asarray(faces, np.int64).ravel()
+    places = np.einsum("nc,ncd->nd", barycentric(mesh.corners[faces], nearest), uv[faces])
+    error = np.abs(texture_values(textures[TEXTURED[0]], places) - source_rgb).mean(axis=1)
     quality = SkinQuality(
         colour_error=round_digits(error.mean()),
         colour_error_p95=round_digits(np.percentile(error, 95)),
-        missed_cells=round_digits(baked.missed),
-        torn_seams=round_digits(_torn_seams(mesh, surface, reach, 1 / baked.density)),
-        texels_per_length=round_digits(baked.density),
+        missed_cells=round_digits(texels.missed),
+        torn_seams=round_digits(_torn_seams(mesh, surface, reach, texel)),
+        texels_per_length=round_digits(texels.density),
     )
     _require_near(quality, level.record.budget, settings)
-    glow = level_emission(mesh, surface, reach)
-    _require_lawful(baked.textures, glow)
+    try:
+        for column in TEXTURED:
+            textures[column].check(column)
+    except TrilightError as error_of_law:
+        raise Rejected("materials_unreadable", str(error_of_law)) from error_of_law
     skin = LevelSkin(
-        uv=baked.uv,
-        packed={name: pack_map(texture) for name, texture in baked.textures.items()},
+        uv=uv,
+        packed={name: pack_map(texture) for name, texture in textures.items()},
         quality=quality,
-        emission=glow,
+        emission=level_emission(mesh, surface, reach),
     )
     return dataclasses.replace(level, skin=skin)
 
@@ -495,16 +464,6 @@ def _require_near(quality: SkinQuality, budget: int, settings: OwnMaterialSettin
             f"{quality.missed_cells:.1%} of the texels have no surface of the source near at "
             f"{budget} faces; expected <= {settings.max_missed:.1%}",
         )
-
-
-def _require_lawful(textures: Mapping[str, Texture], emission: NDArray[np.float32] | None) -> None:
-    try:
-        for column in TEXTURED:
-            textures[column].check(column)
-    except TrilightError as error:
-        raise Rejected("materials_unreadable", str(error)) from error
-    if emission is not None and not FINITE.holds(emission).all():
-        raise Rejected("materials_unreadable", f"it emits {emission.max()}; expected {FINITE}")
 
 
 def read_source_surface(
@@ -536,22 +495,6 @@ def _parts(source: SourceFile, decode: Decode, settings: OwnMaterialSettings) ->
         materials = GltfMaterials(source.gltf, decode, emission=emission, normals=normals)
         return gltf_textured_mesh(source.gltf, materials)
     return read_textured_mesh(source, decode, emission=emission, normals=normals)
-
-
-def _color_errors(
-    level: TriangleMesh, baked: BakedTextures, source: SourceSurface
-) -> NDArray[np.float64]:
-    """Return the mean color difference [N] at points spread evenly over the source."""
-    uniform = rng_for(0, "own-materials").random((_NUM_POINTS, 3))
-    points, point_faces = sample_surface(source.mesh, uniform)
-    weights = barycentric(source.mesh.corners[point_faces], points)
-    at = FacePoints(point_faces, weights)
-    source_rgb = source.columns(at, 1 / baked.density)[:, DIFFUSE]
-    _, faces, nearest = igl.point_mesh_squared_distance(points, level.positions, level.faces)
-    faces = np.asarray(faces, np.int64).ravel()
-    uv = np.einsum("nc,ncd->nd", barycentric(level.corners[faces], nearest), baked.uv[faces])
-    level_rgb = texture_values(baked.textures[TEXTURED[0]], uv)
-    return np.abs(level_rgb - source_rgb).mean(axis=1)
 
 
 def _torn_seams(level: TriangleMesh, source: SourceSurface, reach: float, texel: float) -> float:

@@ -241,9 +241,16 @@ class SourceSurface:
         return source_columns(material, seen, len(points.faces))
 
     def _sample_picture(self, slot: Slot, points: FacePoints, cell: float) -> NDArray[np.float32]:
+        """Return values [N, 4] of a picture, halved until its texels are as wide as a cell."""
         corners = self.parts.uv[points.faces, slot.uv_set] @ slot.uv_matrix.T + slot.uv_offset
         uv = np.einsum("nc,ncd->nd", points.weights, corners)
-        return slot.picture.sample(uv, _halvings(slot, corners, self._areas[points.faces], cell))
+        height, width = slot.picture.values.shape[:2]
+        steps = corners[:, 1:] - corners[:, :1]
+        on_picture = 0.5 * np.abs(steps[:, 0, 0] * steps[:, 1, 1] - steps[:, 0, 1] * steps[:, 1, 0])
+        areas = np.maximum(self._areas[points.faces], 1e-30)
+        texels = on_picture * width * height * cell**2 / areas
+        halvings = np.floor(0.5 * np.log2(np.maximum(texels, 1.0))).astype(np.int64)
+        return slot.picture.sample(uv, np.minimum(halvings, slot.picture.max_halvings))
 
     @cached_property
     def _areas(self) -> NDArray[np.float64]:
@@ -263,18 +270,6 @@ def _rotate(
     ahead = (vectors * end).sum(axis=1, keepdims=True)
     halves = np.maximum(1 + (start * end).sum(axis=1, keepdims=True), 1e-6)
     return vectors - ahead / halves * (start + end)
-
-
-def _halvings(
-    slot: Slot, corners: NDArray[np.float64], areas: NDArray[np.float64], cell: float
-) -> NDArray[np.int64]:
-    """Return the number of halvings [N] of a picture at which texels are as wide as a cell."""
-    height, width = slot.picture.values.shape[:2]
-    steps = corners[:, 1:] - corners[:, :1]
-    on_picture = 0.5 * np.abs(steps[:, 0, 0] * steps[:, 1, 1] - steps[:, 0, 1] * steps[:, 1, 0])
-    texels = on_picture * width * height * cell**2 / np.maximum(areas, 1e-30)
-    halvings = np.floor(0.5 * np.log2(np.maximum(texels, 1.0))).astype(np.int64)
-    return np.minimum(halvings, slot.picture.max_halvings)
 
 
 def match_source_surface(mesh: TriangleMesh, parts: TexturedMesh) -> SourceSurface:

@@ -50,7 +50,7 @@ class _Furniture:
         self.splay = float(rng.choice([0.0, rng.uniform(0.02, 0.09)]))
         self.stretchers = rng.random() < 0.5  # whether bars join the legs near the floor
         self.back = rng.uniform(0.35, 0.65)  # height of a chair's back over its seat
-        # boards of a chair's back or of a bench-like top; 1 is a plain one
+        # boards of a chair's back or of a bench-like top
         self.slats = int(rng.integers(3, 8))
         self.level_slats = rng.random() < 0.4  # whether the back's boards lie level
         # thickness and height of the books on a shelf, from its lowest board upwards
@@ -80,7 +80,7 @@ def _top(params: _Furniture) -> list[Mesh]:
         outline += [(r, -z) for r, z in reversed(outline)]
         positions, faces = lathe(outline, 32)
         return [(positions + np.array([0, 0, high - half]), faces)]
-    if params.kind == "chair" or params.slats == 1:
+    if params.kind == "chair":
         size = [params.width / 2, params.depth / 2, half]
         return [box([0, 0, high - half], size, 0.25 * params.board)]
     step = params.depth / params.slats
@@ -244,71 +244,54 @@ def sample_tree(rng: np.random.Generator) -> Mesh:
     return join(parts)
 
 
-@dataclass(frozen=True, kw_only=True)
-class _Branch:
-    """Parameters of one branch: foot [3], direction [3], length, radius and order."""
-
-    foot: NDArray[np.float64]
-    direction: NDArray[np.float64]
-    length: float
-    radius: float
-    order: int
-
-
 def _branches(
     params: _Tree, rng: np.random.Generator
 ) -> tuple[list[Mesh], list[NDArray[np.float64]]]:
-    """Return all branches as tubes, and the ends [3] of branches without children."""
+    """Return all branches as tubes, and the ends [3] of branches without children.
+
+    Children grow along the trunk, but near the ends of other branches.
+    """
     up = np.array([0.0, 0.0, 1.0])
-    waiting = [_Branch(foot=0 * up, direction=up, length=1.0, radius=params.thickness, order=0)]
     parts: list[Mesh] = []
     ends: list[NDArray[np.float64]] = []
-    while waiting:
-        branch = waiting.pop()
-        order = branch.order
-        fraction = np.linspace(0, 1, _RINGS[order])[:, None]
+
+    def grow(
+        foot: NDArray[np.float64],
+        direction: NDArray[np.float64],
+        length: float,
+        radius: float,
+        order: int,
+    ) -> None:
+        fractions = np.linspace(0, 1, _RINGS[order])[:, None]
         bend = rng.normal(size=3) * 0.12 + params.rise * (order > 0) * up
-        path = branch.foot + branch.length * (
-            fraction * branch.direction + 0.5 * fraction**2 * bend
-        )
-        radii = branch.radius * (1 - _TAPER * fraction[:, 0])
+        path = foot + length * (fractions * direction + 0.5 * fractions**2 * bend)
+        radii = radius * (1 - _TAPER * fractions[:, 0])
         radii[0] *= 1.0 if order else 1.5
         parts.append(tube(path, radii, _SIDES[order]))
-        if order < len(params.children):
-            waiting += _children(branch, path, params, rng)
-        else:
+        if order == len(params.children):
             ends.append(path[-1])
+            return
+        count = params.children[order]
+        first = rng.uniform(0, 2 * np.pi)
+        children = []
+        for number in range(count):
+            along = 0.98 - 0.05 * number if order else 0.55 + 0.43 * number / max(count - 1, 1)
+            step = along * (len(path) - 1)
+            index = min(int(step), len(path) - 2)
+            ahead = path[index + 1] - path[index]
+            spacing = (2 * np.pi / count if order else _GOLDEN) * number
+            azimuth = first + spacing + rng.uniform(-0.3, 0.3)
+            heading = _branch_direction(ahead, params.spread_rad * rng.uniform(0.75, 1.2), azimuth)
+            reach = params.shrink * rng.uniform(0.85, 1.1) * length
+            # Thinner than the parent there, which hides the foot.
+            thickness = 0.75 * radius * (1 - _TAPER * along)
+            start = path[index] + (step - index) * ahead
+            children.append((start, heading, reach, thickness, order + 1))
+        for child in reversed(children):  # after all draws of this branch
+            grow(*child)
+
+    grow(0 * up, up, 1.0, params.thickness, 0)
     return parts, ends
-
-
-def _children(
-    parent: _Branch, path: NDArray[np.float64], params: _Tree, rng: np.random.Generator
-) -> list[_Branch]:
-    """Return the children of a branch: along the trunk, but near the ends of other branches."""
-    count = params.children[parent.order]
-    trunk = parent.order == 0
-    first = rng.uniform(0, 2 * np.pi)
-    branches = []
-    for number in range(count):
-        fraction = 0.55 + 0.43 * number / max(count - 1, 1) if trunk else 0.98 - 0.05 * number
-        step = fraction * (len(path) - 1)
-        index = min(int(step), len(path) - 2)
-        ahead = path[index + 1] - path[index]
-        azimuth = (
-            first + (_GOLDEN if trunk else 2 * np.pi / count) * number + rng.uniform(-0.3, 0.3)
-        )
-        spread = params.spread_rad * rng.uniform(0.75, 1.2)
-        branches.append(
-            _Branch(
-                foot=path[index] + (step - index) * ahead,
-                direction=_branch_direction(ahead, spread, azimuth),
-                length=params.shrink * rng.uniform(0.85, 1.1) * parent.length,
-                # Thinner than the parent there, which hides the foot.
-                radius=0.75 * parent.radius * (1 - _TAPER * fraction),
-                order=parent.order + 1,
-            )
-        )
-    return branches
 
 
 def _branch_direction(
@@ -379,7 +362,12 @@ def leaf_sheet(leaf: LeafParams, rise_rad: float) -> Mesh:
     slope = rise_rad - leaf.arch_rad * np.append(along, 1.0)
     steps = np.stack([np.cos(slope), 0 * slope, np.sin(slope)], axis=1) * leaf.length / leaf.rows
     rib = np.concatenate([[[0.0, 0.0, 0.0]], np.cumsum(steps[:-1], axis=0)])
-    half = 0.5 * leaf.length * leaf.width * _width(along, leaf)
+    rising = leaf.base + (1 - leaf.base) * np.sin(0.5 * np.pi * along / leaf.widest)
+    falling = np.sin(0.5 * np.pi * (1 - along) / (1 - leaf.widest)) ** 0.8
+    width = np.where(along < leaf.widest, rising, falling)
+    if leaf.teeth:
+        width = width * (1 - leaf.tooth_depth * (np.arange(leaf.rows) % 2))
+    half = 0.5 * leaf.length * leaf.width * width
     over = np.stack([-np.sin(slope), 0 * slope, np.cos(slope)], axis=1)[:-1]
     out = half[:, None] * across
     lift = np.abs(out) * np.sin(leaf.fold_rad)
@@ -424,7 +412,11 @@ def sample_plant(rng: np.random.Generator) -> Mesh:
     flattest_rad = rises[1] + rng.uniform(-0.2, 0.2)  # rise of the lowest leaf
     smallest = rng.uniform(0.4, 0.8)  # size of the uppermost leaf, as a share of the largest
     pot_height = rng.uniform(0.22, 0.42)
-    parts = [_pot(pot_height, pot_foot=rng.uniform(0.55, 1.0))]
+    pot_foot = 0.28 * rng.uniform(0.55, 1.0)  # radius of the pot's foot
+    outline = [(0.9 * pot_foot, 0.0), (pot_foot, 0.02), (0.28, pot_height - 0.1)]
+    outline += [(0.31, pot_height - 0.09), (0.31, pot_height), (0.28, pot_height)]  # rim
+    outline += [(0.27, pot_height - 0.03), (0.14, pot_height - 0.025)]  # earth to just below it
+    parts = [lathe(outline, 20)]
     top = pot_height - 0.03
     if stem:
         bend = np.linspace(0, 1, 10)
@@ -441,16 +433,6 @@ def sample_plant(rng: np.random.Generator) -> Mesh:
         scaled = replace(shape, length=shape.length * size)
         parts += _leaf_on_stalk(scaled, stalk * size, foot, azimuth, rise)
     return join(parts)
-
-
-def _width(along: NDArray[np.float64], leaf: LeafParams) -> NDArray[np.float64]:
-    """Return half widths [N] over the largest: a smooth rise, a smooth fall, and notches."""
-    rising = leaf.base + (1 - leaf.base) * np.sin(0.5 * np.pi * along / leaf.widest)
-    falling = np.sin(0.5 * np.pi * (1 - along) / (1 - leaf.widest)) ** 0.8
-    width = np.where(along < leaf.widest, rising, falling)
-    if leaf.teeth:
-        width = width * (1 - leaf.tooth_depth * (np.arange(len(along)) % 2))
-    return width
 
 
 def _leaf_on_stalk(
@@ -470,14 +452,3 @@ def _leaf_on_stalk(
         path = foot + np.linspace(-0.02, stalk + 0.02, 5)[:, None] * direction
         parts.append(tube(path, np.linspace(0.014, 0.008, 5) * (1 + stalk), 5))
     return parts
-
-
-def _pot(height: float, pot_foot: float) -> Mesh:
-    """Return a pot with a rim, filled with earth to just below it.
-
-    `pot_foot` is the radius of its foot over that of its rim.
-    """
-    foot = 0.28 * pot_foot
-    outline = [(0.9 * foot, 0.0), (foot, 0.02), (0.28, height - 0.1), (0.31, height - 0.09)]
-    outline += [(0.31, height), (0.28, height), (0.27, height - 0.03), (0.14, height - 0.025)]
-    return lathe(outline, 20)

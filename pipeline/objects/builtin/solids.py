@@ -197,20 +197,19 @@ _SIGNS = np.array([[x, y, z] for x in (-1, 1) for y in (-1, 1) for z in (-1, 1)]
 
 def _box_faces() -> NDArray[np.int64]:
     """Return six sides, twelve bevels and eight corners, as triangles."""
-    faces = [(3 * corner, 3 * corner + 1, 3 * corner + 2) for corner in range(8)]
+    quads = []
     steps = (4, 2, 1)
     for axis in range(3):
         u, v = (step for other, step in enumerate(steps) if other != axis)
         b, c = (other for other in range(3) if other != axis)
-        for low in (0, steps[axis]):
-            side = [3 * (low + add) + axis for add in (0, u, u + v, v)]
-            faces += [(side[0], side[1], side[2]), (side[0], side[2], side[3])]
+        lows = (0, steps[axis])
+        quads += [[3 * (low + add) + axis for add in (0, u, u + v, v)] for low in lows]
         for low in (0, u, v, u + v):
             high = low + steps[axis]
-            edge = [3 * low + b, 3 * high + b, 3 * high + c, 3 * low + c]
-            faces += [(edge[0], edge[1], edge[2]), (edge[0], edge[2], edge[3])]
+            quads.append([3 * low + b, 3 * high + b, 3 * high + c, 3 * low + c])
+    sides = np.array(quads, np.int64)[:, [0, 1, 2, 0, 2, 3]].reshape(-1, 3)
     unit = (_SIGNS[:, None, :] * (1 - 0.25 * (1 - np.eye(3)))[None]).reshape(-1, 3)
-    return outward(unit, np.array(faces, np.int64))
+    return outward(unit, np.concatenate([np.arange(24).reshape(8, 3), sides]))
 
 
 _BOX_FACES = _box_faces()

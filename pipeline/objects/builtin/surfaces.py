@@ -78,7 +78,11 @@ def sample_rock(rng: np.random.Generator) -> Mesh:
     layer_depth = rng.uniform(0.06, 0.16)  # how far joints between layers are cut back
     frequency = rng.integers(*{"pebble": (5, 10), "broken": (9, 16)}.get(kind, (14, 18)))
     direction, faces = icosphere(int(frequency))
-    radius = _cut_ball(direction, cuts, sharpness)
+    # The hard surface is the nearest plane or the ball: the largest inverse distance. A norm of
+    # these rounds its edges: 6 is a pebble, 30 a broken stone.
+    inverse = np.maximum(direction @ cuts[:, :3].T, 0) / cuts[:, 3]
+    every = np.concatenate([inverse, np.ones((len(direction), 1))], axis=1)
+    radius = (every**sharpness).sum(axis=1) ** (-1 / sharpness)
     swing = np.sin(2 * np.pi * direction @ waves[:, :3].T + waves[:, 3]).mean(axis=1)
     radius = radius * (1 + bump_height * swing)
     if layers:
@@ -89,21 +93,8 @@ def sample_rock(rng: np.random.Generator) -> Mesh:
     return direction * radius[:, None] * sizes, faces
 
 
-def _cut_ball(
-    direction: NDArray[np.float64], planes: NDArray[np.float64], sharpness: float
-) -> NDArray[np.float64]:
-    """Return the distance [N] of the cut ball's surface in each direction [N, 3].
-
-    The hard surface is the nearest plane [K, 4]: a unit direction and the distance from the center.
-    The norm of the inverse distances rounds its edges: 6 is a pebble, 30 a broken stone.
-    """
-    inverse = np.maximum(direction @ planes[:, :3].T, 0) / planes[:, 3]
-    every = np.concatenate([inverse, np.ones((len(direction), 1))], axis=1)
-    return (every**sharpness).sum(axis=1) ** (-1 / sharpness)
-
-
 def _rand_cuts(rng: np.random.Generator, count: int) -> NDArray[np.float64]:
-    """Return planes [count, 4] in even directions with a random rotation and noise."""
+    """Return planes [count, 4]: unit directions, even but for noise, and their distances."""
     index = np.arange(count) + 0.5
     z = 1 - 2 * index / count
     azimuth = np.pi * (1 + np.sqrt(5)) * index + rng.uniform(0, 6)
@@ -354,7 +345,15 @@ def sample_shell(rng: np.random.Generator) -> Mesh:
     rings = int(params.turns * params.rings_per_turn)
     inside = params.rings_per_turn // 2
     winding = np.linspace(-params.turns, 0, rings)
-    outer = _rings(winding, 1 + _relief(winding, params), params)
+    around = 2 * np.pi * np.arange(params.columns) / params.columns
+    relief = np.zeros((rings, params.columns))  # height of ribs, spines and cords, at least 0
+    if params.ribs:
+        crest = (0.5 + 0.5 * np.cos(2 * np.pi * params.ribs * winding)) ** 2
+        shoulder = np.maximum(np.cos(around + 0.7), 0) ** 6
+        relief += params.rib_height * crest[:, None] * (1 + params.spines * shoulder)
+    if params.cords:
+        relief += params.cord_height * (0.5 + 0.5 * np.cos(params.cords * around))
+    outer = _rings(winding, 1 + relief, params)
     # The lip's two edges lie on one ring of angles, the mouth's.
     back = winding[: -inside - 1 : -1]
     fade = np.linspace(1 - params.wall, 0.5 * (1 - params.wall), inside)[:, None]
@@ -366,19 +365,6 @@ def sample_shell(rng: np.random.Generator) -> Mesh:
     lean = np.array([[1, 0, 0], [0, cosine, -sine], [0, sine, cosine]])
     faces = sphere_faces(rings + inside, params.columns)
     return np.concatenate([grid, poles]) @ lean.T, faces
-
-
-def _relief(winding: NDArray[np.float64], params: _Shell) -> NDArray[np.float64]:
-    """Return the height [rings, columns] of ribs, spines and cords, at least 0."""
-    around = 2 * np.pi * np.arange(params.columns) / params.columns
-    relief = np.zeros((len(winding), params.columns))
-    if params.ribs:
-        crest = (0.5 + 0.5 * np.cos(2 * np.pi * params.ribs * winding)) ** 2
-        shoulder = np.maximum(np.cos(around + 0.7), 0) ** 6
-        relief += params.rib_height * crest[:, None] * (1 + params.spines * shoulder)
-    if params.cords:
-        relief += params.cord_height * (0.5 + 0.5 * np.cos(params.cords * around))
-    return relief
 
 
 def _rings(

@@ -21,7 +21,7 @@ from pipeline.objects.file_filters import (
     warn_unread_formats,
 )
 from pipeline.objects.licences import UNKNOWN, require_unstated, stated_licence
-from pipeline.objects.listing import Listing, assign_uids, failure, is_object_file
+from pipeline.objects.listing import Listing, assign_uids, failure
 from storage.errors import Rejected, TrilightError
 from storage.records.objects import ObjectRecord
 from storage.records.safe_read import read_plain
@@ -275,7 +275,11 @@ def list_files(
     """
     stated = stated_licence(licence)
     names = drop_outputs(names)
-    files = [name for name in names if is_object_file(name)]
+    files = [
+        name
+        for name in names
+        if name.lower().endswith(SUFFIXES) and not name.startswith(".") and "/." not in name
+    ]
     warn_unread_formats(names, files)
     uids, failures = assign_uids(drop_duplicates(drop_more(files)))
     records = []

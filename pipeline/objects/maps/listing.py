@@ -49,21 +49,10 @@ class FoundMap:
     """Picture files by component (pipeline.objects.maps.texture_names); a map has one, "map"."""
 
 
-@dataclass(frozen=True, kw_only=True)
-class FoundMaps:
-    """The usable textures or maps of a folder, and the failures."""
-
-    maps: tuple[FoundMap, ...]
-    """Textures or maps with an allowed licence, sorted by uid."""
-    failures: tuple[Failure, ...]
-    """Failures of the stage `objects` for the other files: licence_refused, no_base_colour,
-    map_not_used, unknown_map, unread_format, name_clash, link_outside."""
-
-
 def find_maps(
     kind: str, folder: str, *, licence: str | None, allowed_licences: Sequence[str]
-) -> FoundMaps:
-    """Return the usable textures or maps of a local folder.
+) -> tuple[list[FoundMap], list[Failure]]:
+    """Return the usable textures or maps of a local folder, and the failures of its other files.
 
     Args:
         kind: TEXTURE or SKY.
@@ -72,6 +61,11 @@ def find_maps(
             it count, each under the user's licence.
         licence: licence of files without a catalogue; by default user-provided.
         allowed_licences: SPDX identifiers, `LicenseRef-...`, or compound expressions.
+
+    Returns:
+        Textures or maps with an allowed licence, sorted by uid, and failures of the stage
+        `objects`: licence_refused, no_base_colour, map_not_used, unknown_map, unread_format,
+        name_clash, link_outside.
 
     Raises:
         TrilightError: the folder is missing or holds nothing, or its catalogue has a mistake.
@@ -99,10 +93,8 @@ def find_maps(
             f"{plural}.csv that lists some."
         )
     allowed, refused = refuse_licences(records, allowed_licences)
-    return FoundMaps(
-        maps=tuple(_with_files(kind, root, sorted(allowed, key=attrgetter("uid")))),
-        failures=tuple(sorted([*failures, *refused], key=attrgetter("item"))),
-    )
+    maps = _with_files(kind, root, sorted(allowed, key=attrgetter("uid")))
+    return maps, sorted([*failures, *refused], key=attrgetter("item"))
 
 
 def _with_files(kind: str, root: Path, records: Sequence[ObjectRecord]) -> list[FoundMap]:
@@ -136,38 +128,33 @@ def _scan_pictures(
 ) -> list[ObjectRecord]:
     """Return a record of each texture or map, and add a failure for each other picture."""
     every = [name for name in drop_outputs(walk_files(root)) if not _is_hidden(name)]
-    names = sorted(name for name in every if name.lower().endswith(SUFFIXES[kind]))
-    outside = {name for name in names if not is_below(root, root / name)}
-    names = [name for name in names if name not in outside]
+    pictures = sorted(name for name in every if name.lower().endswith(SUFFIXES[kind]))
+    names = [name for name in pictures if is_below(root, root / name)]
     unused = {
         name: ("unread_format", f"expected {' '.join(SUFFIXES[kind])}; convert or unpack it")
         for name in every
         if name.lower().rpartition(".")[2] in _UNREAD[kind]
     }
     message = "it is a link out of the folder; copy the file into it"
-    unused |= dict.fromkeys(sorted(outside), ("link_outside", message))
-    bases = {name.rpartition(".")[0]: name for name in reversed(names)}
+    unused |= dict.fromkeys(sorted({*pictures} - {*names}), ("link_outside", message))
+    bases = [(name.rpartition(".")[0], name) for name in names]
     if kind == TEXTURE:
         textures, unused_pictures = group_textures(names)
-        bases = {stem: files["base"] for stem, files in textures.items()}
+        bases = [(stem, files["base"]) for stem, files in textures.items()]
         unused |= unused_pictures
-    else:
-        message = "another file of the same name is taken; rename one of them"
-        twins = [name for name in names if bases[name.rpartition(".")[0]] != name]
-        unused |= dict.fromkeys(twins, ("name_clash", message))
+    records: dict[str, ObjectRecord] = {}
+    for stem, name in bases:
+        title = printable(stem).rpartition("/")[2]
+        record = file_record(
+            f"{kind}:{printable(stem)}", {**stated, "path": str(root / name), "title": title}
+        )
+        if records.setdefault(record.uid, record) is not record:
+            message = "another file of the same name is taken; rename one of them"
+            unused[name] = ("name_clash", message)
     failures += [
         failure(f"{kind}:{printable(name)}", reason, printable(message))
         for name, (reason, message) in unused.items()
     ]
-    records: dict[str, ObjectRecord] = {}
-    for stem, name in bases.items():
-        uid = f"{kind}:{printable(stem)}"
-        if uid in records:
-            message = "another file of the same name is taken; rename one of them"
-            failures.append(failure(f"{kind}:{printable(name)}", "name_clash", message))
-        else:
-            title = printable(stem).rpartition("/")[2]
-            records[uid] = file_record(uid, {**stated, "path": str(root / name), "title": title})
     return list(records.values())
 
 

@@ -24,6 +24,7 @@ from safetensors.numpy import save
 from scipy.sparse import csr_array
 
 from pipeline.foreign.linear_picture import clip_to_unit
+from pipeline.foreign.material_files import read_regular
 from pipeline.foreign.picture import FORMATS, UNREADABLE_PICTURE, read_linear_picture
 from pipeline.objects.maps.texture_names import PACKED, TEXTURE_PARTS
 from storage.conventions import linear_from_srgb
@@ -236,11 +237,7 @@ def unpack_parts(
 
 def _read(path: Path) -> bytes:
     try:
-        if not path.is_file():
-            raise Rejected("missing_file", f"{path.name} is no file")
-        if (size := path.stat().st_size) > MOST_BYTES:
-            raise Rejected("too_large_bytes", f"{size} bytes; expected at most {MOST_BYTES}")
-        return path.read_bytes()
+        return read_regular(path, MOST_BYTES)
     except OSError as error:
         raise Rejected("missing_file", f"cannot be read ({error.strerror})") from error
 
@@ -264,7 +261,10 @@ def picture_values(data: bytes, *, is_color: bool) -> tuple[NDArray[np.float32],
         if max(values.shape) > MAX_SIDE:
             raise _too_large(values.shape[1], values.shape[0])
     values, cut = clip_to_unit(values)
-    return (_encode(values) if is_linear and is_color else values), (*unread, *cut)
+    if is_linear and is_color:
+        curve = 1.055 * values ** (1 / 2.4) - 0.055
+        values = np.where(values <= 0.0031308, values * 12.92, curve).astype(np.float32)
+    return values, (*unread, *cut)
 
 
 def are_normals(values: NDArray[np.float32]) -> bool:
@@ -272,11 +272,6 @@ def are_normals(values: NDArray[np.float32]) -> bool:
     vectors = 2 * values - 1
     is_unit = np.abs(np.linalg.norm(vectors, axis=2) - 1) < 0.05
     return values.shape[2] == 3 and bool((is_unit & (vectors[..., 2] > 0)).mean() > 0.98)
-
-
-def _encode(linear: NDArray[np.float32]) -> NDArray[np.float32]:
-    encoded = np.where(linear <= 0.0031308, linear * 12.92, 1.055 * linear ** (1 / 2.4) - 0.055)
-    return encoded.astype(np.float32)
 
 
 def _too_large(width: int, height: int) -> Rejected:

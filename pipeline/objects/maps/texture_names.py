@@ -152,31 +152,25 @@ def group_textures(
     stems = {name: name.rpartition(".")[0] for name in names}
     named = {name: entry for name in names if (entry := _parse_name(stems[name])) is not None}
     _add_letters(stems, named)
-    colors, unknown = _classify_unlabeled(stems, named)
+    _add_colors(stems, named)
+    message = "its name says no part that is known; end it in _color, or move it away"
+    unknown = [name for name in names if name not in named]
+    unused = dict.fromkeys(unknown, ("unknown_map", message))
     parts: dict[tuple[str, str], dict[str, str]] = defaultdict(dict)
-    bases: dict[tuple[str, str], tuple[str, str]] = {}
-    unused: dict[str, tuple[str, str]] = {}
-    for name in (*named, *colors):
-        entry = named.get(name) or _ParsedName(colors[name], colors[name], "base")
-        at = entry.key, entry.kind
+    for name, entry in named.items():
         if entry.part not in _READ:
             message = f"it is a map of {entry.part}; expected colors, metallic and roughness"
             unused[name] = ("map_not_used", message)
-        elif (at in bases) if entry.part == "base" else (entry.part in parts[at]):
+        elif parts[entry.key, entry.kind].setdefault(entry.part, name) != name:
             unused[name] = ("name_clash", "another file of the same name is taken; rename one")
-        elif entry.part == "base":
-            bases[at] = entry.stem, name
-        else:
-            parts[at][entry.part] = name
-    for name in unknown:
-        message = "its name says no part that is known; end it in _color, or move it away"
-        unused[name] = ("unknown_map", message)
     _drop_packed(parts.values(), unused)
     textures = {}
     used = set()
-    for (key, kind), (stem, name) in sorted(bases.items(), key=lambda item: item[1]):
-        textures[stem] = {**parts.get((key, ""), {}), **parts.get((key, kind), {}), "base": name}
-        used |= {(key, ""), (key, kind)}
+    bases = [(files["base"], at) for at, files in parts.items() if "base" in files]
+    for name, at in sorted(bases, key=lambda base: (named[base[0]].stem, base[0])):
+        shared = (at[0], "")
+        textures[named[name].stem] = {**parts.get(shared, {}), **parts[at]}
+        used |= {shared, at}
     for at, rest in parts.items():
         for part, name in rest.items() if at not in used else ():
             message = (
@@ -186,30 +180,19 @@ def group_textures(
     return textures, unused
 
 
-def _classify_unlabeled(
-    stems: Mapping[str, str], named: Mapping[str, _ParsedName]
-) -> tuple[dict[str, str], list[str]]:
-    """Classify files whose names state no component by the files next to them.
-
-    Returns:
-        Stems of colors by file name, and the names of unknown files.
-    """
+def _add_colors(stems: Mapping[str, str], named: dict[str, _ParsedName]) -> None:
+    """Add files whose names state no component, where the files next to them make them colors."""
     with_color = {entry.key for entry in named.values() if entry.part == "base"}
     keys = {entry.key for entry in named.values()}
     folders = {stems[name].rpartition("/")[0] for name in named}
     unnamed = {name: stem for name, stem in stems.items() if name not in named}
     repeated = _find_repeated(unnamed.values())
-    colors: dict[str, str] = {}
-    unknown: list[str] = []
     for name, stem in unnamed.items():
         is_alone = stem.rpartition("/")[0] not in folders and not name.lower().endswith(".exr")
         is_alone &= stem not in repeated
         is_alone &= not _NO_COLOR.fullmatch(_without_accents(stem.rpartition("/")[2]))
         if is_alone or (stem in keys and stem not in with_color):
-            colors[name] = stem
-        else:
-            unknown.append(name)
-    return colors, unknown
+            named[name] = _ParsedName(stem, stem, "base")
 
 
 def _find_repeated(stems: Iterable[str]) -> set[str]:

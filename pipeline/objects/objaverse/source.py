@@ -4,14 +4,13 @@ Files stay where the package `objaverse` keeps them, which other programs use to
 """
 
 import difflib
+import functools
 import gzip
 import json
 import os
 import re
-import threading
 import zlib
-from collections.abc import Sequence
-from functools import partial
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -55,46 +54,39 @@ _MOST_BYTES = 1 << 34
 _PLACE = re.compile(r"glbs/[\w-]+/[\w-]+\.glb")
 
 
-class _ObjaverseFiles:
-    """Files of Objaverse on this machine, downloaded once, whole or not at all."""
+def _fetch_file(name: str) -> Path:
+    """Return the local path of a file, downloaded whole if missing; raises TransferFailed."""
+    path = _FOLDER.expanduser().absolute() / name
+    if not path.is_file():
+        with atomic_writer(path) as stream:
+            download(_URL.child(name), stream, num_bytes=None, max_bytes=_MOST_BYTES)
+    return path
 
-    def __init__(self) -> None:
-        """Read the list of all objects; raises TrilightError where it cannot be downloaded."""
-        paths: dict[str, str] = self.read_list("object-paths.json.gz")
-        self.paths = {uid: path for uid, path in paths.items() if _PLACE.fullmatch(str(path))}
-        """Paths of all objects by uid."""
 
-    def fetch(self, name: str) -> Path:
-        """Return the local path of a file, downloaded if it is missing; raises TransferFailed."""
-        path = _FOLDER.expanduser().absolute() / name
-        if not path.is_file():
-            with atomic_writer(path) as stream:
-                download(_URL.child(name), stream, num_bytes=None, max_bytes=_MOST_BYTES)
-        return path
+def _read(name: str) -> Any:
+    """Return the content of a metadata file; an unreadable one is downloaded again once.
 
-    def read(self, name: str) -> Any:
-        """Return the content of a metadata file; an unreadable one is downloaded again once.
-
-        Raises:
-            TransferFailed: it cannot be downloaded, or is damaged there too.
-        """
-        for _ in range(2):
-            path = self.fetch(name)
-            try:
-                return json.loads(gzip.decompress(path.read_bytes()))
-            except (OSError, EOFError, ValueError, zlib.error):
-                path.unlink(missing_ok=True)
-        raise TransferFailed("download_failed", "is damaged")
-
-    def read_list(self, name: str) -> Any:
-        """Return the content of a metadata file that every run needs."""
+    Raises:
+        TransferFailed: it cannot be downloaded, or is damaged there too.
+    """
+    for _ in range(2):
+        path = _fetch_file(name)
         try:
-            return self.read(name)
-        except TransferFailed as error:
-            raise TrilightError(
-                f"objects objaverse: {name} cannot be downloaded ({error.message}); expected "
-                "Objaverse to be reachable. Check the network and try again."
-            ) from error
+            return json.loads(gzip.decompress(path.read_bytes()))
+        except (OSError, EOFError, ValueError, zlib.error):
+            path.unlink(missing_ok=True)
+    raise TransferFailed("download_failed", "is damaged")
+
+
+def _read_list(name: str) -> Any:
+    """Return the content of a metadata file that every run needs."""
+    try:
+        return _read(name)
+    except TransferFailed as error:
+        raise TrilightError(
+            f"objects objaverse: {name} cannot be downloaded ({error.message}); expected "
+            "Objaverse to be reachable. Check the network and try again."
+        ) from error
 
 
 def list_objaverse(source: str, allowed: Sequence[str]) -> Listing:
@@ -109,44 +101,49 @@ def list_objaverse(source: str, allowed: Sequence[str]) -> Listing:
             downloaded.
     """
     text = source.removeprefix(PREFIX).strip()
+    count = None
     if text.startswith(_CATEGORY):
         names, count = _category_names(text.removeprefix(_CATEGORY), source)
-        files = _ObjaverseFiles()
-        uids = _uids_of_categories(files.read_list("lvis-annotations.json.gz"), names)
+        uids = _uids_of_categories(_read_list("lvis-annotations.json.gz"), names)
     else:
         uids = _uids(text, source)
-        count = None
-        files = _ObjaverseFiles()
     uids = sorted(set(uids))
-    known = [uid for uid in uids if uid in files.paths]
+    stated = _read_list("object-paths.json.gz")
+    paths = {uid: stated[uid] for uid in uids if _PLACE.fullmatch(str(stated.get(uid)))}
     failures = [
-        failure(_name(uid), "unknown_uid", "Objaverse 1.0 has no object of this uid")
+        failure(f"objaverse/{uid}", "unknown_uid", "Objaverse 1.0 has no object of this uid")
         for uid in uids
-        if uid not in files.paths
+        if uid not in paths
     ]
-    records, lost = _records(files, known, allowed, count)
-    return Listing(records=records, failures=[*failures, *lost], fetch=partial(_fetch, files))
+    records, lost = _records(paths, allowed, count)
+
+    def fetch(chosen: list[ObjectRecord], downloaded: CountDone) -> Fetched:
+        files = {f"objaverse/{uid}": path for uid, path in paths.items()}
+        return fetch_all(chosen, lambda record: _fetch_file(files[record.uid]), downloaded)
+
+    return Listing(records=records, failures=[*failures, *lost], fetch=fetch)
 
 
 def _records(
-    files: _ObjaverseFiles, uids: list[str], allowed: Sequence[str], count: int | None
+    paths: Mapping[str, str], allowed: Sequence[str], count: int | None
 ) -> tuple[list[ObjectRecord], list[Failure]]:
     """Read annotations, file by file as they are needed, until `count` licences are allowed."""
-    known: dict[str, dict[str, Any] | TransferFailed] = {}
+
+    @functools.cache
+    def read_annotations(group: str) -> dict[str, Any] | TransferFailed:
+        try:
+            return dict(_read(f"metadata/{group}.json.gz"))
+        except TransferFailed as error:
+            return error
+
     records: list[ObjectRecord] = []
     failures: list[Failure] = []
     usable = 0
-    for uid in uids:
-        group = files.paths[uid].split("/")[1]
-        if group not in known:
-            try:
-                known[group] = files.read(f"metadata/{group}.json.gz")
-            except TransferFailed as error:
-                known[group] = error
-        annotations = known[group]
+    for uid, path in paths.items():
+        annotations = read_annotations(path.split("/")[1])
         if isinstance(annotations, TransferFailed):
             message = f"annotations: {annotations.message}"
-            failures.append(failure(_name(uid), annotations.reason, message))
+            failures.append(failure(f"objaverse/{uid}", annotations.reason, message))
             continue
         record = _record(uid, annotations.get(uid) or {})
         records.append(record)
@@ -166,7 +163,7 @@ def _record(uid: str, annotation: dict[str, Any]) -> ObjectRecord:
     date = _DATE.match(_text(annotation, "publishedAt"))
     published = f"published {date[0]}" if date else "of unknown date"
     return ObjectRecord(
-        uid=_name(uid),
+        uid=f"objaverse/{uid}",
         path="",
         title=title,
         licence=_LICENCES.get(_text(annotation, "license"), UNKNOWN),
@@ -174,17 +171,6 @@ def _record(uid: str, annotation: dict[str, Any]) -> ObjectRecord:
         attribution=f"{title} by {author}" + (f" ({profile})" if profile else ""),
         source_url=_text(annotation, "viewerUrl"),
     )
-
-
-def _fetch(files: _ObjaverseFiles, records: list[ObjectRecord], downloaded: CountDone) -> Fetched:
-    def fetch(record: ObjectRecord) -> Path:
-        return files.fetch(files.paths[record.uid.removeprefix(_name(""))])
-
-    return fetch_all(records, fetch, downloaded, threading.Event())
-
-
-def _name(uid: str) -> str:
-    return f"objaverse/{uid}"
 
 
 def _text(row: dict[str, Any], field: str) -> str:

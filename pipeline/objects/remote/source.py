@@ -17,8 +17,9 @@ from concurrent.futures import Future
 from functools import partial
 from pathlib import Path
 from typing import Any, BinaryIO, cast
-from urllib.parse import quote, unquote
+from urllib.parse import unquote
 
+from pipeline.foreign.gltf.document import read_container
 from pipeline.foreign.material_files import is_elsewhere
 from pipeline.objects.listing import CountDone, Fetched, Listing, fetch_all
 from pipeline.objects.local.folder import (
@@ -30,9 +31,17 @@ from pipeline.objects.local.folder import (
 from storage.atomic import atomic_writer, remove_leftovers, write_atomically
 from storage.cache import cache_folder
 from storage.digests import sha256_hex
-from storage.errors import TrilightError
+from storage.errors import Rejected, TrilightError
 from storage.records.objects import ObjectRecord
-from storage.remote.transfers import TransferFailed, download, is_absent, version_of, with_tries
+from storage.remote.transfers import (
+    TransferFailed,
+    download,
+    facts_of,
+    is_absent,
+    unreadable,
+    version_of,
+    with_tries,
+)
 from storage.remote.url import RemoteUrl, printable, safe_url, shared_driver
 from storage.typed_json import read_json
 
@@ -41,7 +50,6 @@ _MAX_NAME_BYTES = 220
 _MAX_PATH_BYTES = 2000
 _NAME_ERRORS = (errno.ENAMETOOLONG, errno.ENOTDIR, errno.EEXIST, errno.EISDIR, errno.EILSEQ)
 _MAX_BUFFERS = 100
-_MAX_JSON_BYTES = 64_000_000
 _STALE_S = 24 * 3600.0
 _MAX_FOLDERS = 10_000
 _MAX_DEPTH = 32
@@ -75,20 +83,14 @@ class RemoteFolder:
         # younger files may belong to a running process
         remove_leftovers(self.files, older_than_s=_STALE_S)
 
-    def address(self, name: str) -> str:
-        """Return the driver's address of a file."""
-        if name in self._addresses:
-            return self._addresses[name]
-        # Bytes that are not UTF-8 are lone surrogates in `name`.
-        inner = quote(name, errors="surrogateescape") if self.url.is_http else name
-        return f"{self.url.root}/{inner}"
+    def url_of(self, name: str) -> RemoteUrl:
+        """Return the URL of a file, as the listing has it where there is one."""
+        address = self._addresses.get(name)
+        return dataclasses.replace(self.url, root=address) if address else self.url.child(name)
 
     def display_url(self, name: str) -> str:
         """Return the URL of a file for messages and documents, without secrets."""
-        address = self.address(name)
-        return printable(
-            safe_url(address if self.url.is_http else f"{self.url.scheme}://{address}")
-        )
+        return safe_url(self.url_of(name).display_url)
 
     def name_of(self, record: ObjectRecord) -> str:
         """Return the name of the file of a record."""
@@ -100,22 +102,13 @@ class RemoteFolder:
         Raises:
             TrilightError: the server gives no answer.
         """
-
-        def ask() -> bool:
-            try:
-                return self.driver.info(self.address(name))["type"] == "file"
-            except Exception as error:  # drivers raise exceptions of any type
-                if is_absent(error):
-                    return False
-                raise
-
         try:
-            return with_tries(ask)
+            facts_of(self.url_of(name))
         except TransferFailed as error:
-            raise TrilightError(
-                f"objects {self.url.display_url!r}: cannot be read ({error.message}); expected a "
-                "folder that can be reached. Check the URL and your access to it."
-            ) from error
+            if is_absent(error):
+                return False
+            raise unreadable(self.url_of(name), error) from error
+        return True
 
     def names(self) -> list[str]:
         """Return the names of all files, at any depth.
@@ -136,12 +129,12 @@ class RemoteFolder:
     def _names_by_find(self) -> list[str]:
         start = f"{self.url.root}/"
         listing = with_tries(lambda: self.driver.find(self.url.root, detail=True))
-        for address, facts in listing.items():
-            name = address.removeprefix(start)
-            if address.startswith(start) and name:
-                self._addresses[name] = address
-                self._facts[name] = facts
-        return sorted(self._addresses)
+        self._facts = {
+            address.removeprefix(start): facts
+            for address, facts in listing.items()
+            if address.startswith(start) and address != start
+        }
+        return sorted(self._facts)
 
     def _names_by_links(self) -> list[str]:
         """Follow the links of the server's listings, only those below the folder."""
@@ -220,9 +213,7 @@ class RemoteFolder:
     def _refresh(self, name: str) -> Path:
         """Download a file unless the local copy has the server's version; return its path."""
         path = self.path(name)
-        facts = self._facts.get(name) or with_tries(lambda: self.driver.info(self.address(name)))
-        if facts.get("type") == "directory":
-            raise TransferFailed("download_failed", "is a folder, not a file")
+        facts = self._facts.get(name) or facts_of(self.url_of(name))
         size = facts.get("size")
         self._check_size(size or 0)
         version = version_of(facts)
@@ -231,21 +222,17 @@ class RemoteFolder:
         versions = self.files.parent / "versions"
         note = versions / f"{sha256_hex(os.fsencode(name))}.json"
         if not version or not _is_here(path, note, version):
-            self._transfer(name, path, size)
+            try:
+                with atomic_writer(path) as stream:
+                    target = cast(BinaryIO, _StoppableStream(stream, self.stop))
+                    download(self.url_of(name), target, num_bytes=size, max_bytes=MAX_BYTES)
+            except TrilightError as error:
+                if isinstance(error.__cause__, OSError) and error.__cause__.errno in _NAME_ERRORS:
+                    message = f"the name {printable(name)[:100]!r} clashes with another one here"
+                    raise TransferFailed("unsafe_name", message) from error
+                raise
             write_atomically(note, json.dumps(version, sort_keys=True).encode())
         return path
-
-    def _transfer(self, name: str, path: Path, size: int | None) -> None:
-        url = dataclasses.replace(self.url, root=self.address(name))
-        try:
-            with atomic_writer(path) as stream:
-                target = cast(BinaryIO, _StoppableStream(stream, self.stop))
-                download(url, target, num_bytes=size, max_bytes=MAX_BYTES)
-        except TrilightError as error:
-            if isinstance(error.__cause__, OSError) and error.__cause__.errno in _NAME_ERRORS:
-                message = f"the name {printable(name)[:100]!r} clashes with another one here"
-                raise TransferFailed("unsafe_name", message) from error
-            raise
 
     def _check_size(self, size: int) -> None:
         if size > MAX_BYTES:
@@ -299,12 +286,10 @@ def buffer_names(path: Path, name: str) -> list[str]:
         name: its path below the remote folder; the results are such paths too.
     """
     try:
-        if path.stat().st_size > _MAX_JSON_BYTES:
-            return []
-        tree = json.loads(path.read_bytes())
-    except (OSError, ValueError, RecursionError):
+        tree, _ = read_container(path.read_bytes(), ".gltf")
+    except (OSError, Rejected):
         return []
-    buffers = tree.get("buffers") if isinstance(tree, dict) else None
+    buffers = tree.get("buffers")
     folder = posixpath.dirname(name)
     names: dict[str, None] = {}
     for buffer in buffers if isinstance(buffers, list) else ():
@@ -347,14 +332,12 @@ def _list_catalogue(folder: RemoteFolder, catalogue: str) -> list[ObjectRecord]:
     try:
         records = read_catalogue(folder.fetch(catalogue))
     except TransferFailed as error:
-        raise TrilightError(
-            f"objects {folder.url.display_url!r}: {catalogue} cannot be read ({error.message}); "
-            "expected it to be fetched. Try again, or check your access to it."
-        ) from error
-    urls = [record.source_url or folder.display_url(folder.name_of(record)) for record in records]
+        raise unreadable(folder.url_of(catalogue), error) from error
     return [
-        dataclasses.replace(record, source_url=source_url)
-        for record, source_url in zip(records, urls, strict=True)
+        record
+        if record.source_url
+        else dataclasses.replace(record, source_url=folder.display_url(folder.name_of(record)))
+        for record in records
     ]
 
 
@@ -382,4 +365,4 @@ def _fetch(folder: RemoteFolder, records: list[ObjectRecord], downloaded: CountD
             message = f"{folder.display_url(name)}: {error.message}"
             raise TransferFailed(error.reason, message) from error
 
-    return fetch_all(records, fetch, downloaded, folder.stop)
+    return fetch_all(records, fetch, downloaded, folder.stop.set)

@@ -174,9 +174,8 @@ def test_outputs_of_ours_are_left_out_with_a_note(
     touch(tmp_path, *mine, *names.split())
     rows = list_folder(tmp_path, None).records
     assert [row.uid for row in rows] == ["chair", "sub/meshes/a", "sub/table"]
-    textures = find_maps(TEXTURE, str(tmp_path), licence=None, allowed_licences=DEFAULT_ALLOWED)
-    assert [one.record.uid for one in textures.maps] == ["texture:wood"]
-    assert textures.failures == ()
+    found = find_maps(TEXTURE, str(tmp_path), licence=None, allowed_licences=DEFAULT_ALLOWED)
+    assert ([one.record.uid for one in found[0]], found[1]) == (["texture:wood"], [])
 
 
 def test_the_named_folder_may_be_an_output_scenes_of_ours_are_no_objects_and_others_are_named(

@@ -26,8 +26,8 @@ from scene_templates.skies.procedural_skies import (
     planckian_rgb,
 )
 from scene_templates.skies.texels import SkyTexels
-from storage.records.environment import Environment
 from storage.records.scene import Scene
+from storage.records.texture import Environment
 from storage.seeds import SceneKey, rng_for
 from storage.settings.overrides import apply_overrides
 from tests.for_each import for_each

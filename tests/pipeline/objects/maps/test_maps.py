@@ -8,7 +8,7 @@ from numpy.typing import NDArray
 from PIL import Image
 
 from pipeline.objects.licences import DEFAULT_ALLOWED
-from pipeline.objects.maps.listing import FoundMaps, find_maps
+from pipeline.objects.maps.listing import FoundMap, find_maps
 from pipeline.objects.maps.prepared import (
     area_means,
     decode_prepared,
@@ -22,7 +22,7 @@ from pipeline.objects.maps.texture_names import _parse_name, group_textures
 from storage.conventions import linear_from_srgb8
 from storage.errors import Rejected, TrilightError
 from storage.records.exr import encode_channels
-from storage.records.objects import SKY, TEXTURE
+from storage.records.objects import SKY, TEXTURE, Failure
 from tests.for_each import for_each
 
 
@@ -47,7 +47,9 @@ def sun_map(seed: int = 0, rows: int = 8) -> NDArray[np.float32]:
     return radiance
 
 
-def _find(folder: Path, kind: str = TEXTURE, licence: str | None = None) -> FoundMaps:
+def _find(
+    folder: Path, kind: str = TEXTURE, licence: str | None = None
+) -> tuple[list[FoundMap], list[Failure]]:
     return find_maps(kind, str(folder), licence=licence, allowed_licences=DEFAULT_ALLOWED)
 
 
@@ -94,18 +96,18 @@ def test_sets_are_found_and_the_rest_is_said(tmp_path: Path) -> None:
         png(tmp_path / name, noise(1))
     for name in ("readme.txt", "oak.zip", "deep/tin.psd"):
         (tmp_path / name).write_text("no picture")
-    found = _find(tmp_path)
-    files = {one.record.uid: sorted(one.files) for one in found.maps}
+    maps, failures = _find(tmp_path)
+    files = {one.record.uid: sorted(one.files) for one in maps}
     expected = {"texture:oak": ["base", "roughness"], "texture:deep/tin": ["base", "metallic"]}
     assert files == expected
-    assert {failure.item: failure.reason for failure in found.failures} == {
+    assert {failure.item: failure.reason for failure in failures} == {
         "texture:oak_normal.png": "map_not_used",
         "texture:steel_rough.png": "no_base_colour",
         "texture:Oak076.png": "unknown_map",
         "texture:oak.zip": "unread_format",
         "texture:deep/tin.psd": "unread_format",
     }
-    assert {one.record.licence for one in found.maps} == {"LicenseRef-user-provided"}
+    assert {one.record.licence for one in maps} == {"LicenseRef-user-provided"}
 
 
 def test_folders_of_the_large_collections() -> None:
@@ -166,17 +168,17 @@ def test_licences_are_those_of_the_catalogue_or_the_stated_one(tmp_path: Path) -
     for name in ("a", "b", "c"):
         exr(tmp_path / f"{name}.exr", np.ones((1, 2, 3), np.float32))
     png(tmp_path / "a.png", noise(1))
-    assert _find(tmp_path, licence="CC-BY-4.0").maps[0].record.licence == "CC-BY-4.0"
-    refused = _find(tmp_path, licence="CC-BY-NC-4.0").failures
+    assert _find(tmp_path, licence="CC-BY-4.0")[0][0].record.licence == "CC-BY-4.0"
+    refused = _find(tmp_path, licence="CC-BY-NC-4.0")[1]
     assert "licence_refused" in {one.reason for one in refused}
     rows = "a,a.exr,CC-BY-4.0,Ada\nb,b.exr,,\nc,c.exr,CC-BY-NC-4.0,Cy\n"
     (tmp_path / "skies.csv").write_text(f"uid,path,licence,attribution\n{rows}")
-    found = _find(tmp_path, SKY)
-    (only,) = found.maps
+    maps, failures = _find(tmp_path, SKY)
+    (only,) = maps
     assert (only.record.uid, only.record.licence, only.record.attribution) == (
         "sky:a", "CC-BY-4.0", "Ada",
     )  # fmt: skip
-    assert [failure.reason for failure in found.failures] == ["licence_refused"] * 2
+    assert [failure.reason for failure in failures] == ["licence_refused"] * 2
     with pytest.raises(TrilightError, match="states the licence of every"):
         _find(tmp_path, SKY, licence="CC0-1.0")
 
@@ -185,12 +187,12 @@ def test_links_out_of_the_folder_are_refused(tmp_path: Path) -> None:
     outside = png(tmp_path / "outside.png", noise(1))
     (tmp_path / "in").mkdir()
     (tmp_path / "in" / "a.png").symlink_to(outside)
-    assert [one.reason for one in _find(tmp_path / "in").failures] == ["link_outside"]
+    assert [one.reason for one in _find(tmp_path / "in")[1]] == ["link_outside"]
     png(tmp_path / "in" / "b.png", noise(1))
     (tmp_path / "in" / "b_roughness.png").symlink_to(outside)
-    found = _find(tmp_path / "in")
-    assert [sorted(one.files) for one in found.maps] == [["base"]]
-    assert [one.reason for one in found.failures] == ["link_outside"] * 2
+    maps, failures = _find(tmp_path / "in")
+    assert [sorted(one.files) for one in maps] == [["base"]]
+    assert [one.reason for one in failures] == ["link_outside"] * 2
 
 
 def test_a_folder_that_is_not_there_or_empty_is_a_mistake(tmp_path: Path) -> None:
