@@ -253,11 +253,12 @@ def _count_scenes(
     """Return counts with those of scenes; without a folder here, what waits is not known."""
     waiting = given_up = 0
     if folder is not None:
-        walked = os.walk(folder.staged_samples)  # passes over a folder that is removed meanwhile
-        waiting = sum(name.endswith(".tar") for _, _, names in walked for name in names)
+        # first what was given up: a worker counts that after it has staged the scene
         with contextlib.suppress(OSError, ValueError):  # of shards that are not listed, or grow
             scenes = set(map(int, folder.staged_given_up.read_text().split()))
             given_up = len(scenes - listed_scenes(manifest))
+        walked = os.walk(folder.staged_samples)  # passes over a folder that is removed meanwhile
+        waiting = sum(name.endswith(".tar") for _, _, names in walked for name in names)
     return dataclasses.replace(
         counts,
         scenes_done=sum(expected[name] for name in finished) + waiting - given_up,

@@ -10,6 +10,7 @@ import math
 import os
 import sys
 import time
+from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 from unittest import mock
@@ -33,6 +34,7 @@ from storage.dataset.manifest import (
 from storage.dataset.progress import (
     announce_downloads,
     announce_objects,
+    count_given_up,
     count_object,
     log_scene,
     missing_shards,
@@ -331,6 +333,19 @@ def test_scenes_at_work_count_in_part(tmp_path: Path) -> None:
     (tmp_path / "full" / ".staging").write_text("in the way")
     for note in (lambda at: tell_views(at, 0, 0.5), lambda at: tell_views(at, 0, None)):
         note(DatasetFolder(tmp_path / "full"))  # where nothing can be written, nothing is told
+
+
+def test_a_scene_that_is_given_up_during_a_count_is_not_subtracted(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    folder, walk = begin_tiny(tmp_path, 8).folder, os.walk
+
+    def walk_and_give_up(top: Path) -> Iterator[Any]:
+        yield from walk(top)
+        count_given_up(folder, 0)
+
+    monkeypatch.setattr(os, "walk", walk_and_give_up)
+    assert read_progress(folder).scenes_done == 0
 
 
 def test_shards_scenes_and_what_to_do_next(tmp_path: Path) -> None:
