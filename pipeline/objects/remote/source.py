@@ -102,13 +102,13 @@ class RemoteFolder:
         Raises:
             TrilightError: the server gives no answer.
         """
-        try:
-            facts_of(self.url_of(name))
+        url = self.url_of(name)
+        try:  # a folder of this name is no catalogue
+            return bool(with_tries(lambda: self.driver.info(url.root))["type"] == "file")
         except TransferFailed as error:
             if is_absent(error):
                 return False
-            raise unreadable(self.url_of(name), error) from error
-        return True
+            raise unreadable(self.url, error) from error
 
     def names(self) -> list[str]:
         """Return the names of all files, at any depth.

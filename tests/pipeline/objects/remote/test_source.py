@@ -101,6 +101,8 @@ class _Bucket:
         self.fetched: list[str] = []
 
     def info(self, address: str) -> dict[str, Any]:
+        if any(name.startswith(f"{address}/") for name in self.files):
+            return {"name": address, "type": "directory", "size": 0}
         if address not in self.files:
             raise FileNotFoundError(address)
         data = self.files[address]
@@ -137,6 +139,12 @@ def test_a_bucket_is_listed_at_once(bucket: _Bucket, cache: Path) -> None:
     assert found.records[1].source_url == "s3://bucket/set/x/d.obj"
     assert find("s3://bucket/set/", work_dir=cache) == found
     assert sorted(bucket.fetched) == ["bucket/set/a?b#c%20.obj", "bucket/set/x/d.obj"]
+
+
+def test_a_folder_is_no_catalogue_whatever_its_name(bucket: _Bucket) -> None:
+    bucket.files = {"bucket/objects.csv/a.obj": b"a"}
+    (record,) = find("s3://bucket").records
+    assert record.uid == "objects.csv/a"
 
 
 def test_what_is_not_wanted_stays_on_the_server(bucket: _Bucket, cache: Path) -> None:
