@@ -327,7 +327,9 @@ class SceneBuilder:
         material: Material,
     ) -> Self:
         if name in self._objects:
-            raise TrilightError(f"objects holds the name {name!r} twice; expected unique names.")
+            raise TrilightError(
+                f"{self._name}: objects holds the name {name!r} twice; expected unique names."
+            )
         self._objects[name] = DescribedObject(
             name=name,
             mesh_path=str(mesh[0]) if isinstance(mesh, tuple) else mesh.uid,

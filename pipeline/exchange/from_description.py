@@ -113,8 +113,8 @@ class DescribedCamera:
 class CameraFile:
     """A file with a list of cameras, which may be a scene file."""
 
-    file: str  # name of the file, for messages and provenance
     cameras: tuple[DescribedCamera, ...]  # in the order of the file
+    file: str = ""  # its name, for messages and provenance
     unknown_fields: tuple[str, ...] = ()
     """Dotted names of unknown fields, which were left out."""
 

@@ -11,6 +11,7 @@ objects of several materials; shading normals other than flat ones and those tha
 (smooth across edges of up to 30 degrees).
 """
 
+import dataclasses
 import json
 import re
 from collections import Counter
@@ -23,6 +24,7 @@ from numpy.typing import NDArray
 
 from pipeline.exchange.from_description import (
     SHELL_FOLDER,
+    CameraFile,
     DescribedCamera,
     DescribedObject,
     SceneDescription,
@@ -45,7 +47,7 @@ from storage.records.scene import Scene
 from storage.settings.fields import describe_fields, group_of
 from storage.typed_json import read_json
 
-Record = TypeVar("Record")
+Record = TypeVar("Record", bound=CameraFile)
 
 MAX_BYTES = 4 << 20
 """Maximum size of a file; an object takes about 1 KiB."""
@@ -88,8 +90,6 @@ def read_record(kind: type[Record], data: bytes, name: str) -> Record:
         )
         unknown: list[str] = []
         known = _take_known(kind, tree, "", unknown)
-        if isinstance(known, dict):
-            known |= {"file": name, "unknown_fields": unknown}
         text = json.dumps(known)
     except RecursionError as error:
         raise TrilightError(f"{name}: nested too deeply; expected a scene.") from error
@@ -100,8 +100,10 @@ def read_record(kind: type[Record], data: bytes, name: str) -> Record:
         raise TrilightError(f"{name}: not readable as JSON from {where} on.") from error
     except ValueError as error:
         raise TrilightError(f"{name}: not readable as JSON in UTF-8.") from error
+    if not isinstance(known, dict):
+        raise TrilightError(f"{name}: the file is {_to_text(known)}; expected a JSON object.")
     for what, most in (("objects", MAX_OBJECTS), ("cameras", MAX_CAMERAS)):
-        entries = known.get(what) if isinstance(known, dict) else None
+        entries = known.get(what)
         if isinstance(entries, list | dict) and not 1 <= len(entries) <= most:
             raise TrilightError(f"{name}: {len(entries)} {what}; expected 1 to {most}.")
         for key in entries if isinstance(entries, dict) else ():
@@ -110,7 +112,9 @@ def read_record(kind: type[Record], data: bytes, name: str) -> Record:
                     f"{name}: {_to_text(f'{what}.{key}')} is {_to_text(key)}; expected a printable "
                     "name of 1 to 200 letters."
                 )
-    return read_json(text, kind, name)
+    record = read_json(text, kind, name)
+    # A name that is not UTF-8 has no place in JSON.
+    return dataclasses.replace(record, file=name, unknown_fields=tuple(unknown))
 
 
 def _take_known(kind: Any, value: Any, where: str, unknown: list[str]) -> Any:

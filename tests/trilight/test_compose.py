@@ -139,7 +139,7 @@ def _described(place: dict[str, object]) -> dict[str, object]:
         (lambda: _lit().add_floor(Material(diffuse=(0.9,) * 3, specular=(0.9,) * 3)).scene(),
          "objects.floor: .*more than 1|floor.*1.8"),
         (lambda: _lit().add_mesh(TETRAHEDRON, name="a").add_mesh(TETRAHEDRON, name="a").scene(),
-         "'a' twice"),
+         "test: objects holds the name 'a' twice"),
         (lambda: SceneBuilder().add_floor().add_camera(at=(0, -2, 1)).scene(), "emission"),
         (lambda: _lit().add_floor().add_camera(at=(0, 0, 0)).scene(), r"cameras\[1\] looks"),
         (lambda: SceneBuilder("empty").scene(), "empty: holds no object"),

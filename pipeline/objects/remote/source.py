@@ -36,7 +36,6 @@ from storage.records.objects import ObjectRecord
 from storage.remote.transfers import (
     TransferFailed,
     download,
-    facts_of,
     is_absent,
     unreadable,
     version_of,
@@ -102,13 +101,16 @@ class RemoteFolder:
         Raises:
             TrilightError: the server gives no answer.
         """
-        try:
-            facts_of(self.url_of(name))
+        try:  # a folder of this name is no catalogue
+            return bool(self._ask(name)["type"] == "file")
         except TransferFailed as error:
             if is_absent(error):
                 return False
-            raise unreadable(self.url_of(name), error) from error
-        return True
+            raise unreadable(self.url, error) from error
+
+    def _ask(self, name: str) -> dict[str, Any]:
+        """Return what the driver says of a file; one driver lists a whole folder once for all."""
+        return with_tries(lambda: dict(self.driver.info(self.url_of(name).root)))
 
     def names(self) -> list[str]:
         """Return the names of all files, at any depth.
@@ -213,7 +215,9 @@ class RemoteFolder:
     def _refresh(self, name: str) -> Path:
         """Download a file unless the local copy has the server's version; return its path."""
         path = self.path(name)
-        facts = self._facts.get(name) or facts_of(self.url_of(name))
+        facts = self._facts.get(name) or self._ask(name)
+        if facts.get("type") == "directory":
+            raise TransferFailed("download_failed", "is a folder, not a file")
         size = facts.get("size")
         self._check_size(size or 0)
         version = version_of(facts)

@@ -67,6 +67,10 @@ def test_what_may_be_missing_has_the_published_default() -> None:
     assert box.material.rand_tri_diffuse_seed == 0
 
 
+def test_the_name_of_a_file_need_not_be_utf_8() -> None:
+    assert read_renderformer_json(changed(), "\udcff.json").file == "\udcff.json"
+
+
 def test_unknown_fields_are_named_and_harmless() -> None:
     scene = json.loads(changed())
     scene["environment"] = {}
@@ -127,7 +131,8 @@ REFUSED = [
     ('{"a": 1}'.encode("utf-16"), "not readable as JSON in UTF-8"),
     (b'{"a":' * 100_000, "a.json: "),
     (b"[" * 100_000, "a.json: "),
-    (b"[]", "all of it is []; expected names with values"),
+    (b"[]", "the file is []; expected a JSON object"),
+    (b"null", "the file is None; expected a JSON object"),
     (b'{"a": NaN}', "NaN is no JSON number"),
     (b'{"a": 1' + b"0" * 5000 + b"}", "not readable as JSON"),
     (b'{"a": 1, "a": 2}', "the name 'a' stands twice"),

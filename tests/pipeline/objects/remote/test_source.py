@@ -95,12 +95,19 @@ class _Bucket:
     """What s3fs, gcsfs and huggingface_hub have in common, over a dictionary."""
 
     async_impl = False
+    is_listed = False
 
     def __init__(self, files: dict[str, bytes]) -> None:
         self.files = files
         self.fetched: list[str] = []
+        self.listed: list[str] = []
 
     def info(self, address: str) -> dict[str, Any]:
+        if not self.is_listed:
+            self.is_listed = True
+            self.listed.append(address)
+        if any(name.startswith(f"{address}/") for name in self.files):
+            return {"name": address, "type": "directory", "size": 0}
         if address not in self.files:
             raise FileNotFoundError(address)
         data = self.files[address]
@@ -114,7 +121,7 @@ class _Bucket:
         return self.files[address][start:end]
 
     def invalidate_cache(self) -> None:
-        """Forget nothing."""
+        self.is_listed = False
 
 
 @pytest.fixture
@@ -137,6 +144,20 @@ def test_a_bucket_is_listed_at_once(bucket: _Bucket, cache: Path) -> None:
     assert found.records[1].source_url == "s3://bucket/set/x/d.obj"
     assert find("s3://bucket/set/", work_dir=cache) == found
     assert sorted(bucket.fetched) == ["bucket/set/a?b#c%20.obj", "bucket/set/x/d.obj"]
+
+
+def test_a_folder_is_no_catalogue_whatever_its_name(bucket: _Bucket) -> None:
+    bucket.files = {"bucket/objects.csv/a.obj": b"a"}
+    (record,) = find("s3://bucket").records
+    assert record.uid == "objects.csv/a"
+
+
+def test_a_catalogue_that_changed_nothing_is_looked_up_in_one_listing(bucket: _Bucket) -> None:
+    rows = [{"uid": name, "path": f"{name}.obj", "licence": "MIT"} for name in "abc"]
+    bucket.files["bucket/objects.jsonl"] = "\n".join(map(json.dumps, rows)).encode()
+    found = find("s3://bucket")
+    bucket.listed.clear()
+    assert find("s3://bucket") == found and len(bucket.listed) == 1
 
 
 def test_what_is_not_wanted_stays_on_the_server(bucket: _Bucket, cache: Path) -> None:
