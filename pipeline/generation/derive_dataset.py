@@ -293,6 +293,8 @@ def derive_shards(
         used_objects(selected), key=lambda row: canonical_json(dataclasses.asdict(row))
     )
     groups, scenes_per_shard = _group_scenes(sources, derive, selected)
+    for entry in selected:
+        offset_key(entry.key, offsets[entry.dataset])  # raises before shards are written
     write_objects_lock(out.objects_lock, objects)
     write_failures(out.failures, _failures(offsets, selected))
     shards = []

@@ -405,6 +405,17 @@ def test_what_does_not_fit_together_is_named(
     assert "number of views is 3; expected 2" in refused(tmp_path / "c", MERGE, a, other)
 
 
+def test_a_key_that_is_no_number_is_refused_before_a_shard_is_written(tmp_path: Path) -> None:
+    odd = dataclasses.replace(lit(0, 2, ["a"]), key="chair")
+    first = finished(tmp_path / "a", scenes(1))
+    second = finished(tmp_path / "b", {"train-000000.tar": [odd]}, seed=1)
+    out = DatasetFolder(tmp_path / "out")
+    sources = [open_finished(str(place)) for place in (first, second)]
+    with pytest.raises(TrilightError, match="'chair': expected a number as key"):
+        derive_shards(sources, MERGE, out)
+    assert not out.root.exists()
+
+
 def test_damage_and_what_is_not_finished_are_refused(tmp_path: Path) -> None:
     a, out, derive = finished(tmp_path / "a", scenes(0)), tmp_path / "c", reshard(3)
     manifest = open_dataset(str(a)).manifest
