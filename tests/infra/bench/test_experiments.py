@@ -67,7 +67,8 @@ def test_noise_is_no_difference_and_another_picture_is() -> None:
 
 
 def test_json_of_other_kinds_is_no_scene_of_the_user(tmp_path: Path) -> None:
-    scene, template = {"objects": {"a": {}}, "cameras": [{}]}, {"objects": {"a": {}}}
+    template: dict[str, Any] = {"objects": {"a": {}}}
+    scene = {**template, "cameras": [{}]}
     for name, record in (("2", scene), ("10", scene), ("template", template), ("list", [1])):
         (tmp_path / f"{name}.json").write_text(json.dumps(record))
     (tmp_path / "cut.json").write_text("{")
