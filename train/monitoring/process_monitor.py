@@ -245,9 +245,10 @@ def profiled_steps(
     traces: list[Path] = []
 
     def write(profiler: Any) -> None:
-        last = done + profiler.step_num
-        folder.mkdir(parents=True, exist_ok=True)
+        last = max(first, done + profiler.step_num)  # it may end within the first one
         trace = folder / f"profile-steps-{first}-to-{last}.json.gz"
+        traces.append(trace)  # before anything can fail: there was something to write
+        folder.mkdir(parents=True, exist_ok=True)
         table = trace.with_name(trace.name.replace(".json.gz", ".txt"))
         profiler.export_chrome_trace(str(trace))
         order = f"self_{device.type}_time_total"
@@ -256,7 +257,6 @@ def profiled_steps(
             f"steps {first} to {last} were profiled: open {trace} at chrome://tracing in Chromium "
             f"or at ui.perfetto.dev; {table.name} beside it lists the dearest operators"
         )
-        traces.append(trace)
 
     on_gpu = [ProfilerActivity.CUDA] if device.type == "cuda" else []
     planned = schedule(skip_first=SKIPPED_STEPS - 1, wait=0, warmup=1, active=steps, repeat=1)

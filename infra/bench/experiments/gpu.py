@@ -65,6 +65,8 @@ def _measure(work: Sequence[str], context: BenchContext, trial: str) -> Figures:
                 figures = steps.copy_figures(device, way, _COPIED_BYTES[device.type])
             case "picture", network, precision:
                 figures = steps.picture_figures(network, precision, device)
+                if device.type == "cpu":
+                    context.note("without a GPU a picture is compared with itself")
             case "step", run:
                 figures = steps.step_figures(run, _STEPS[context.scale.name], device)
                 if not figures:

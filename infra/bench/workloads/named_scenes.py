@@ -7,6 +7,7 @@ surfaces, materials and camera always agree.
 """
 
 import dataclasses
+import json
 import math
 from collections.abc import Mapping, Sequence
 from pathlib import Path
@@ -30,19 +31,38 @@ from pipeline.scenes.pieces import (
 )
 from scene_templates.layout import Emitter, ShellPart, SurfaceLook
 from storage.conventions import look_at_c2w
+from storage.errors import TrilightError, prefix_errors
 from storage.records.scene import Scene, SceneObject
 from storage.seeds import rng_for
 
 
 def given_scenes(folder: Path | None) -> Mapping[str, SceneSource]:
-    """Return the scenes in the files of a folder by their names.
+    """Return the scenes in the files of a folder by their names, without JSON files of other kinds.
 
     Raises:
         TrilightError: the folder holds no file of a scene.
     """
-    with SceneReader() as reader:
-        sources = reader.list_scenes(str(folder)) if folder else []
-    return {source.name: source for source in sources}
+    if folder is None:
+        return {}
+    with prefix_errors("--scenes"), SceneReader() as reader:
+        sources = reader.list_scenes(str(folder))
+        scenes = {source.name: source for source in sources if _may_hold_a_scene(source.path)}
+        if not scenes:
+            raise TrilightError(
+                f"{folder}: it holds no scene; expected RenderFormer scenes (*.json), glTF or USD."
+            )
+    return scenes
+
+
+def _may_hold_a_scene(path: Path) -> bool:
+    """Return False for JSON without objects or a camera, such as templates and lists."""
+    if path.suffix.lower() != ".json":
+        return True
+    try:
+        record = json.loads(path.read_bytes())
+    except ValueError:
+        return False
+    return isinstance(record, dict) and bool(record.get("objects")) and bool(record.get("cameras"))
 
 
 def preset_scene(

@@ -66,6 +66,7 @@ def training_figures(
             stepper.launch(buckets, learning_rate(step, settings))  # no step waits for its figures
             state.step += 1
     model = state.model.eval()
+    del state, stepper, buckets  # the optimizer's memory is free before pictures are judged
     seconds = time.perf_counter() - began
     views = iter(judge.judge(model).views)
     scores_by_view = []

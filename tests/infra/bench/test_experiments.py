@@ -2,6 +2,7 @@
 
 import dataclasses
 import itertools
+import json
 import subprocess
 import sys
 import time
@@ -19,6 +20,7 @@ from infra.bench.experiments import methods
 from infra.bench.experiments.calibration import LOOKS
 from infra.bench.experiments.cycles import agreement_figures
 from infra.bench.experiments.frontier import cost_at_error
+from infra.bench.experiments.gpu import EXPERIMENT as GPU
 from infra.bench.experiments.gpu import NETWORKS
 from infra.bench.experiments.growth import EXPERIMENT, WORK, measure_work, session_bytes
 from infra.bench.experiments.loader import LAYOUTS, read_figures, unpacking_figures
@@ -28,6 +30,7 @@ from infra.bench.workloads import cycles as environment
 from infra.bench.workloads import gpu_steps
 from infra.bench.workloads.cycles import installed_python
 from infra.bench.workloads.gpu_steps import picture_figures, step_figures, step_settings
+from infra.bench.workloads.named_scenes import given_scenes
 from infra.bench.workloads.traced_pictures import load_or_render_reference
 from infra.bench_options import BenchOptions
 from infra.render.raw_references import RawReference
@@ -61,6 +64,20 @@ def test_noise_is_no_difference_and_another_picture_is() -> None:
     assert abs(same["brightness"]) < 1
     assert mirrored["pixels_db"] < same["pixels_db"] - 5
     assert figures(1.1 * truth)["brightness"] == pytest.approx(100 / 1.1 - 100, abs=1)
+
+
+def test_json_of_other_kinds_is_no_scene_of_the_user(tmp_path: Path) -> None:
+    template: dict[str, Any] = {"objects": {"a": {}}}
+    scene = {**template, "cameras": [{}]}
+    for name, record in (("2", scene), ("10", scene), ("template", template), ("list", [1])):
+        (tmp_path / f"{name}.json").write_text(json.dumps(record))
+    (tmp_path / "cut.json").write_text("{")
+    assert list(given_scenes(tmp_path)) == ["2.json", "10.json"] and not given_scenes(None)
+    (tmp_path / "others").mkdir()
+    (tmp_path / "template.json").rename(tmp_path / "others" / "template.json")
+    for folder in (tmp_path / "others", tmp_path / "none"):
+        with pytest.raises(TrilightError, match=f"^--scenes: {folder}: .*expected"):
+            given_scenes(folder)
 
 
 @pytest.mark.slow("benchmarks")
@@ -131,6 +148,17 @@ def test_too_little_memory_has_no_figures(monkeypatch: pytest.MonkeyPatch) -> No
     monkeypatch.setattr(gpu_steps, "drawn_batch", drawn)
     assert step_figures("smoke", 1, CPU) == {}
     assert drawn.call_args.args[1] == 1, "fewer scenes were tried, down to one"
+
+
+def test_without_a_gpu_the_result_says_that_a_picture_is_compared_with_itself(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    monkeypatch.setattr(gpu_steps, "picture_figures", mock.Mock(return_value={"db": 100.0}))
+    notes: list[str] = []
+    context = SimpleNamespace(options=BenchOptions(device="cpu"), note=notes.append)
+    point = next(each for each in GPU.points(TINY, context.options) if "picture" in each.name)
+    assert point.measure and point.measure(cast(Any, context), "round 1") == {"db": 100.0}
+    assert "without a GPU a picture is compared with itself" in notes
 
 
 @pytest.mark.slow("benchmarks")

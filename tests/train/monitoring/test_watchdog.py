@@ -43,6 +43,7 @@ from train.monitoring.process_monitor import (
     LEAST_REMEMBERED,
     OWN_PHASES,
     PHASES,
+    SKIPPED_STEPS,
     Activity,
     LayerNorms,
     SpikeDetector,
@@ -308,6 +309,22 @@ def test_the_trace_holds_the_steps_and_the_note_says_how_to_open_it(tmp_path: Pa
     assert "aten::mm" in (tmp_path / table).read_text()
     (note,) = said
     assert str(trace) in note and "chrome://tracing" in note and table in note
+
+
+@for_each("written", [True, False])
+def test_a_step_that_fails_is_in_the_trace_and_a_trace_that_is_not_written_is_no_short_run(
+    tmp_path: Path, written: bool
+) -> None:
+    folder = tmp_path / "traces"
+    if not written:
+        folder.write_text("no folder")
+    told: list[str] = []
+    error = RuntimeError if written else FileExistsError
+    with pytest.raises(error), profiled_steps(2, 0, CPU, folder, told.append) as end_step:
+        for _ in range(SKIPPED_STEPS):
+            end_step()
+        raise RuntimeError("step 4 fails")
+    assert [text.partition(":")[0] for text in told] == ["steps 4 to 4 were profiled"] * written
 
 
 @for_each(("asked", "steps"), [(2, 1), (0, 8)])
