@@ -21,7 +21,7 @@ from pipeline.objects.local.folder import (
     read_catalogue,
     walk_files,
 )
-from pipeline.objects.maps.texture_names import PICTURES, group_textures
+from pipeline.objects.maps.texture_names import PICTURES, group_textures, is_part_folder
 from storage.errors import TrilightError
 from storage.records.objects import SKY, TEXTURE, Failure, ObjectRecord
 from storage.remote.url import printable
@@ -105,13 +105,15 @@ def _with_files(kind: str, root: Path, records: Sequence[ObjectRecord]) -> list[
     if kind == SKY:
         return [FoundMap(record=row, files={"map": Path(row.path)}) for row in records]
     textures: dict[str, dict[str, str]] = {}
-    for folder in sorted({Path(row.path).parent for row in records}):
-        if folder.is_dir():
-            inner = folder.relative_to(root)
-            names = [(inner / name).as_posix() for name in os.listdir(folder)]
-            pictures = [n for n in names if n.lower().endswith(PICTURES) and not _is_hidden(n)]
-            for files in group_textures(pictures)[0].values():
-                textures[files["base"]] = files
+    for folder in sorted(filter(Path.is_dir, {Path(row.path).parent for row in records})):
+        beside = [folder]
+        if folder != root and is_part_folder(folder.name):
+            beside = [each for each in folder.parent.iterdir() if is_part_folder(each.name)]
+        paths = [path for each in beside if each.is_dir() for path in each.iterdir()]
+        names = [path.relative_to(root).as_posix() for path in paths]
+        pictures = [n for n in names if n.lower().endswith(PICTURES) and not _is_hidden(n)]
+        for files in group_textures(pictures)[0].values():
+            textures[files["base"]] = files
     maps = []
     for row in records:
         base = Path(row.path)

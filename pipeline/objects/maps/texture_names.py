@@ -180,6 +180,11 @@ def group_textures(
     return textures, unused
 
 
+def is_part_folder(name: str) -> bool:
+    """Return whether a folder of this name holds one component of many textures."""
+    return _FOLDERS.fullmatch(name) is not None
+
+
 def _add_colors(stems: Mapping[str, str], named: dict[str, _ParsedName]) -> None:
     """Add files whose names state no component, where the files next to them make them colors."""
     with_color = {entry.key for entry in named.values() if entry.part == "base"}

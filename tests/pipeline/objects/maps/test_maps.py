@@ -110,6 +110,29 @@ def test_sets_are_found_and_the_rest_is_said(tmp_path: Path) -> None:
     assert {one.record.licence for one in maps} == {"LicenseRef-user-provided"}
 
 
+@for_each("folder", ["", "deep/"])
+def test_folders_of_one_part_each_give_what_names_of_parts_give(
+    tmp_path: Path, folder: str
+) -> None:
+    """With a catalogue as without one; a folder of colors that was named alone has no others."""
+    parts = {"base": "Albedo", "roughness": "roughness", "metallic": "metallic"}
+    for texture in ("oak", "tin"):
+        for part in parts.values():
+            png(tmp_path / "folders" / f"{folder}{part}" / f"{texture}.png", noise(1))
+            png(tmp_path / "names" / f"{folder}{texture}_{part}.png", noise(1))
+    by_folder, by_name = (_find(tmp_path / each) for each in ("folders", "names"))
+    assert [sorted(one.files) for one in by_folder[0]] == [sorted(parts)] * 2
+    assert [sorted(one.files) for one in by_name[0]] == [sorted(parts)] * 2
+    assert by_folder[1] == by_name[1] == []
+    rows = [f"{texture},{folder}Albedo/{texture}.png,CC0-1.0" for texture in ("oak", "tin")]
+    (tmp_path / "folders" / "textures.csv").write_text("\n".join(["uid,path,licence", *rows]))
+    assert [one.files for one in _find(tmp_path / "folders")[0]] == [
+        one.files for one in by_folder[0]
+    ]
+    (alone, _), _ = _find(tmp_path / "folders" / f"{folder}Albedo")
+    assert list(alone.files) == ["base"]
+
+
 def test_folders_of_the_large_collections() -> None:
     for names, textures, unused in (
         ("a.png b.jpg sky.exr", {"a": "a.png", "b": "b.jpg"}, "sky.exr:unknown_map"),
