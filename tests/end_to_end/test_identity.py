@@ -5,6 +5,7 @@ identity.json, under the vector extension of this processor. A later change of o
 commit.
 """
 
+import contextlib
 import json
 import os
 import subprocess
@@ -27,7 +28,6 @@ from pipeline.generation.scene_worker import MAX_ATTEMPTS
 from pipeline.objects.generated import generate_objects
 from pipeline.objects.local.folder import list_folder
 from pipeline.presets.registry import DATASET_PRESETS, preset_settings
-from pipeline.presets.settings import DatasetSettings
 from pipeline.renders.mitsuba_variant import vector_extension
 from pipeline.scenes.compose import compose_scene
 from pipeline.scenes.triangle_budget import PooledAsset
@@ -36,9 +36,8 @@ from storage.dataset.statistics import digest_of_scenes
 from storage.digests import canonical_json, sha256_hex
 from storage.errors import Rejected
 from storage.records.asset import decode_asset
-from storage.records.objects import LockedObject, ObjectRecord
+from storage.records.objects import LockedObject
 from storage.records.sample import sample_key
-from storage.records.scene import Scene
 from storage.records.scene_file import encode_arrays, encode_scene
 from storage.seeds import SceneKey
 from tests.conftest import ROOT
@@ -57,49 +56,33 @@ SETS = {
 """Preset, objects, scenes and scenes of a shard of sets at 32 pixels, to 20 dB."""
 
 
-def settings_digests() -> dict[str, str]:
-    """Return the digest of every preset's settings."""
-    return {name: preset_settings(name).digest for name in DATASET_PRESETS}
-
-
 def benchmark_digests() -> dict[str, str]:
     """Return the scene digests of the benchmarks, as composed here."""
     full = DATASET_PRESETS["benchmark-v1"]
     settings = full.settings()
     members = {}
     with tempfile.TemporaryDirectory() as folder:
-        pool = _pool(settings, Path(folder))
-        for scene_index in range(full.num_scenes):
-            arrays = encode_arrays(_composed(settings, pool, scene_index))
-            members[f"{sample_key(scene_index)}.scene.safetensors"] = sha256_hex(arrays)
+        records = generate_objects(str(settings.source), Path(folder))
+        with mesh_stage(settings.assets, workers=2) as prepare:
+            prepared, rejected = prepare(records, lambda: None)
+        assert not rejected
+        pool = []
+        for asset in sorted(prepared, key=lambda entry: entry.record.uid):
+            stated = {**asset.record.identity, "asset_sha256": asset.asset_sha256}
+            data = asset_store().asset_path(asset.asset_name).read_bytes()
+            locked = LockedObject(**stated, split="test")
+            pool.append(PooledAsset(locked=locked, asset=decode_asset(data)))
+        for index in range(full.num_scenes):
+            for attempt in range(MAX_ATTEMPTS):
+                with contextlib.suppress(Rejected):
+                    key = SceneKey(settings.seed, index, attempt)
+                    scene = compose_scene(settings.scenes, pool, key)
+                    break
+            else:
+                raise AssertionError(f"scene {index} of the benchmark is rejected")
+            members[f"{sample_key(index)}.scene.safetensors"] = sha256_hex(encode_arrays(scene))
     mini = dict(list(members.items())[: DATASET_PRESETS["benchmark-v1-mini"].num_scenes])
     return {"whole": digest_of_scenes(members), "mini": digest_of_scenes(mini)}
-
-
-def _pool(settings: DatasetSettings, folder: Path) -> list[PooledAsset]:
-    records = generate_objects(str(settings.source), folder)
-    with mesh_stage(settings.assets, workers=2) as prepare:
-        prepared, rejected = prepare(records, lambda: None)
-    assert not rejected
-    pool = []
-    for asset in prepared:
-        locked = LockedObject(
-            **asset.record.identity, asset_sha256=asset.asset_sha256, split="test"
-        )
-        data = asset_store().asset_path(asset.asset_name).read_bytes()
-        pool.append(PooledAsset(locked=locked, asset=decode_asset(data)))
-    return sorted(pool, key=lambda entry: entry.locked.uid)
-
-
-def _composed(settings: DatasetSettings, pool: list[PooledAsset], scene_index: int) -> Scene:
-    for attempt in range(MAX_ATTEMPTS):
-        try:
-            return compose_scene(
-                settings.scenes, pool, SceneKey(settings.seed, scene_index, attempt)
-            )
-        except Rejected:
-            continue
-    raise AssertionError(f"scene {scene_index} of the benchmark is rejected")
 
 
 def set_digests(name: str, root: Path) -> dict[str, Any]:
@@ -114,19 +97,14 @@ def set_digests(name: str, root: Path) -> dict[str, Any]:
     dataset = open_dataset(str(root))
     tars = {path.name: sha256_hex(path.read_bytes()) for path in sorted(root.rglob("*.tar"))}
     assert len(tars) == num_scenes // per_shard
-    scenes = [sample.scene for sample in dataset.samples()]
-    return {"dataset": dataset.digest, "tars": tars, "usd": _usd_digest(scenes, root / "usd")}
-
-
-def _usd_digest(scenes: list[Scene], folder: Path) -> str:
-    """Return the digest of the scenes' files, which USD must give back bit for bit."""
-    folder.mkdir()
-    files = [encode_scene(scene) for scene in scenes]
-    for row, (scene, file) in enumerate(zip(scenes, files, strict=True)):
-        path = folder / f"{row}.usdz"
-        write_usd(path, scene)
-        assert encode_scene(read_scene(path)) == file, path
-    return sha256_hex(b"".join(files))
+    (root / "usd").mkdir()
+    files = []
+    for row, sample in enumerate(dataset.samples()):
+        path = root / "usd" / f"{row}.usdz"
+        files.append(encode_scene(sample.scene))
+        write_usd(path, sample.scene)
+        assert encode_scene(read_scene(path)) == files[-1], "USD gives back every bit"
+    return {"dataset": dataset.digest, "tars": tars, "usd": sha256_hex(b"".join(files))}
 
 
 def mesh_digests() -> dict[str, Any]:
@@ -141,16 +119,13 @@ def mesh_digests() -> dict[str, Any]:
             ("uniform", drawn[::2], AssetSettings(profile="uniform")),
             ("own materials", real[::4], AssetSettings(budgets=(700,), own_materials=own)),
         ):
-            found[name] = _outcome_digest(records, settings)
+            with mesh_stage(settings, workers=2) as prepare:
+                prepared, failures = prepare(records, lambda: None)
+            outcomes = {asset.record.uid: asset.asset_sha256 for asset in prepared}
+            outcomes |= {failure.item: failure.reason for failure in failures}
+            digest = sha256_hex(canonical_json(outcomes))
+            found[name] = f"{len(outcomes)} outcomes {digest}"
     return {RECIPE: found}
-
-
-def _outcome_digest(records: list[ObjectRecord], settings: AssetSettings) -> str:
-    with mesh_stage(settings, workers=2) as prepare:
-        prepared, failures = prepare(records, lambda: None)
-    outcomes = {asset.record.uid: asset.asset_sha256 for asset in prepared}
-    outcomes |= {failure.item: failure.reason for failure in failures}
-    return f"{len(outcomes)} outcomes {sha256_hex(canonical_json(outcomes))}"
 
 
 def network_digests() -> dict[str, str | float]:
@@ -183,7 +158,7 @@ def _shared() -> Path:
 
 
 PARTS: Mapping[str, Callable[[], Mapping[str, Any]]] = {
-    "settings": settings_digests,
+    "settings": lambda: {name: preset_settings(name).digest for name in DATASET_PRESETS},
     "benchmarks": benchmark_digests,
     "meshes": mesh_digests,
     "networks": network_digests,

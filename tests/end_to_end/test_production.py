@@ -96,7 +96,12 @@ def test_all_executors_give_one_digest(tmp_path: Path) -> None:
         call(several, environment, RUN_S)
         digests["two workers"] = _verified(tmp_path / "two")
         _wait_for_both_workers(environment)
-        _submits(tmp_path / "two", environment, digests["two workers"])
+        # what is there already is asked for: the run finds it whole, and its summary arrives here
+        words = ("submit", "generate-scenes", "tiny", *OPTIONS, "--scenes", str(SCENES), "--json")
+        text = call(["-m", "trilight", *words, "--out", str(tmp_path / "two")], environment, RUN_S)
+        told = json.loads(text)
+        summary = ("Completed", digests["two workers"])
+        assert (told["state"], told["summary"]["dataset digest"]) == summary
         _trains(tmp_path, environment)
         _refuses_secrets(tmp_path, environment, database)
         require_an_array_outlives_its_flow(tmp_path, environment)
@@ -135,29 +140,17 @@ def _wait_for_both_workers(environment: dict[str, str]) -> None:
         time.sleep(0.5)
 
 
-def _submits(out: Path, environment: dict[str, str], digest: str) -> None:
-    """Ask for what is there already: the run finds it whole, and its summary arrives here."""
-    words = ("submit", "generate-scenes", "tiny", *OPTIONS, "--scenes", str(SCENES), "--json")
-    text = call(["-m", "trilight", *words, "--out", str(out)], environment, RUN_S)
-    told = json.loads(text)
-    assert (told["state"], told["summary"]["dataset digest"]) == ("Completed", digest)
-
-
 def _trains(tmp_path: Path, environment: dict[str, str]) -> None:
     """Learn from what the flows made, as a flow."""
-    changes = {
-        "warmup_steps": 1,
-        "scenes_per_step": 1,
-        "views_per_scene": 1,
-        "validation_scenes": 1,
-    }
-    where: dict[str, Any] = {
-        "data": json.dumps([str(tmp_path / "two")]),
-        "out": str(tmp_path / "run"),
-        "steps": 4,
-        "changes": json.dumps(changes),
-    }
-    call(documented_run("train-model", **where), environment, RUN_S)
+    ones = ("warmup_steps", "scenes_per_step", "views_per_scene", "validation_scenes")
+    run = documented_run(
+        "train-model",
+        data=json.dumps([str(tmp_path / "two")]),
+        out=tmp_path / "run",
+        steps=4,
+        changes=json.dumps(dict.fromkeys(ones, 1)),
+    )
+    call(run, environment, RUN_S)
     assert NeuralRenderer.load(tmp_path / "run").trained.resolution == 64
 
 
