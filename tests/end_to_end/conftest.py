@@ -14,7 +14,6 @@ import numpy as np
 import pytest
 
 from tests.command_line import run_program
-from tests.command_line import trilight as run_here
 from tests.s3_server import moto as moto
 
 Trilight = Callable[..., "subprocess.CompletedProcess[str]"]
@@ -28,13 +27,6 @@ def trilight(tmp_path: Path) -> Trilight:
         return run_program(command(*arguments), tmp_path, status=status)
 
     return run
-
-
-@pytest.fixture
-def refused(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Callable[..., str]:
-    """Run `trilight` with a mistake in this process, which spares its imports; return its line."""
-    monkeypatch.chdir(tmp_path)
-    return lambda *arguments: run_here(arguments).mistake
 
 
 def command(*arguments: str) -> list[str]:

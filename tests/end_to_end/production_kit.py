@@ -1,7 +1,6 @@
-"""The documented ways: a private production path, and what tutorials tell a reader to do."""
+"""The documented production path, private to a test, and pages that a command serves."""
 
 import contextlib
-import json
 import os
 import re
 import shlex
@@ -16,7 +15,6 @@ import tomllib
 import urllib.error
 import urllib.request
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass
 from pathlib import Path
 
 import pytest
@@ -183,16 +181,6 @@ def copy_of_the_project(folder: Path) -> None:
     (folder / ".venv").symlink_to(ROOT / ".venv")
 
 
-def copy_objects(source: Path, target: Path, rows: Sequence[Mapping[str, str]]) -> Path:
-    """Copy some objects of a folder, with the rows of `objects.jsonl` that state their licenses."""
-    for row in rows:
-        path = target / row["path"]
-        path.parent.mkdir(parents=True, exist_ok=True)
-        shutil.copy(source / row["path"], path)
-    (target / "objects.jsonl").write_text("".join(json.dumps(row) + "\n" for row in rows))
-    return target
-
-
 def start_served(environment: dict[str, str]) -> None:
     """Run what `make serve` runs, and let clients know the password."""
     call(START, environment, timeout=2 * START_S)
@@ -221,6 +209,7 @@ def call(
 def dask_cluster(folder: Path, workers: int) -> Iterator[str]:
     """A scheduler and worker processes of one thread each; gives the address."""
     pytest.importorskip("prefect_dask", reason="make setup-all brings prefect-dask")
+    distributed = pytest.importorskip("distributed")
     address = f"tcp://127.0.0.1:{free_port()}"
     run = [sys.executable, "-m", "distributed.cli.dask_worker", address, "--nthreads", "1"]
     run += ["--no-nanny", "--no-dashboard", "--local-directory", str(folder)]
@@ -235,7 +224,16 @@ def dask_cluster(folder: Path, workers: int) -> Iterator[str]:
             processes.append(
                 subprocess.Popen(command, env=environment, cwd=ROOT, stdout=log, stderr=log)
             )
-        _wait_for_workers(address, workers)
+        deadline = time.monotonic() + START_S
+        is_up = False
+        while not is_up:
+            assert time.monotonic() < deadline, "the Dask cluster did not start"
+            with (
+                contextlib.suppress(OSError),
+                distributed.Client(address, timeout=20, set_as_default=False) as client,
+            ):
+                client.wait_for_workers(workers, timeout=START_S)
+                is_up = True
         yield address
     finally:
         for process in processes:
@@ -243,55 +241,8 @@ def dask_cluster(folder: Path, workers: int) -> Iterator[str]:
             process.wait()
 
 
-def _wait_for_workers(address: str, workers: int) -> None:
-    from distributed import Client
-
-    deadline = time.monotonic() + START_S
-    while time.monotonic() < deadline:
-        with (
-            contextlib.suppress(OSError),
-            Client(address, timeout=20, set_as_default=False) as client,
-        ):
-            client.wait_for_workers(workers, timeout=START_S)
-            return
-    raise AssertionError("the Dask cluster did not start")
-
-
-_BLOCK = re.compile(r"```(sh|python)\n(.*?)```", re.DOTALL)
-
 _END_S = 600
 """The end waits for the step at hand: 13 s on two busy cores, and over a minute on busier ones."""
-
-
-@dataclass(frozen=True, kw_only=True)
-class Step:
-    """One thing that a reader does."""
-
-    language: str
-    """`sh` or `python`."""
-    text: str
-    """A command, or the whole block of Python."""
-
-
-def tutorial(name: str) -> Path:
-    """Return the file of a tutorial."""
-    return ROOT / "docs" / "tutorials" / f"{name}.md"
-
-
-def steps_of(page: Path) -> Iterator[Step]:
-    """Yield the commands of a page's `sh` blocks, and its `python` blocks, in their order."""
-    for language, text in _BLOCK.findall(page.read_text()):
-        if language == "python":
-            yield Step(language="python", text=text)
-        else:
-            for line in shell_lines(text):
-                yield Step(language="sh", text=line)
-
-
-def shell_lines(text: str) -> list[str]:
-    """Return the commands of a script, each on one line, without comments."""
-    lines = (line.split(" #")[0].strip() for line in text.replace("\\\n", " ").splitlines())
-    return [line for line in lines if line and not line.startswith("#")]
 
 
 @contextlib.contextmanager

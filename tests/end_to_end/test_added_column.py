@@ -8,12 +8,11 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
-from numpy.typing import NDArray
 
 from infra.render.path_tracer import PathTracer, RenderChild
 from model.inference import NeuralRenderer
 from model.open import open_network, save_published
-from model.scene_tensors import SceneTensors, batch_scenes, scene_tensors
+from model.scene_tensors import batch_scenes, scene_tensors
 from pipeline.generation.inspect_scene import _facts
 from pipeline.renders.mitsuba_variant import choose_variant
 from pipeline.renders.preview import PreviewSettings
@@ -72,11 +71,6 @@ def run(data: Dataset, tmp_path_factory: pytest.TempPathFactory) -> Path:
     return out
 
 
-def coats(tensors: SceneTensors) -> NDArray[np.float32]:
-    assert tensors.columns == WITH_COAT
-    return np.asarray(tensors.material_TM[:, -1].numpy())
-
-
 def test_composed_scenes_differ_in_the_column_alone() -> None:
     scene = composed(0)
     reflects = (scene.materials[:, EMISSION] == 0).all(axis=1)
@@ -104,7 +98,9 @@ def test_the_stream_shows_what_was_composed(data: Dataset) -> None:
     assert {scene.key for scene in batch} == {f"{index:09d}" for index in range(4)}
     for shown in batch:
         scene = composed(int(shown.key))
-        assert np.array_equal(coats(shown.tensors), scene.materials[scene.material_index, -1])
+        assert shown.tensors.columns == WITH_COAT
+        coats = shown.tensors.material_TM[:, -1].numpy()
+        assert np.array_equal(coats, scene.materials[scene.material_index, -1])
 
 
 def test_symmetries_permute_and_scale_an_added_colour_and_leave_a_scalar() -> None:
@@ -140,11 +136,8 @@ def test_a_network_learns_from_it_and_is_opened_again(run: Path) -> None:
     coated.materials[FLOOR, -1] = 0.9
     assert not np.array_equal(renderer.render(plain, 16), renderer.render(coated, 16))
     assert not renderer.prepare(coated).notes
-
-
-def test_a_checkpoint_whose_column_is_not_declared_says_so(run: Path) -> None:
     with declared():
-        for place in (run, run / "checkpoints" / "step-000000004.safetensors"):
+        for place in (run, checkpoint):
             with pytest.raises(TrilightError, match="'coat'.*has to be declared first"):
                 open_network(place)
 
@@ -167,7 +160,9 @@ def test_the_shipped_network_gives_the_same_bytes_and_says_what_it_does_not_read
         assert np.array_equal(renderer.render(tiny_scene(), 16), shown)
 
 
-def test_the_path_tracer_says_what_it_does_not_read(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_the_path_tracer_says_what_it_does_not_read_and_inspect_what_is_there(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
     use_children_here(monkeypatch)
     child = RenderChild(choose_variant(), threads=1)
     tracer = PathTracer(child, PreviewSettings(resolution=8, spp=1, denoiser="off"))
@@ -175,18 +170,12 @@ def test_the_path_tracer_says_what_it_does_not_read(monkeypatch: pytest.MonkeyPa
     assert tracer.load(scene, "floor").notes == ()
     scene.materials[FLOOR, -1] = 0.9
     assert tracer.load(scene, "floor").notes == ("the path tracer does not read coat",)
-
-
-def test_inspect_names_the_columns_in_use() -> None:
-    scene = tiny_scene()
-    for coat, named in ((0.9, "coat"), (0.0, None)):
-        scene.materials[FLOOR, -1] = coat
-        assert _facts(scene).get("added_columns") == named
+    assert _facts(scene).get("added_columns") == "coat"
+    scene.materials[FLOOR, -1] = 0.0
+    assert _facts(scene).get("added_columns") is None
 
 
 def test_a_network_of_four_columns_trains_on_the_same_data(data: Dataset, tmp_path: Path) -> None:
     trained(FOUR, [str(data.folder.root)], tmp_path / "four")
-    assert open_network(tmp_path / "four").encoder.tokens.material.weight.shape == (
-        36,
-        10,
-    )
+    shape = open_network(tmp_path / "four").encoder.tokens.material.weight.shape
+    assert shape == (36, 10)

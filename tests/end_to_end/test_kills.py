@@ -11,7 +11,6 @@ import threading
 import time
 from collections import Counter
 from collections.abc import Callable, Iterator
-from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
@@ -48,27 +47,13 @@ def _start(out: Path, workers: int, environment: dict[str, str]) -> "subprocess.
     )
 
 
-@dataclass(frozen=True, kw_only=True)
-class Whole:
-    """A dataset that nothing disturbed, made with an empty cache."""
-
-    folder: Path
-    cache: Path
-    digest: str
-    seconds: float
-
-
 @pytest.fixture(scope="module")
-def whole(tmp_path_factory: pytest.TempPathFactory) -> Whole:
+def whole(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, float]:
+    """Return a folder with its cache and a set that nothing disturbed, and the seconds it took."""
     folder, started = tmp_path_factory.mktemp("undisturbed"), time.monotonic()
     environment = {**os.environ, "TRILIGHT_CACHE": str(folder / "cache")}
     assert _start(folder / "set", 1, environment).wait() == 0
-    return Whole(
-        folder=folder / "set",
-        cache=folder / "cache",
-        digest=open_dataset(str(folder / "set")).digest,
-        seconds=time.monotonic() - started,
-    )
+    return folder, time.monotonic() - started
 
 
 def _wait_until(run: "subprocess.Popen[bytes]", reached: Callable[[], bool]) -> None:
@@ -79,17 +64,18 @@ def _wait_until(run: "subprocess.Popen[bytes]", reached: Callable[[], bool]) -> 
 
 @pytest.mark.slow("kills")
 @pytest.mark.timeout(3600)
-def test_killed_anywhere_ends_in_the_same_digest(tmp_path: Path, whole: Whole) -> None:
+def test_killed_anywhere_ends_in_the_same_digest(tmp_path: Path, whole: tuple[Path, float]) -> None:
     rng = np.random.default_rng(0)
+    undisturbed, seconds = whole
     mark, environment = marked_environment()
     cache = tmp_path / "cache"
     environment["TRILIGHT_CACHE"] = str(cache)
     for number in range(KILLS):
         run = _start(tmp_path / "killed", 2, environment)
-        pause_s = rng.uniform(0.1, 0.5) * whole.seconds
+        pause_s = rng.uniform(0.1, 0.5) * seconds
         if number == 0:  # while meshes are made
             _wait_until(run, lambda: num_meshes(cache) > 5)
-            assert num_meshes(cache) < num_meshes(whole.cache)
+            assert num_meshes(cache) < num_meshes(undisturbed / "cache")
             pause_s = 0.0
         try:
             run.wait(timeout=pause_s)
@@ -99,10 +85,11 @@ def test_killed_anywhere_ends_in_the_same_digest(tmp_path: Path, whole: Whole) -
             run.wait()
         wait_until_nobody_is_left(mark)
         for shard in (tmp_path / "killed").glob("*.tar"):
-            assert shard.read_bytes() == (whole.folder / shard.name).read_bytes()
+            assert shard.read_bytes() == (undisturbed / "set" / shard.name).read_bytes()
     assert _start(tmp_path / "killed", 2, environment).wait() == 0
     wait_until_nobody_is_left(mark)
-    assert open_dataset(str(tmp_path / "killed")).digest == whole.digest
+    expected = open_dataset(str(undisturbed / "set")).digest
+    assert open_dataset(str(tmp_path / "killed")).digest == expected
     assert verify_dataset(tmp_path / "killed").problems == []
     # young leftovers may be somebody's work on another machine; old ones go with the next run
     cleaned = tmp_path / "killed" / ".staging" / "cleaned"
@@ -115,12 +102,12 @@ def test_killed_anywhere_ends_in_the_same_digest(tmp_path: Path, whole: Whole) -
 @pytest.mark.slow("kills")
 @pytest.mark.parametrize("moment", ["meshes", "scenes"])
 def test_ctrl_c_says_what_to_do_and_leaves_nobody(
-    tmp_path: Path, whole: Whole, moment: str
+    tmp_path: Path, whole: tuple[Path, float], moment: str
 ) -> None:
     """On a terminal, where progress bars hide the cursor: it is back, and the words come last."""
     mark, environment = marked_environment()
     environment.pop("PREFECT_API_URL", None)
-    cache = tmp_path / "cache" if moment == "meshes" else whole.cache
+    cache = (tmp_path if moment == "meshes" else whole[0]) / "cache"
     environment |= {"TRILIGHT_CACHE": str(cache), "TERM": "xterm"}
     ours, theirs = pty.openpty()
     run = subprocess.Popen(

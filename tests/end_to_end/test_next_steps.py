@@ -19,7 +19,6 @@ from tests.end_to_end.conftest import Trilight, command
 from tests.end_to_end.production_kit import SIXTEEN_SAMPLES
 from tests.for_each import for_each
 
-SCENE = "{}"
 LONG = {
     "generate": ("generate", "smoke", "--out", "set"),
     "assets": ("assets", "builtin:", "--out", "my meshes"),
@@ -63,7 +62,7 @@ def _leave(words: tuple[str, ...], folder: Path, begun: Callable[[], bool]) -> N
 @pytest.mark.slow("kills")
 @for_each("name", LONG)
 def test_words_come_first_and_ctrl_c_is_answered(name: str, tmp_path: Path) -> None:
-    (tmp_path / "scene.json").write_text(SCENE)
+    (tmp_path / "scene.json").write_text("{}")
     with socket.create_server(("127.0.0.1", 0)) as server:  # takes connections, and never answers
         url = f"http://127.0.0.1:{server.getsockname()[1]}/set"
         # verify has nothing slow to import: only a wait outlasts the signal's way

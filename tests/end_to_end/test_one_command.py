@@ -4,7 +4,6 @@ import json
 import re
 import shutil
 import sys
-from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
@@ -18,7 +17,7 @@ from storage.dataset.layout import DatasetFolder
 from storage.records.lights import num_light_pictures, sum_of_lights
 from storage.records.objects import read_failures
 from storage.records.passes import view_passes
-from tests.command_line import expect_output, run_program
+from tests.command_line import expect_mistake, expect_output, run_program
 from tests.conftest import ROOT
 from tests.end_to_end.conftest import Trilight
 from tests.end_to_end.production_kit import SIXTEEN_SAMPLES
@@ -54,7 +53,8 @@ BAD_INPUT = [
 ]
 
 
-def test_bad_input_is_one_clear_line(refused: Callable[..., str], tmp_path: Path) -> None:
+def test_bad_input_is_one_clear_line(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.chdir(tmp_path)
     (tmp_path / "empty").mkdir()
     (tmp_path / "broken").mkdir()
     (tmp_path / "broken" / "torn.stl").write_bytes(b"solid nothing")
@@ -64,7 +64,7 @@ def test_bad_input_is_one_clear_line(refused: Callable[..., str], tmp_path: Path
     (tmp_path / "twice" / "a.stl").write_bytes(b"solid nothing")
     (tmp_path / "twice" / "objects.jsonl").write_text(2 * (json.dumps(row) + "\n"))
     for arguments, message in BAD_INPUT:
-        assert message in refused(*arguments), arguments
+        assert message in expect_mistake(*arguments), arguments
 
 
 EXACT = (
@@ -74,8 +74,9 @@ EXACT = (
 
 
 @pytest.fixture
-def scenes(shared: Path, tmp_path: Path) -> Path:
-    """A folder with two scenes, and with the meshes of all."""
+def scenes(shared: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    """A folder, of the one in use, with two scenes, and with the meshes of all."""
+    monkeypatch.chdir(tmp_path)
     source = shared / "renderformer_scenes"
     for name in ("objects", "templates"):
         shutil.copytree(source / name, tmp_path / "scenes" / name)
@@ -85,9 +86,7 @@ def scenes(shared: Path, tmp_path: Path) -> Path:
 
 
 @pytest.mark.slow("commands")
-def test_existing_scenes_become_a_dataset(
-    trilight: Trilight, refused: Callable[..., str], scenes: Path, tmp_path: Path
-) -> None:
+def test_existing_scenes_become_a_dataset(trilight: Trilight, scenes: Path, tmp_path: Path) -> None:
     def generate(out: str, *more: str) -> dict[str, object]:
         made = trilight("generate", "smoke", "--scenes-from", "scenes", "--out", out, *EXACT, *more)
         return dict(json.loads(made.stdout[made.stdout.index("{") :]))
@@ -120,21 +119,19 @@ def test_existing_scenes_become_a_dataset(
     damaged = bytearray(whole)
     damaged[len(damaged) // 2] ^= 1
     (tmp_path / "set" / shard.name).write_bytes(damaged)
-    assert "expected --scenes-from FOLDER" in refused("verify", "set", "--repair")
+    assert "expected --scenes-from FOLDER" in expect_mistake("verify", "set", "--repair")
     trilight("verify", "set", "--repair", "--scenes-from", "scenes")
     assert (tmp_path / "set" / shard.name).read_bytes() == whole
     assert open_dataset(str(tmp_path / "set")).manifest == dataset.manifest
 
     with (scenes / "objects/cbox/tall-box.obj").open("a") as stream:
         stream.write("\n")
-    changed = refused("generate", "smoke", "--scenes-from", "scenes", "--out", "set", *EXACT)
+    changed = expect_mistake("generate", "smoke", "--scenes-from", "scenes", "--out", "set", *EXACT)
     assert "scene files: 'objects/cbox/tall-box.obj' has changed" in changed
     assert DatasetFolder(tmp_path / "set").shard(shard.name).exists()
 
 
-def test_bad_scenes_are_one_clear_line(
-    refused: Callable[..., str], scenes: Path, tmp_path: Path
-) -> None:
+def test_bad_scenes_are_one_clear_line(scenes: Path, tmp_path: Path) -> None:
     (tmp_path / "bad").mkdir()
     (tmp_path / "bad" / "bad.json").write_text('{"scene_name": "x", "version": "1.0"}')
     for arguments, message in (
@@ -143,12 +140,12 @@ def test_bad_scenes_are_one_clear_line(
         (("--scenes-from", "nowhere"), "no such folder"),
         (("--views", "2"), "--views is 2"),
     ):
-        assert message in refused("generate", "smoke", "--out", "set", *arguments)
+        assert message in expect_mistake("generate", "smoke", "--out", "set", *arguments)
 
 
 @pytest.mark.slow("commands")
 def test_a_bad_file_and_a_dark_scene_cost_themselves(
-    trilight: Trilight, refused: Callable[..., str], scenes: Path, tmp_path: Path
+    trilight: Trilight, scenes: Path, tmp_path: Path
 ) -> None:
     """The first of three is no scene, the second dark; the third has albedos that add up to 1.1."""
     (scenes / "bad.json").write_text('{"scene_name": "x", "version": "1.0", "objects": {}}')
@@ -174,11 +171,8 @@ def test_a_bad_file_and_a_dark_scene_cost_themselves(
     again = trilight("generate", "smoke", *arguments, *EXACT, "--workers", "2")
     assert json.loads(again.stdout)["dataset_digest"] == outcome["dataset_digest"]
     # it would be another set
-    strict = refused("generate", "smoke", *arguments, *EXACT, "--albedo-over-one", "refuse")
+    strict = expect_mistake("generate", "smoke", *arguments, *EXACT, "--albedo-over-one", "refuse")
     assert "'crystals.json' is missing" in strict
-
-
-ONE_VIEW = ("--set", "scenes.num_views=1")
 
 
 def _generate(out: Path, *words: str) -> None:
@@ -219,7 +213,8 @@ def test_objects_alone_from_the_preset_to_the_exports(
 @pytest.mark.slow("commands")
 def test_the_page_relights_a_scene_one_light_at_a_time(tmp_path: Path) -> None:
     skies = ["--set", "scenes.skies.share=1", "--set", "scenes.skies.maps.height=16"]
-    _generate(tmp_path / "data/olat", "olat", "--scenes", "1", *ONE_VIEW, *skies)
+    skies += ["--set", "scenes.num_views=1"]
+    _generate(tmp_path / "data/olat", "olat", "--scenes", "1", *skies)
     expect_output("verify", tmp_path / "data/olat")
     (block,) = re.findall(
         r"```python\n(.*?)```", (ROOT / "docs/how-to/olat.md").read_text(), re.DOTALL

@@ -1,4 +1,7 @@
-"""The documented production path, word for word: one dataset by all executors has one digest."""
+"""The documented production path, word for word: one dataset by all executors has one digest.
+
+In a bucket too, by two machines and a flow; and no secret gets anywhere.
+"""
 
 import base64
 import json
@@ -8,6 +11,7 @@ import subprocess
 import sys
 import time
 import urllib.request
+from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
@@ -17,6 +21,7 @@ import pytest
 from model.inference import NeuralRenderer
 from storage.dataset.dataset import open_dataset
 from storage.dataset.verify import verify_dataset
+from tests.command_line import run_program
 from tests.conftest import ROOT
 from tests.end_to_end.conftest import kill_one
 from tests.end_to_end.production_kit import (
@@ -32,6 +37,11 @@ from tests.end_to_end.production_kit import (
     postgres,
     served,
 )
+from tests.http_server import serve
+from tests.pipeline.assets.meshes_by_hand import knot, write_obj
+from tests.pipeline.documents.dataset_by_hand import files_of
+from tests.pipeline.generation.bucket_kit import empty_bucket
+from tests.s3_server import control
 
 SCENES = 8
 """Two shards of four: a range for each of two workers."""
@@ -42,6 +52,7 @@ SMALL: dict[str, Any] = {
 """Tiny scenes, as wide as the smoke run's pictures."""
 OPTIONS = ("--objects", "builtin:24", "--resolution", "64", *FEW_SAMPLES)
 CANARY = "CANARY-51b2"
+"""Part of every secret; nothing that is written or said may contain it."""
 RUN_S = 900
 """A run takes a minute; on busy machines many times that."""
 
@@ -85,7 +96,12 @@ def test_all_executors_give_one_digest(tmp_path: Path) -> None:
         call(several, environment, RUN_S)
         digests["two workers"] = _verified(tmp_path / "two")
         _wait_for_both_workers(environment)
-        _submits(tmp_path / "two", environment, digests["two workers"])
+        # what is there already is asked for: the run finds it whole, and its summary arrives here
+        words = ("submit", "generate-scenes", "tiny", *OPTIONS, "--scenes", str(SCENES), "--json")
+        text = call(["-m", "trilight", *words, "--out", str(tmp_path / "two")], environment, RUN_S)
+        told = json.loads(text)
+        summary = ("Completed", digests["two workers"])
+        assert (told["state"], told["summary"]["dataset digest"]) == summary
         _trains(tmp_path, environment)
         _refuses_secrets(tmp_path, environment, database)
         require_an_array_outlives_its_flow(tmp_path, environment)
@@ -124,29 +140,17 @@ def _wait_for_both_workers(environment: dict[str, str]) -> None:
         time.sleep(0.5)
 
 
-def _submits(out: Path, environment: dict[str, str], digest: str) -> None:
-    """Ask for what is there already: the run finds it whole, and its summary arrives here."""
-    words = ("submit", "generate-scenes", "tiny", *OPTIONS, "--scenes", str(SCENES), "--json")
-    text = call(["-m", "trilight", *words, "--out", str(out)], environment, RUN_S)
-    told = json.loads(text)
-    assert (told["state"], told["summary"]["dataset digest"]) == ("Completed", digest)
-
-
 def _trains(tmp_path: Path, environment: dict[str, str]) -> None:
     """Learn from what the flows made, as a flow."""
-    changes = {
-        "warmup_steps": 1,
-        "scenes_per_step": 1,
-        "views_per_scene": 1,
-        "validation_scenes": 1,
-    }
-    where: dict[str, Any] = {
-        "data": json.dumps([str(tmp_path / "two")]),
-        "out": str(tmp_path / "run"),
-        "steps": 4,
-        "changes": json.dumps(changes),
-    }
-    call(documented_run("train-model", **where), environment, RUN_S)
+    ones = ("warmup_steps", "scenes_per_step", "views_per_scene", "validation_scenes")
+    run = documented_run(
+        "train-model",
+        data=json.dumps([str(tmp_path / "two")]),
+        out=tmp_path / "run",
+        steps=4,
+        changes=json.dumps(dict.fromkeys(ones, 1)),
+    )
+    call(run, environment, RUN_S)
     assert NeuralRenderer.load(tmp_path / "run").trained.resolution == 64
 
 
@@ -228,3 +232,118 @@ def require_an_array_outlives_its_flow(folder: Path, environment: dict[str, str]
     ).read_text()
     assert verify_dataset(str(folder / "by-array")).problems == []
     assert (folder / "asked").read_text() == "0-1\n", "the second run asked for nothing"
+
+
+SECRETS = (
+    "AWS_SECRET_ACCESS_KEY", "AWS_SESSION_TOKEN", "PREFECT_API_KEY", "HF_TOKEN", "GITHUB_TOKEN",
+    "GOOGLE_API_KEY", "DATABASE_PASSWORD",
+)  # fmt: skip
+BUCKET_OPTIONS = (
+    "--objects", "env:TRILIGHT_SOURCE_TEST", "--scenes", "12", "--resolution", "32",
+    *FEW_SAMPLES,
+)  # fmt: skip
+"""Three shards of four tiny scenes."""
+FLOW = f"""
+from pipeline.flows import prefect_server as private
+private.quiet_prefect()
+with private.prefect_server():
+    from pipeline.flows.prefect_flows import generate_scenes
+    generate_scenes(objects="env:TRILIGHT_SOURCE_TEST", scenes=12, resolution=32,
+                    changes={FEW_SAMPLES_CHANGES!r}, out="s3://shards/flow")
+"""
+
+
+@pytest.fixture
+def driver(moto: int, monkeypatch: pytest.MonkeyPatch) -> Iterator[Any]:
+    with empty_bucket(moto, monkeypatch) as bucket:
+        bucket.port = moto
+        yield bucket
+
+
+@pytest.fixture
+def environment(driver: Any, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Any]:
+    """An environment full of secrets, and objects behind a URL with three of them."""
+    (tmp_path / "objects").mkdir()
+    for number in range(8):  # the first six have all three splits
+        write_obj(tmp_path / "objects" / f"knot{number}.obj", knot(segments=30 + number, sides=6))
+    with serve(None) as site:
+        for path in (tmp_path / "objects").iterdir():
+            site.put(f"objects/{path.name}", path.read_bytes())
+        site.needed_query = f"key={CANARY}"
+        address = site.url.removeprefix("http://")
+        yield {
+            **{name: value for name, value in os.environ.items() if name != "PREFECT_API_URL"},
+            **{name: f"{CANARY}-{name.lower()}" for name in SECRETS},
+            "TRILIGHT_SOURCE_TEST": f"http://me:{CANARY}@{address}/objects/?key={CANARY}",
+            "PYTHONPATH": str(ROOT),
+            "NO_PROXY": "127.0.0.1",
+            "PREFECT_HOME": str(tmp_path / "prefect"),
+            "PREFECT_LOGGING_LEVEL": "DEBUG",
+            "PREFECT_LOGGING_EXTRA_LOGGERS": "trilight",
+        }
+
+
+def _words(out: Path | str, *more: str) -> list[str]:
+    command = ["-m", "trilight", "generate", "smoke", *BUCKET_OPTIONS]
+    return [*command, "--out", str(out), *more]
+
+
+@pytest.mark.slow("servers")
+@pytest.mark.timeout(3600)
+def test_a_bucket_as_output_from_two_machines_and_a_flow(
+    driver: Any, environment: dict[str, str], tmp_path: Path
+) -> None:
+    plain, said = tmp_path / "plain", []
+    reader = {**environment, "TRILIGHT_CACHE": str(tmp_path / "one")}
+    said.append(call(_words(plain), reader, RUN_S))
+    runs = [
+        subprocess.Popen(
+            [sys.executable, *_words("s3://shards/set", "--shards", shards)],
+            cwd=ROOT, env={**environment, "TRILIGHT_CACHE": str(tmp_path / cache)}, text=True,
+            stdout=subprocess.PIPE, stderr=subprocess.STDOUT,
+        )
+        for cache, shards in (("two", "0:2"), ("three", "1:3"))
+    ]  # fmt: skip
+    for run in runs:
+        said.append(run.communicate(timeout=RUN_S)[0])
+        assert run.returncode == 0, said[-1]
+    said.append(call(["-c", FLOW], reader, RUN_S))  # its meshes are made
+    _same_files(driver, plain, "shards/set")
+    _same_files(driver, plain, "shards/flow")
+    for name in ("verify", "status", "inspect"):
+        said += [call(["-m", "trilight", name, "s3://shards/set"], reader, RUN_S)]
+    assert "finished" in said[-2] and "12 of 12" in said[-2]
+    said += _refused(environment, driver.port)
+    _no_canary(driver, tmp_path, said)
+
+
+def _same_files(driver: Any, plain: Path, prefix: str) -> None:
+    """Compare all that is a dataset; logs and what is beside it are not."""
+    driver.invalidate_cache()
+    found = {path.removeprefix(f"{prefix}/"): driver.cat_file(path) for path in driver.find(prefix)}
+    aside = (".staging/", "logs/")
+    assert {name: data for name, data in found.items() if not name.startswith(aside)} == {
+        name: data for name, data in files_of(plain).items() if not name.startswith(aside)
+    }
+
+
+def _refused(environment: dict[str, str], port: int) -> list[str]:
+    """Return what is said where access is refused, and where a secret stands in the URL."""
+    control(port, "reset-auth", b"0")
+    refused = []
+    for out in ("s3://shards/set", f"s3://me:{CANARY}@shards/set", f"s3://shards/set?k={CANARY}"):
+        done = run_program([sys.executable, *_words(out)], env=environment, status=1)
+        assert "trilight: out 's3://shards/set" in done.stderr.strip().splitlines()[-1]
+        refused.append(done.stdout + done.stderr)
+    control(port, "reset-auth", b"inf")
+    return refused
+
+
+def _no_canary(driver: Any, tmp_path: Path, said: list[str]) -> None:
+    """Look through what was said, every file, every object of the bucket, and Prefect's records."""
+    files = [path for path in tmp_path.rglob("*") if path.is_file()]
+    records = b"".join(path.read_bytes() for path in files if "prefect.db" in path.name)
+    assert b"s3://shards/flow/report.html" in records  # the artifacts are in what is looked through
+    assert not [text for text in said if CANARY in text]
+    assert not [path for path in files if CANARY.encode() in path.read_bytes()]
+    assert not [path for path in driver.find("shards") if CANARY.encode() in driver.cat_file(path)]

@@ -1,33 +1,44 @@
 """The commands of README, tutorials and how-to pages do what is said; those of all pages exist."""
 
+import contextlib
+import csv
+import dataclasses
 import json
 import os
 import re
 import shlex
+import shutil
+from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
 from PIL import Image
 
+from infra.viewer.open_source import open_handlers, page_of
+from pipeline.presets.registry import preset_settings
 from storage.dataset.dataset import open_dataset
+from storage.digests import sha256_of_file
 from storage.extensions import is_reference
+from storage.records.objects import write_objects_lock
+from storage.records.scene import Scene
+from storage.settings.described import settings_record
 from tests.command_line import run_program, trilight
 from tests.conftest import ROOT
 from tests.end_to_end.production_kit import (
     SIXTEEN_SAMPLES,
     answer_of,
-    copy_objects,
     copy_of_the_project,
-    shell_lines,
-    steps_of,
-    tutorial,
     viewed,
 )
 from tests.for_each import for_each
+from tests.infra.viewer.served_kit import served
+from tests.pipeline.documents.dataset_by_hand import edit_manifest, locked
+from tests.train.toy import toy_scene, write_toy_dataset
 
 README = ROOT / "README.md"
+DOCS = ROOT / "docs"
 TUTORIALS = [
-    tutorial(name)
+    DOCS / "tutorials" / f"{name}.md"
     for name in (
         "first-dataset",
         "your-own-objects",
@@ -43,16 +54,27 @@ NOT_RUN_HERE = {". .venv/bin/activate", "make setup-all"}
 """What this test's own environment is."""
 
 
+def _steps_of(page: Path) -> Iterator[tuple[str, str]]:
+    """Yield what a reader of a page or a script does, in its order, after `sh` or `python`.
+
+    A step is a command on one line, without comments, or a whole block of Python.
+    """
+    whole = page.read_text()
+    blocks = re.findall(r"```(sh|python)\n(.*?)```", whole, re.DOTALL)
+    for language, text in blocks if page.suffix == ".md" else [("sh", whole)]:
+        if language == "python":
+            yield language, text
+            continue
+        lines = (line.split(" #")[0].strip() for line in text.replace("\\\n", " ").splitlines())
+        yield from (("sh", line) for line in lines if line and not line.startswith("#"))
+
+
 def _shell_lines(page: Path) -> list[str]:
-    """Return the commands of a page's `sh` blocks, or of a script, without comments."""
-    text = page.read_text()
-    if page.suffix == ".md":
-        text = "\n".join(re.findall(r"```sh\n(.*?)```", text, re.DOTALL))
-    return shell_lines(text)
+    return [text for language, text in _steps_of(page) if language == "sh"]
 
 
 AGENTS = ROOT / "AGENTS.md"
-PAGES = [README, AGENTS, ROOT / "CONTRIBUTING.md", SCRIPT, *sorted((ROOT / "docs").rglob("*.md"))]
+PAGES = [README, AGENTS, ROOT / "CONTRIBUTING.md", SCRIPT, *sorted(DOCS.rglob("*.md"))]
 EXAMPLES = sorted((ROOT / "examples").glob("*.py"))
 SHOWN = re.findall(r"^    (trilight .*)$", "".join(e.read_text() for e in EXAMPLES), re.MULTILINE)
 USED = sorted({*SHOWN, *(line for page in PAGES for line in _shell_lines(page))})
@@ -82,9 +104,7 @@ COMMANDS = sorted({_command(words) for line in USED if (words := _trilight_words
 def test_readme_and_tutorials_show_commands() -> None:
     for page in (README, *TUTORIALS[1:], SCRIPT):
         assert any(_trilight_words(line) for line in _shell_lines(page)), page
-    assert set(TUTORIALS) == set((ROOT / "docs" / "tutorials").glob("*.md")) - {
-        ROOT / "docs" / "tutorials" / "index.md"
-    }
+    assert {*TUTORIALS, DOCS / "tutorials" / "index.md"} == set(DOCS.glob("tutorials/*.md"))
 
 
 @pytest.mark.parametrize("command", COMMANDS, ids=" ".join)
@@ -133,10 +153,12 @@ def _view(command: str, folder: Path) -> None:
 def test_the_commands_run(tmp_path: Path, shared: Path) -> None:
     """README's, in order; only its objects, dataset and training are fewer."""
     copy_of_the_project(tmp_path)
-    rows = [json.loads(row) for row in (shared / "objects/objects.jsonl").open()]
-    objects = copy_objects(
-        shared / "objects", tmp_path / "objects", rows[2:32:2]
-    )  # of all three splits
+    objects = tmp_path / "objects"
+    rows = (shared / "objects/objects.jsonl").read_text().splitlines()[2:32:2]  # of all splits
+    for path in (json.loads(row)["path"] for row in rows):
+        (objects / path).parent.mkdir(parents=True, exist_ok=True)
+        shutil.copy(shared / "objects" / path, objects / path)
+    (objects / "objects.jsonl").write_text("\n".join(rows) + "\n")
     for command in _shell_lines(README):
         if command in NOT_RUN_HERE:
             continue
@@ -171,14 +193,14 @@ def test_the_commands_run(tmp_path: Path, shared: Path) -> None:
 def test_the_tutorials_run(tmp_path: Path) -> None:
     copy_of_the_project(tmp_path)
     _run("make dataset", tmp_path)
-    for step in (step for page in TUTORIALS for step in steps_of(page)):
-        if step.language == "python":
-            (tmp_path / "block.py").write_text(step.text)
+    for language, text in (step for page in TUTORIALS for step in _steps_of(page)):
+        if language == "python":
+            (tmp_path / "block.py").write_text(text)
             _run("python block.py", tmp_path)
-        elif step.text.startswith("trilight view"):
-            _view(step.text, tmp_path)
+        elif text.startswith("trilight view"):
+            _view(text, tmp_path)
         else:
-            _run(step.text, tmp_path)
+            _run(text, tmp_path)
     made_by_pages = (
         "runs/mine/validation_sheet.png",
         "data/both.png",
@@ -199,7 +221,7 @@ def test_the_whole_line_runs(tmp_path: Path) -> None:
 
 OWN_PAGES = [
     ROOT / "CONTRIBUTING.md",
-    *(p for p in sorted((ROOT / "docs" / "how-to").glob("*.md")) if "/examples/" in p.read_text()),
+    *(p for p in sorted(DOCS.glob("how-to/*.md")) if "/examples/" in p.read_text()),
 ]
 """Of those who add something of their own."""
 SCREEN = 60
@@ -225,3 +247,106 @@ def test_every_example_has_a_page_and_every_page_a_command() -> None:
     for example in EXAMPLES:
         assert f"](../../examples/{example.name})" in texts, example.name
     assert all(_shell_lines(page) for page in OWN_PAGES)
+
+
+PX = 16
+"""Width of the toys' pictures, where the pages have 64."""
+SMOKE = settings_record(preset_settings("smoke"))
+SMALL = ["--set", "resolution=16", "--set", "views_per_scene=2"]
+"""Of trainings."""
+TOYS = {
+    "trilight shards select data/mine --template corner --where 'lights_per_scene >= 3'      "
+    "--out data/corners": "trilight shards select data/mine --split train "
+    "--template toy --out data/corners",
+    "trilight assets procedural:12 --out data/watertight --budget 1188 --watertight": "trilight "
+    "assets procedural:3 --out data/watertight --budget 1188 --watertight",
+    "trilight generate renderformer-v1-256 --objects data/watertight --out data/v1 --scenes 128": ""
+    "trilight generate renderformer-v1-256 --objects data/watertight --out data/v1 --scenes 1 "
+    "--resolution 16 --noise-floor 5 --set splits.scenes_per_shard=1 --set splits.one_split=true",
+}
+"""What a page says of scenes that the toys have none of, or of more than a test needs."""
+ASKED = {"dataset.html": "rows", "scene.html": "scene", "folder.html": "folder"}
+
+
+def toy_room(index: int) -> Scene:
+    """Return a toy scene whose objects say what they are."""
+    scene = toy_scene(index)
+    named = (
+        dataclasses.replace(each, uid=f"{index}") if each.kind == "object" else each
+        for each in scene.objects
+    )
+    return dataclasses.replace(scene, objects=tuple(named))
+
+
+@pytest.fixture(scope="module")
+def desk(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Path]:
+    """Return a reader's folder, with what the pages before have made; it is the working one.
+
+    Toy scenes stand where those pages have made theirs.
+    """
+    desk = tmp_path_factory.mktemp("desk")
+    splits = ["train"] * 3 + ["validation"]
+    dataset = write_toy_dataset(
+        desk / "data" / "mine", train=3, validation=1, resolution=PX, scene_of=toy_room
+    )
+    objects = [locked(f"{row}", split=split) for row, split in enumerate(splits)]
+    write_objects_lock(dataset.folder.objects_lock, objects)
+    digest = sha256_of_file(dataset.folder.objects_lock)
+    told = {**SMOKE, "renders": {**SMOKE["renders"], "resolution": PX}}
+    edit_manifest(dataset, objects_lock_sha256=digest, settings=told)
+    dataset.folder.card.write_text("# Toys\n")
+    with contextlib.chdir(desk):
+        began = "train smoke --data data/mine --out runs/mine --steps 2".split()
+        assert trilight([*began, *SMALL]).exit_code == 0
+        yield desk
+
+
+def do(language: str, text: str) -> None:
+    """Do what a page says: a training is a short one, and a page is asked what it asks first."""
+    if language == "python":
+        text = text.replace("resolution=64", f"resolution={PX}")
+        exec(compile(text, "a tutorial", "exec"), {})
+        return
+    name, *words = shlex.split(TOYS.get(text, text))
+    assert name == "trilight", text
+    if words[0] == "view":
+        page = page_of(words[1])
+        with served(open_handlers(words[1], checkpoint=None, threads=1), page) as asker:
+            status, told, _ = asker.ask(f"api/{ASKED[page]}")
+            assert status == 200 and told, words[1]
+        return
+    if words[0] == "train":
+        words = [re.sub(r"^(num_steps=)?(\d)0$", r"\1\2", word) for word in words] + SMALL
+    ended = trilight(words)
+    assert ended.exit_code == 0, (words, ended.output)
+
+
+@pytest.mark.slow("commands")
+@pytest.mark.timeout(900)
+@pytest.mark.parametrize(
+    ("page", "made"),
+    [
+        (
+            "look-around",
+            ["data/corners/report.html", "data/files/more/room.usdz", "data/mine/templates.png"],
+        ),
+        ("stand-on-a-leaderboard", ["boards/mine/leaderboard.png", "data/for-others/views.csv"]),
+        ("../how-to/coming-from-scripts", ["data/v1-energon/.nv-meta/split.yaml"]),
+    ],
+)
+def test_every_step_of_a_page_does_what_is_said(page: str, made: list[str], desk: Path) -> None:
+    for step in _steps_of(DOCS / "tutorials" / f"{page}.md"):
+        do(*step)
+    for name in made:
+        assert (desk / name).stat().st_size > 0, name
+    if page == "stand-on-a-leaderboard":  # rows of a user's network and pictures
+        with (desk / "boards" / "mine" / "leaderboard.csv").open() as stream:
+            rows = {row["name"]: row for row in csv.DictReader(stream)}
+        assert {"pictures of theirs", "network mine", "network builtin:"} < set(rows)
+        assert rows["pictures of theirs"]["first_core_s"] == ""
+        traced = [rows[f"{samples}, fast"] for samples in ("1 sample", "4 samples", "16 samples")]
+        for row in traced:
+            assert row["kind"] == "path tracer, denoised" and row["processor"]
+            assert float(row["first_core_s"]) > 0 < float(row["further_core_s"])
+        # the toys' pictures are no path tracer's: what is traced has their shapes, not their light
+        assert len({row["psnr_log_db_median"] for row in traced}) == 3

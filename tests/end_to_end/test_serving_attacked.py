@@ -1,5 +1,6 @@
 """What `make serve` starts, attacked by requests, origins and rebinding; then it does its work."""
 
+import contextlib
 import http
 import http.client
 import json
@@ -239,7 +240,13 @@ def test_the_same_page_does_as_it_likes_with_prefect_alone(tmp_path: Path) -> No
     ) as process:  # fmt: skip
         try:
             alone = Server(f"http://127.0.0.1:{port}/api", None, tmp_path, environment)
-            _until_it_answers(alone)
+            deadline = time.monotonic() + START_S
+            status = 0
+            while status != 200:
+                assert time.monotonic() < deadline, "the server did not start"
+                with contextlib.suppress(OSError):
+                    status, _ = alone.ask("GET", "/api/health")
+                time.sleep(0.2)
             _, flow = alone.ask("POST", "/api/flows/", {"name": "f"})
             given = {"name": "local", "flow_id": flow["id"], "entrypoint": "f_scenes"}
             assert alone.ask("POST", "/api/deployments/", given)[0] == 201
@@ -253,17 +260,6 @@ def test_the_same_page_does_as_it_likes_with_prefect_alone(tmp_path: Path) -> No
         finally:
             process.kill()
     raise AssertionError((won, told))
-
-
-def _until_it_answers(server: Server) -> None:
-    deadline = time.monotonic() + START_S
-    while time.monotonic() < deadline:
-        try:
-            if server.ask("GET", "/api/health")[0] == 200:
-                return
-        except OSError:
-            time.sleep(0.2)
-    raise AssertionError("the server did not start")
 
 
 @pytest.mark.parametrize("name", ["127.0.0.1", "localhost"])

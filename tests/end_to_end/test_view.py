@@ -360,12 +360,11 @@ PICK = """document.querySelector('[name="{}"][value="{}"]').click()"""
 
 
 def test_a_person_looks_around(tmp_path: Path) -> None:
-    dataset = five_scenes(tmp_path)
-    report = write_report(dataset, dataset_distributions(dataset), out=dataset.folder)
+    address = report(tmp_path).as_uri()
     with browser() as page:
         for width in (1280, 1000, 390):
             page.show(width, 844)
-            page.open(f"{report.as_uri()}?{width}")  # another address, which is loaded anew
+            page.open(f"{address}?{width}")  # another address, which is loaded anew
             assert page.run("document.documentElement.scrollWidth") <= width
             assert page.run("document.querySelector('.cards').offsetTop") < 844
             everything = page.run(SHOWN)
@@ -381,7 +380,7 @@ def test_a_person_looks_around(tmp_path: Path) -> None:
             assert sorted(page.run(SHOWN).split(",")) == sorted(everything.split(","))
             assert page.run(SHOWN) != everything and page.run(COMMANDS) == ""
             page.call("Emulation.setScriptExecutionDisabled", value=True)
-            page.open(f"{report.as_uri()}?{width}&bare")
+            page.open(f"{address}?{width}&bare")
             assert page.run(SHOWN) == everything
             assert not page.run("document.querySelector('.filters').offsetParent")
             page.call("Emulation.setScriptExecutionDisabled", value=False)

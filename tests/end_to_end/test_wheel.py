@@ -3,7 +3,6 @@
 import os
 import sys
 import zipfile
-from collections.abc import Callable
 from importlib import metadata
 from pathlib import Path
 
@@ -18,8 +17,6 @@ from tests.end_to_end.production_kit import SIXTEEN_SAMPLES
 from tests.scenes_by_hand import tiny_scene
 
 pytestmark = [pytest.mark.slow("packaging"), pytest.mark.timeout(1800)]
-
-Run = Callable[..., str]
 
 
 def _call(command: list[str], folder: Path) -> str:
@@ -73,12 +70,8 @@ def place(wheel: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
     return folder
 
 
-@pytest.fixture
-def trilight(place: Path) -> Run:
-    def run(*words: str) -> str:
-        return _call([str(place / "env/bin/trilight"), *words], place)
-
-    return run
+def _trilight(place: Path, *words: str) -> str:
+    return _call([str(place / "env/bin/trilight"), *words], place)
 
 
 def test_the_wheel_holds_one_package_and_what_belongs_to_it(wheel: Path) -> None:
@@ -96,22 +89,22 @@ def test_the_wheel_holds_one_package_and_what_belongs_to_it(wheel: Path) -> None
         assert f"trilight/{name}" in names
 
 
-def test_it_says_its_version_and_renders_by_both_engines(place: Path, trilight: Run) -> None:
-    assert trilight("--version").startswith("trilight 0.")
+def test_it_says_its_version_and_renders_by_both_engines(place: Path) -> None:
+    assert _trilight(place, "--version").startswith("trilight 0.")
     small = ("--resolution", "16", "--max-spp", "8", "--noise-floor", "10")
-    trilight("render", "scene.safetensors", "--engine", "both", *small, "--out", "both.exr")
+    _trilight(place, "render", "scene.safetensors", "--engine", "both", *small, "--out", "both.exr")
     assert (place / "both.mitsuba.exr").is_file()
     assert (place / "both.neural.exr").is_file()
-    trilight("convert", "scene.safetensors", "scene.usdc")
-    trilight("convert", "scene.usdc", "back.safetensors")
+    _trilight(place, "convert", "scene.safetensors", "scene.usdc")
+    _trilight(place, "convert", "scene.usdc", "back.safetensors")
     back = read_scene_file(place / "back.safetensors")
     assert back.num_triangles == tiny_scene().num_triangles
 
 
-def test_it_makes_a_dataset_and_trains_on_it(place: Path, trilight: Run) -> None:
+def test_it_makes_a_dataset_and_trains_on_it(place: Path) -> None:
     size = ("--scenes", "8", "--resolution", "64", *SIXTEEN_SAMPLES)
-    trilight("generate", "smoke", *size, "--out", "data/set")
+    _trilight(place, "generate", "smoke", *size, "--out", "data/set")
     assert open_dataset(str(place / "data/set")).manifest.num_samples == 8
-    trilight("verify", "data/set")
-    trilight("train", "smoke", "--data", "data/set", "--out", "runs/it", "--steps", "10")
+    _trilight(place, "verify", "data/set")
+    _trilight(place, "train", "smoke", "--data", "data/set", "--out", "runs/it", "--steps", "10")
     assert (place / "runs/it/model.safetensors").is_file()

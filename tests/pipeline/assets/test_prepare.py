@@ -187,7 +187,7 @@ def records(shared: Path, tmp_path_factory: pytest.TempPathFactory) -> list[Obje
 
 @pytest.mark.parametrize("step", [27, pytest.param(2, marks=pytest.mark.slow("every"))])
 def test_a_cross_section_of_them(records: list[ObjectRecord], step: int) -> None:
-    """A scan among them; of the other half tests/end_to_end/identity.py holds the bytes."""
+    """A scan among them; of the other half tests/end_to_end/test_identity.py holds the bytes."""
     assert len(records) == 148
     for record in records[step // 2 :: step]:
         meshes.check_levels(meshes.prepare(Path(record.path)))

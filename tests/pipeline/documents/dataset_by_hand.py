@@ -152,8 +152,10 @@ def edit_manifest(dataset: Dataset, **changes: Any) -> Path:
     return dataset.folder.root
 
 
-def files_of(folder: Path) -> dict[Path, bytes]:
-    return {path: path.read_bytes() for path in folder.rglob("*") if path.is_file()}
+def files_of(folder: Path) -> dict[str, bytes]:
+    """Return all files below a folder by their names in it."""
+    files = [path for path in folder.rglob("*") if path.is_file()]
+    return {path.relative_to(folder).as_posix(): path.read_bytes() for path in files}
 
 
 HARM = """<script>alert(1)</script><img src=x onerror=alert(2)>"'&"""

@@ -329,7 +329,17 @@ HOSTILE = (
 )
 
 
-def test_text_from_outside_stays_text(tmp_path: Path) -> None:
+def test_text_from_outside_stays_text_in_its_line_its_code_span_and_its_yaml(
+    tmp_path: Path,
+) -> None:
+    for escape in (text, code):
+        assert "\n" not in escape("a\nb\r\nc\u2028d")
+    assert code("a`b|c") == "`a'b\\|c`"
+    values = {
+        "a": "yes: no # [", "b": ["1", "null"], "c": [{"d": "x", "e": ["y", "'"]}, {"d": "1e3"}],
+        "f": [], "g": 3,
+    }  # fmt: skip
+    assert yaml.safe_load(front_matter(values).strip("-")) == values
     dataset = five_scenes(tmp_path)
     lock, settings = dataset.folder.objects_lock, dataset.manifest.settings
     objects = read_objects_lock(lock)
@@ -349,25 +359,8 @@ def test_text_from_outside_stays_text(tmp_path: Path) -> None:
         assert "\x1b" not in body and "\n# mine" not in body
 
 
-def test_text_stays_in_its_line_its_code_span_and_its_yaml() -> None:
-    for escape in (text, code):
-        assert "\n" not in escape("a\nb\r\nc\u2028d")
-    assert code("a`b|c") == "`a'b\\|c`"
-    values = {
-        "a": "yes: no # [", "b": ["1", "null"], "c": [{"d": "x", "e": ["y", "'"]}, {"d": "1e3"}],
-        "f": [], "g": 3,
-    }  # fmt: skip
-    assert yaml.safe_load(front_matter(values).strip("-")) == values
-
-
-@pytest.fixture
-def mlcroissant() -> Any:
-    return pytest.importorskip("mlcroissant", reason="run make setup-all")
-
-
-def test_the_validator_has_no_error_and_every_shard_and_scene_is_found(
-    mlcroissant: Any, tmp_path: Path
-) -> None:
+def test_the_validator_has_no_error_and_every_shard_and_scene_is_found(tmp_path: Path) -> None:
+    mlcroissant = pytest.importorskip("mlcroissant", reason="run make setup-all")
     dataset = five_scenes(tmp_path)
     manifest, path = dataset.manifest, dataset.folder.croissant
     path.write_bytes(encode_croissant(manifest, dataset_distributions(dataset).licences))
@@ -419,8 +412,9 @@ def test_shards_are_spread_over_each_split(
 
 @pytest.mark.usefixtures("bare_reports")
 def test_documents_of_a_sample_say_so(
-    mlcroissant: Any, eleven: Dataset, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    eleven: Dataset, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
+    mlcroissant = pytest.importorskip("mlcroissant", reason="run make setup-all")
     whole = dataset_statistics(eleven)
     assert whole.scene_digest and "what follows is" not in dict(whole.lines())
     monkeypatch.setattr("storage.dataset.statistics.MOST_SCENES", 4)

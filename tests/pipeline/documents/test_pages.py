@@ -340,7 +340,11 @@ def test_documents_that_are_written_again_have_their_sums(tmp_path: Path) -> Non
     assert names == {p.relative_to(root).as_posix() for p in published_files(root)} - {SUMS}
 
 
-def test_a_damaged_shard_keeps_the_sum_that_it_had(tmp_path: Path) -> None:
+def test_a_damaged_shard_keeps_the_sum_that_it_had_and_what_is_no_sum_is_one_sentence(
+    tmp_path: Path,
+) -> None:
+    renew_sums(tmp_path)
+    assert list(tmp_path.iterdir()) == [] == stale_sums(tmp_path)
     for name in (SHARD, "report.html", "old.html"):
         (tmp_path / name).write_text(name)
     (tmp_path / "logs").mkdir()
@@ -354,11 +358,6 @@ def test_a_damaged_shard_keeps_the_sum_that_it_had(tmp_path: Path) -> None:
     assert stale_sums(tmp_path) == ["new.html", "old.html", "report.html"]
     renew_sums(tmp_path)
     assert stale_sums(tmp_path) == [] and checked(tmp_path) == [SHARD]
-
-
-def test_what_is_no_sum_is_one_sentence(tmp_path: Path) -> None:
-    renew_sums(tmp_path)
-    assert list(tmp_path.iterdir()) == [] == stale_sums(tmp_path)
     (tmp_path / SUMS).write_text("nothing\n")
     for use in (renew_sums, stale_sums):
         with pytest.raises(TrilightError, match="nothing is no sum"):
@@ -418,22 +417,18 @@ class Listed:
         return self._keys[shard]
 
 
-def chosen_of(max_scenes: int, **counts: int) -> list[tuple[ShardEntry, str]]:
-    return choose_scenes(cast(Dataset, Listed(**counts)), max_scenes)
+def test_as_many_are_chosen_as_asked_for_small_splits_too_and_other_shards_stay_closed() -> None:
+    def chosen_of(max_scenes: int, listed: Listed) -> list[tuple[ShardEntry, str]]:
+        return choose_scenes(cast(Dataset, listed), max_scenes)
 
-
-def test_all_are_chosen_where_there_are_few_and_exactly_as_many_as_asked_for() -> None:
-    chosen = chosen_of(48, test=3, train=5)
+    chosen = chosen_of(48, Listed(test=3, train=5))
     assert [shard.split for shard, _ in chosen] == ["train"] * 5 + ["test"] * 3
     assert [int(key) for _, key in chosen] == [3, 4, 5, 6, 7, 0, 1, 2]
     for count in range(12):
-        keys = [key for _, key in chosen_of(count, train=4, validation=4, test=4)]
+        keys = [key for _, key in chosen_of(count, Listed(train=4, validation=4, test=4))]
         assert len(keys) == len(set(keys)) == count
-
-
-def test_small_splits_are_seen_and_only_shards_of_chosen_scenes_are_opened() -> None:
     listed = Listed(train=4000, validation=20, test=3)
-    chosen = choose_scenes(cast(Dataset, listed), 48)
+    chosen = chosen_of(48, listed)
     assert sorted(listed.opened) == sorted({shard.name for shard, _ in chosen})
     splits = [shard.split for shard, _ in chosen]
     assert (splits.count("validation"), splits.count("test")) == (6, 3)

@@ -59,21 +59,6 @@ def pages(report: Path) -> dict[Path, Tags]:
     return {path: read(path.read_bytes()) for path in files}
 
 
-def hostile(root: Path) -> Dataset:
-    """Return a dataset whose every text from outside is markup."""
-    shell = SceneObject(name=HARM, kind="shell")
-    scene = furnished([HARM], HARM, **RIGHTS)
-    scene = scene.with_provenance({**scene.provenance, HARM: [HARM]})
-    object.__setattr__(scene, "objects", (shell, *scene.objects[1:]))
-    failures = [
-        Failure(stage="scenes", item="000000000", reason=HARM, message=HARM),
-        Failure(stage=HARM, item=HARM, reason="$\\frac{$ \x07\n ł 高", message=HARM),
-    ]
-    objects = [locked(HARM, HARM, title=HARM, **{k: HARM for k in ("attribution", "source_url")})]
-    shards = {"train-000000.tar": [sample(0, scene)]}
-    return write_dataset(root, shards, objects=objects, failures=failures)
-
-
 @pytest.fixture(scope="module")
 def dataset(tmp_path_factory: pytest.TempPathFactory) -> Dataset:
     """Five scenes with their report."""
@@ -89,7 +74,19 @@ def five(dataset: Dataset) -> dict[str, Tags]:
 
 
 def test_text_from_outside_stays_text(tmp_path: Path) -> None:
-    shown = pages(report_of(hostile(tmp_path)))
+    """Every text from outside is markup."""
+    shell = SceneObject(name=HARM, kind="shell")
+    scene = furnished([HARM], HARM, **RIGHTS)
+    scene = scene.with_provenance({**scene.provenance, HARM: [HARM]})
+    object.__setattr__(scene, "objects", (shell, *scene.objects[1:]))
+    failures = [
+        Failure(stage="scenes", item="000000000", reason=HARM, message=HARM),
+        Failure(stage=HARM, item=HARM, reason="$\\frac{$ \x07\n ł 高", message=HARM),
+    ]
+    objects = [locked(HARM, HARM, title=HARM, attribution=HARM, source_url=HARM)]
+    shards = {"train-000000.tar": [sample(0, scene)]}
+    hostile = write_dataset(tmp_path, shards, objects=objects, failures=failures)
+    shown = pages(report_of(hostile))
     assert len(shown) == 2
     for path, tags in shown.items():
         own = ["script"] * (path.name == "report.html")
@@ -224,20 +221,15 @@ def test_writing_elsewhere_gives_the_same_bytes_and_leaves_the_dataset_alone(
     assert files_of(root) == before
 
 
-@pytest.fixture(scope="module")
-def mapped(tmp_path_factory: pytest.TempPathFactory) -> Dataset:
-    """A textured scene below a seen sky, a textured one, and a plain one, with their report."""
+def test_the_report_and_the_card_count_maps_and_scenes_show_them(
+    tmp_path: Path, dataset: Dataset, five: dict[str, Tags]
+) -> None:
+    """A textured scene below a seen sky, a textured one, and a plain one."""
     dusk = sky(radiance_rgb=np.full((4, 8, 3), 0.25, np.float32), is_seen=True)
     scenes = [textured_scene(environment=dusk), textured_scene(), tiny_scene()]
     shards = {"train-000000.tar": [sample(key, scene) for key, scene in enumerate(scenes)]}
-    dataset = write_dataset(tmp_path_factory.mktemp("maps"), shards)
-    report_of(dataset)
-    return dataset
-
-
-def test_the_report_and_the_card_count_maps_and_scenes_show_them(
-    mapped: Dataset, dataset: Dataset, five: dict[str, Tags]
-) -> None:
+    mapped = write_dataset(tmp_path, shards)
+    report_of(mapped)
     page = read(mapped.folder.report.read_bytes())
     text = text_of(page)
     assert "scenes textured 2 66.7% scenes below a sky 1 33.3%" in text

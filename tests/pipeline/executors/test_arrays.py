@@ -2,11 +2,9 @@
 
 import contextlib
 import dataclasses
-import json
 import os
 import shlex
 import subprocess
-from collections.abc import Callable
 from importlib import import_module
 from pathlib import Path
 from typing import Any
@@ -32,7 +30,7 @@ from storage.dataset.progress import missing_shards
 from storage.dataset.verify import verify_dataset
 from storage.errors import TrilightError
 from storage.number_ranges import number_ranges, numbers_of
-from tests.command_line import trilight
+from tests.command_line import expect_json, trilight
 from tests.for_each import for_each
 from tests.pipeline.generation.tiny_scenes_kit import Undocumented, tiny_order, without_rendering
 from tests.pipeline.programs import printed_by
@@ -41,6 +39,9 @@ from tests.pipeline.programs import printed_by
 def _array(task: int, first: int, last: int, count: int, **more: str) -> dict[str, str]:
     numbers = {"ID": task, "MIN": first, "MAX": last, "COUNT": count}
     return {f"SLURM_ARRAY_TASK_{name}": str(value) for name, value in numbers.items()} | more
+
+
+GIVEN = {"TASKS": "0-1,7", "SHARDS_PER_TASK": "4"}
 
 
 def test_the_tasks_of_an_array_have_equal_shares() -> None:
@@ -57,14 +58,8 @@ def test_the_tasks_of_an_array_have_equal_shares() -> None:
     alone = {"SLURM_ARRAY_TASK_ID": "2", "SHARDS_PER_TASK": "4"}
     assert shards_of_task(alone, unknown) == "8:12"
     assert not unknown.called, "nobody needs to know: the dataset need not even be begun"
-
-
-GIVEN = {"TASKS": "0-1,7", "SHARDS_PER_TASK": "4"}
-
-
-def test_a_place_is_a_task_that_is_missing() -> None:
     shares = [shards_of_place({**GIVEN, PLACE: str(place)}) for place in range(3)]
-    assert shares == ["0:4", "4:8", "28:32"]
+    assert shares == ["0:4", "4:8", "28:32"], "a place is a task that is missing"
 
 
 @for_each(
@@ -147,16 +142,15 @@ def test_ranges(numbers: tuple[int, ...], text: str) -> None:
     assert numbers_of(text) == sorted(set(numbers))
 
 
-def test_an_array_fits_the_cluster_and_covers_every_shard(cluster: Path) -> None:
+def test_an_array_fits_the_cluster_and_covers_every_shard_of_what_was_ordered(
+    cluster: Path,
+) -> None:
     order = GenerateOptions(build="pretrain-256", scenes=2_000_000)
     job = array_job(order, per_task=None, at_once=None)
     shards = -(-2_000_000 // 256)
     assert len(job.tasks) <= MAX_TASKS
     assert job.per_task * len(job.tasks) >= shards > job.per_task * (len(job.tasks) - 1)
-
-
-def test_settings_that_divide_the_dataset_count(cluster: Path) -> None:
-    changes = {"splits.scenes_per_shard": 8}
+    changes = {"splits.scenes_per_shard": 8}  # settings that divide the dataset count
     order = GenerateOptions(build="smoke", scenes=64, changes=changes, objects="my objects")
     job = array_job(order, per_task=2, at_once=3)
     assert job.tasks == [0, 1, 2, 3]
@@ -165,17 +159,6 @@ def test_settings_that_divide_the_dataset_count(cluster: Path) -> None:
     assert words[4:] == ["--set", "splits.scenes_per_shard=8"]
     given = sbatch_environment(job)
     assert given["OBJECTS"] == "my objects" and given["SCENES"] == "64"
-
-
-def test_only_what_is_missing_is_submitted(cluster: Path) -> None:
-    words = ["submit", "slurm", "smoke", "--out", "set", "--scenes", "24", "--sbatch=--partition=a"]
-    first = trilight([*words, "--json"])
-    assert first.exit_code == 0, first.exception
-    assert json.loads(first.stdout) == {"job": "4711", "array": "0-5", "shards_per_task": 1}
-    asked = (cluster / "asked").read_text().split("\n")
-    assert asked[:3] == ["--parsable", "--array=0-5", "--partition=a"]
-    assert Path(asked[3]).name == "generate.sbatch" and (cluster / "logs").is_dir()
-    assert "SHARDS_PER_TASK=1" in (cluster / "asked.env").read_text().splitlines()
 
 
 def test_tasks_that_died_are_all_that_is_submitted_again(
@@ -256,18 +239,26 @@ def test_refusals(cluster: Path, monkeypatch: pytest.MonkeyPatch) -> None:
 
 def test_the_printed_command_does_what_submitting_does(cluster: Path) -> None:
     words = ["submit", "slurm", "smoke", "--out", "my set", "--objects", "my objects"]
+    words += ["--scenes", "24", "--sbatch=--partition=a"]
     dry = trilight([*words, "--dry-run"])
     assert dry.exit_code == 0 and not (cluster / "logs").exists()
     subprocess.run(["bash", "-c", dry.stdout.splitlines()[-1]], check=True, capture_output=True)
     assert (cluster / "logs").is_dir()
     printed = (cluster / "asked").read_text()
+    asked = printed.split("\n")
+    assert asked[:3] == ["--parsable", "--array=0-5", "--partition=a"]
+    assert Path(asked[3]).name == "generate.sbatch"
     environment = (cluster / "asked.env").read_text().splitlines()
-    assert {"OUT=my set", "OBJECTS=my objects"} <= set(environment)
-    assert trilight(words).exit_code == 0
-    assert (cluster / "asked").read_text() == printed
+    assert {"OUT=my set", "OBJECTS=my objects", "SHARDS_PER_TASK=1"} <= set(environment)
+    (cluster / "logs").rmdir()
+    assert expect_json(*words) == {"job": "4711", "array": "0-5", "shards_per_task": 1}
+    assert (cluster / "asked").read_text() == printed and (cluster / "logs").is_dir()
+    environment = (cluster / "asked.env").read_text().splitlines()
+    assert "SHARDS_PER_TASK=1" in environment
 
 
 def test_what_an_executor_is_and_has_no_use_for() -> None:
+    """Its name loads neither Prefect nor the stages: names are asked for at every tab key."""
     with pytest.raises(TrilightError, match="--workers is 2; expected none with --runner dask"):
         find_executor("dask", "tcp://127.0.0.1:1", 2)
     with pytest.raises(TrilightError, match="--address is tcp://a:1; expected .* --runner dask"):
@@ -280,10 +271,6 @@ def test_what_an_executor_is_and_has_no_use_for() -> None:
         home, _, function = name.partition(":")
         make = getattr(import_module(f"pipeline.{home}"), function)
         assert make.__code__.co_varnames[: make.__code__.co_argcount] == ("options", "address")
-
-
-def test_names_of_executors_load_neither_prefect_nor_the_stages() -> None:
-    """They are asked for at every press of the tab key."""
     code = (
         "import sys, pipeline.executors.registry;"
         "print([name for name in ('prefect', 'distributed', 'pipeline.generation.pipeline') "
@@ -295,27 +282,22 @@ def test_names_of_executors_load_neither_prefect_nor_the_stages() -> None:
 IMAGE = "registry.example/trilight@sha256:1"
 MISSING = [0, 1, 5, 8]
 """Shards, two to a task: tasks 0, 2 and 4."""
-Made = Callable[..., dict[str, Any]]
 
 
-@pytest.fixture
-def made(monkeypatch: pytest.MonkeyPatch) -> Made:
-    """Make the manifest of an array of MISSING in a bucket, or of other shards."""
-
-    def make(missing: list[int] = MISSING, **options: Any) -> dict[str, Any]:
-        monkeypatch.setattr(arrays, "_is_begun", lambda place: True)
-        monkeypatch.setattr(arrays, "missing_shards", lambda place, scenes: missing)
-        order = GenerateOptions(
-            build="smoke", scenes=64, out="s3://sets/mine", objects="builtin:", seed=7
-        )
-        job = arrays.array_job(order, per_task=2, at_once=None, on="kubernetes")
-        return job_manifest(job, KubernetesOptions(**{"image": IMAGE, **options}))
-
-    return make
+def _manifest(missing: list[int] = MISSING, **options: Any) -> dict[str, Any]:
+    """Return the manifest of an array of what a dataset in a bucket lacks."""
+    order = GenerateOptions(
+        build="smoke", scenes=64, out="s3://sets/mine", objects="builtin:", seed=7
+    )
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(arrays, "_is_begun", lambda place: True)
+        patch.setattr(arrays, "missing_shards", lambda place, scenes: missing)
+        job = array_job(order, per_task=2, at_once=None, on="kubernetes")
+    return job_manifest(job, KubernetesOptions(**{"image": IMAGE, **options}))
 
 
-def test_every_place_makes_what_is_missing_and_nothing_else(made: Made) -> None:
-    manifest = made()
+def test_every_place_makes_what_is_missing_and_nothing_else() -> None:
+    manifest = _manifest()
     spec = manifest["spec"]
     (container,) = spec["template"]["spec"]["containers"]
     environment = {row["name"]: row["value"] for row in container["env"]}
@@ -327,13 +309,13 @@ def test_every_place_makes_what_is_missing_and_nothing_else(made: Made) -> None:
         *("--seed", "7", "--out", "s3://sets/mine", "--runner", "kubernetes"),
     ]
     assert environment["TRILIGHT_CORES"] == "8" and environment["HOME"] == "/tmp"
-    assert made() == manifest
-    assert made([0])["metadata"]["name"] != manifest["metadata"]["name"]
+    assert _manifest() == manifest
+    assert _manifest([0])["metadata"]["name"] != manifest["metadata"]["name"]
 
 
-def test_kubernetes_takes_the_job(made: Made) -> None:
+def test_kubernetes_takes_the_job() -> None:
     schemas = pytest.importorskip("kubernetes_validate", reason="make setup-all")
-    manifest = made(account="trilight-flow", machine_type="c7i.2xlarge", tries=4)
+    manifest = _manifest(account="trilight-flow", machine_type="c7i.2xlarge", tries=4)
     schemas.validate(manifest, "1.37", strict=True)
     spec = manifest["spec"]
     # what Kubernetes demands beside its schema of indices that are tried again one by one
@@ -348,12 +330,12 @@ def test_kubernetes_takes_the_job(made: Made) -> None:
     assert manifest["metadata"]["namespace"] == "trilight"
 
 
-def test_the_pod_has_the_rights_of_the_other_manifests(made: Made) -> None:
+def test_the_pod_has_the_rights_of_the_other_manifests() -> None:
     from tests.infra.setup.manifests_kit import job_template
 
     manifest = job_template()["job_configuration"]["job_manifest"]
     theirs = manifest["spec"]["template"]["spec"]
-    pod = made()["spec"]["template"]["spec"]
+    pod = _manifest()["spec"]["template"]["spec"]
     (ours,), (other,) = pod["containers"], theirs["containers"]
     assert pod["securityContext"] == theirs["securityContext"]
     for name in ("securityContext", "resources", "envFrom", "imagePullPolicy"):
@@ -363,10 +345,10 @@ def test_the_pod_has_the_rights_of_the_other_manifests(made: Made) -> None:
     assert not pod["automountServiceAccountToken"]
 
 
-def test_an_image_is_needed(made: Made, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_an_image_is_needed(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.delenv("TRILIGHT_IMAGE", raising=False)
     with pytest.raises(TrilightError, match="submit kubernetes: --image is not given"):
-        made(image=None)
+        _manifest(image=None)
 
 
 @for_each(

@@ -241,15 +241,12 @@ def test_rendering_on_a_gpu_takes_its_limit(
 
 
 def test_a_dask_worker_that_sees_another_folder_is_named_before_any_work(tmp_path: Path) -> None:
-    class Client:
-        """Two workers, of which the second is on another machine."""
-
-        def run(self, function: Any, *arguments: Any) -> dict[str, bool]:
-            return {"tcp://a:1": function(*arguments), "tcp://b:1": False}
-
+    """There are two workers, of which the second is on another machine."""
     order = GenerateOptions(out=str(tmp_path / "set"))
+    client: Any = Mock()
+    client.run = lambda look, *more: {"tcp://a:1": look(*more), "tcp://b:1": False}
     with pytest.raises(TrilightError, match="1 of 2 Dask workers do not see.*such as tcp://b:1"):
-        flow_executors._require_shared(cast(Any, Client()), order)
+        flow_executors._require_shared(client, order)
     assert list((tmp_path / "set" / ".staging").iterdir()) == []
 
 
@@ -425,6 +422,9 @@ def run(**given: Any) -> None:
 def test_what_is_missing_is_asked_for_and_shown_to_the_end(
     tables: Shown, cluster: list[list[int]], tmp_path: Path
 ) -> None:
+    with pytest.raises(TrilightError, match=r"no new scene for 0\.0001 hours \(none made\)"):
+        run(out=str(tmp_path / "watched"), scheduler="none", quiet_hours=0.0001)
+    assert cluster == [] and tables == [], "who watches alone asks for nothing"
     out = str(tmp_path / "set")
     run(out=out, scenes=20, shards_per_task=2)
     assert cluster == [[0, 1, 2]]
@@ -437,14 +437,6 @@ def test_what_is_missing_is_asked_for_and_shown_to_the_end(
     run(out=out, scenes=20, shards_per_task=2)
     assert cluster[1:] == [[1]], "the task of the shard that is gone"
     assert (tmp_path / "set" / "train-000003.tar").exists()
-
-
-def test_who_watches_alone_asks_for_nothing_and_waits_so_long(
-    tables: Shown, cluster: list[list[int]], tmp_path: Path
-) -> None:
-    with pytest.raises(TrilightError, match=r"no new scene for 0\.0001 hours \(none made\)"):
-        run(out=str(tmp_path / "set"), scheduler="none", quiet_hours=0.0001)
-    assert cluster == [] and tables == []
 
 
 @pytest.mark.usefixtures("tables", "cluster")

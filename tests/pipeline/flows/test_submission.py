@@ -79,21 +79,13 @@ def test_the_deployment_of_make_serve_comes_first_then_the_only_one_or_one_that_
     for deployments, wanted in ((["cluster"], None), (["a", "b"], "b")):
         run = submit(Server(deployments), "generate-scenes", wanted, {})  # type: ignore[arg-type]
         assert run.deployment == f"generate-scenes/{deployments[-1]}"
-
-
-@for_each(
-    ("deployments", "wanted", "complaint"),
-    [
+    for deployments, wanted, complaint in (
         ([], None, "no deployment of the flow generate-scenes. Run make serve"),
         (["a", "b"], None, "--deployment is None; expected one of a, b"),
         (["local"], "other", "--deployment is 'other'; expected one of local"),
-    ],
-)
-def test_a_deployment_that_cannot_be_found(
-    deployments: list[str], wanted: str | None, complaint: str
-) -> None:
-    with pytest.raises(TrilightError, match=complaint):
-        submit(Server(deployments), "generate-scenes", wanted, {})  # type: ignore[arg-type]
+    ):
+        with case(complaint), pytest.raises(TrilightError, match=complaint):
+            submit(Server(deployments), "generate-scenes", wanted, {})  # type: ignore[arg-type]
 
 
 def test_parameters_are_what_the_flow_takes() -> None:
@@ -192,14 +184,6 @@ def _answer(kind: str = "http", **headers: str) -> list[MutableMapping[str, Any]
     return sent
 
 
-def _require_refusal(said: bytes, **headers: str) -> None:
-    start, body = _answer(**headers)
-    assert start["status"] == 403 and said in body["body"]
-    assert (b"content-security-policy", b"frame-ancestors 'none'") in start["headers"]
-    (closed,) = _answer("websocket", **headers)
-    assert closed["type"] == "websocket.close"
-
-
 @for_each(
     "host",
     ["127.0.0.1:4200", "localhost:4200", "localhost", "10.1.2.3:4200", "[::1]:4200", "server:4200",
@@ -214,26 +198,31 @@ def test_own_names_and_addresses_are_answered(host: str) -> None:
         assert _answer("websocket", host=host, **origin) == [{"type": "websocket.accept"}]
 
 
-@for_each(
-    "host",
-    ["evil.example", f"evil.example:{PORT}", "localhost.evil.example", "127.0.0.1.evil.example",
-     "me@evil.example", "127.0.0.1@evil.example", "2130706433", "0x7f.1", "server.", "", "[",
-     "a b"],
+STRANGERS = (
+    "evil.example", f"evil.example:{PORT}", "localhost.evil.example", "127.0.0.1.evil.example",
+    "me@evil.example", "127.0.0.1@evil.example", "2130706433", "0x7f.1", "server.", "", "[", "a b",
 )  # fmt: skip
-def test_other_names_and_none_are_refused(host: str) -> None:
+OTHER_ORIGINS = (
+    "http://evil.example", "null", "", f"http://127.0.0.1:{PORT + 1}", "http://127.0.0.1",
+    f"http://localhost:{PORT}", f"http://127.0.0.1:{PORT}.evil.example", "file://",
+)  # fmt: skip
+
+
+def test_other_names_none_and_pages_of_other_origins_are_refused() -> None:
     """A page may let its own name point to 127.0.0.1: its origin is then this very host."""
     assert _answer()[0]["status"] == 403
-    _require_refusal(b"no name of this server", host=host)
-    _require_refusal(b"no name of this server", host=host, origin=f"http://{host}")
-
-
-@for_each(
-    "origin",
-    ["http://evil.example", "null", "", f"http://127.0.0.1:{PORT + 1}", "http://127.0.0.1",
-     f"http://localhost:{PORT}", f"http://127.0.0.1:{PORT}.evil.example", "file://"],
-)  # fmt: skip
-def test_pages_of_other_origins_are_refused(origin: str) -> None:
-    _require_refusal(b"other origins", host=f"127.0.0.1:{PORT}", origin=origin)
+    names = [
+        {"host": host, **more} for host in STRANGERS for more in ({}, {"origin": f"http://{host}"})
+    ]
+    pages = [{"host": f"127.0.0.1:{PORT}", "origin": origin} for origin in OTHER_ORIGINS]
+    rows = [(b"no name of this server", each) for each in names]
+    for said, headers in [*rows, *((b"other origins", each) for each in pages)]:
+        with case(headers):
+            start, body = _answer(**headers)
+            assert start["status"] == 403 and said in body["body"]
+            assert (b"content-security-policy", b"frame-ancestors 'none'") in start["headers"]
+            (closed,) = _answer("websocket", **headers)
+            assert closed["type"] == "websocket.close"
 
 
 def test_half_requests_are_closed_and_slow_answers_are_not(monkeypatch: pytest.MonkeyPatch) -> None:

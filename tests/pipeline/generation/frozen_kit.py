@@ -12,22 +12,19 @@ import pytest
 
 from pipeline.assets.stage import PreparedObject
 from pipeline.generation import object_batches
-from pipeline.generation.dataset_writer import DatasetWriter, begin_or_resume_dataset
+from pipeline.generation.dataset_writer import DatasetWriter
 from pipeline.generation.freeze_objects import AcceptedMaps, ObjectLock
 from pipeline.generation.prepare_isolated import asset_store
 from pipeline.generation.scene_origins import AcceptedObjects
-from pipeline.presets.registry import preset_settings
-from pipeline.shards.pack_shards import PublishedShards
-from storage.dataset.layout import DatasetFolder
 from storage.digests import sha256_hex
 from storage.records.asset import encode_asset
 from storage.records.objects import Failure, ObjectRecord
-from tests.pipeline.generation.test_dataset_writer import ENVIRONMENT
+from tests.pipeline.generation.test_dataset_writer import _build
 from tests.pipeline.scenes.small_pool import small_pool
 
 LICENCES = ("CC0-1.0", "CC-BY-SA-4.0", "CC-BY-4.0", "CC-BY-SA-3.0")
 SOURCE = "objects-by-hand"
-BUILD = preset_settings("smoke", resolution=16)
+BUILD = _build()
 _pool = functools.cache(small_pool)
 
 
@@ -53,11 +50,6 @@ def prepared(number: int) -> PreparedObject:
         geometry_sha256=name,
         least_triangles=min(len(level.faces) for level in asset.levels),
     )
-
-
-def begun(root: Path) -> DatasetWriter:
-    """Begin a dataset of four scenes."""
-    return begin_or_resume_dataset(PublishedShards(DatasetFolder(root)), BUILD, ENVIRONMENT, 4)
 
 
 def asked(writer: DatasetWriter, source: str = SOURCE, licence: str | None = None) -> ObjectLock:

@@ -35,18 +35,23 @@ ENVIRONMENT = {"mitsuba_variant": "llvm_ad_rgb", "libraries": {"mitsuba": "3.9.1
 LOCKED = locked("a")
 
 
-def _build() -> DatasetSettings:
-    build = preset_settings("smoke", resolution=16)
+def _build(seed: int | None = None) -> DatasetSettings:
+    build = preset_settings("smoke", resolution=16, seed=seed)
     return dataclasses.replace(build, scenes=dataclasses.replace(build.scenes, num_views=2))
 
 
 def begin_tiny(
-    root: Path, scenes: int = 4, accept_environment: bool = False, **environment: str
+    root: Path,
+    scenes: int = 4,
+    accept_environment: bool = False,
+    seed: int | None = None,
+    **environment: str,
 ) -> DatasetWriter:
     """Begin a dataset of tiny scenes, four to a shard, two views each."""
     shards, made_in = PublishedShards(DatasetFolder(root)), {**ENVIRONMENT, **environment}
     accepted = accept_environment
-    return begin_or_resume_dataset(shards, _build(), made_in, scenes, accept_environment=accepted)
+    build = _build(seed)
+    return begin_or_resume_dataset(shards, build, made_in, scenes, accept_environment=accepted)
 
 
 def _sample(index: int) -> Sample:
@@ -255,12 +260,6 @@ def test_a_shard_in_the_folder_of_a_worker_alone_is_no_shard(
     assert open_dataset(str(tmp_path / "here")).manifest.shards == (elsewhere,)
 
 
-@pytest.fixture()
-def two_each(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Two files in a folder stand for 4,096: the rule is the same."""
-    monkeypatch.setattr(layout, "FILES_PER_FOLDER", 2)
-
-
 def _most_entries(root: Path) -> int:
     folders = [root, *(path for path in root.rglob("*") if path.is_dir())]
     return max(sum(1 for _ in folder.glob("[a-z0-9]*[0-9].*")) for folder in folders)
@@ -274,9 +273,12 @@ def test_the_first_shards_stay_where_the_design_has_them() -> None:
     assert shard_name(999_999, splits) == "part-0244/train-999999.tar"
 
 
-@pytest.mark.usefixtures("two_each")
-def test_a_dataset_in_parts_is_whole(tmp_path: Path) -> None:
-    """Shards, rejections and logs move together; reading and verifying find them."""
+def test_a_dataset_in_parts_is_whole(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Shards, rejections and logs move together; reading and verifying find them.
+
+    Two files in a folder stand for 4,096: the rule is the same.
+    """
+    monkeypatch.setattr(layout, "FILES_PER_FOLDER", 2)
     writer = _dataset(tmp_path, scenes=20)
     shards = writer.manifest.shards
     names = [shard.name for shard in shards]
@@ -303,8 +305,10 @@ def test_a_dataset_in_parts_is_whole(tmp_path: Path) -> None:
     assert verify_dataset(tmp_path).problems == ["part-0001/train-000009.tar: not in the manifest"]
 
 
-@pytest.mark.usefixtures("two_each")
-def test_staged_scenes_and_built_in_objects_stand_in_parts(tmp_path: Path) -> None:
+def test_staged_scenes_and_built_in_objects_stand_in_parts(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(layout, "FILES_PER_FOLDER", 2)
     for index in range(5):
         stage_scene(tmp_path / "shard", index, _sample(index), [], "lossless")
     assert all(is_staged(tmp_path / "shard", index) for index in range(5))

@@ -15,7 +15,6 @@ from typing import Any
 
 import pytest
 
-from pipeline.generation.dataset_writer import begin_or_resume_dataset
 from pipeline.generation.derive_dataset import (
     DeriveOptions,
     Selection,
@@ -23,7 +22,7 @@ from pipeline.generation.derive_dataset import (
     derive_shards,
 )
 from pipeline.shards.finished_dataset import open_finished
-from pipeline.shards.pack_shards import PublishedShards, pack_shard
+from pipeline.shards.pack_shards import pack_shard
 from storage.dataset import layout
 from storage.dataset.dataset import Dataset, open_dataset
 from storage.dataset.layout import DatasetFolder
@@ -44,8 +43,14 @@ from storage.records.sample import Sample, encode_sample, sample_key
 from storage.records.scene import Scene
 from tests.columns_kit import COAT, declared
 from tests.for_each import for_each
-from tests.pipeline.documents.dataset_by_hand import furnished, locked, sample, write_dataset
-from tests.pipeline.generation.test_dataset_writer import ENVIRONMENT, _build
+from tests.pipeline.documents.dataset_by_hand import (
+    files_of,
+    furnished,
+    locked,
+    sample,
+    write_dataset,
+)
+from tests.pipeline.generation.test_dataset_writer import begin_tiny
 from tests.scenes_by_hand import stage_scene
 from tests.textured_by_hand import (
     colour_texture,
@@ -126,11 +131,6 @@ def shards_made(out: Path, derive: DeriveOptions, *places: Path) -> Dataset:
     return open_dataset(str(out))
 
 
-def bytes_of(root: Path) -> dict[str, bytes]:
-    files = [path for path in root.rglob("*") if path.is_file()]
-    return {path.relative_to(root).as_posix(): path.read_bytes() for path in files}
-
-
 def samples_of(dataset: Dataset) -> dict[str, tuple[str, dict[str, bytes]]]:
     """Return split and members of every sample, by key."""
     return {
@@ -175,7 +175,10 @@ def test_a_merge_holds_every_scene_under_its_raised_key_and_says_where_it_is_fro
     assert all(str(source["digest"]) in body for source in derivation.sources)
 
 
-def test_a_merge_of_a_merge_nests(tmp_path: Path) -> None:
+def test_a_merge_of_a_merge_nests_and_one_of_a_selection_gives_no_key_twice(
+    tmp_path: Path,
+) -> None:
+    """A selection keeps its keys, which then go beyond its number of scenes."""
     roots = [finished(tmp_path / str(salt), scenes(salt), seed=salt) for salt in range(3)]
     shards_made(tmp_path / "ab", MERGE, *roots[:2])
     merged = shards_made(tmp_path / "abc", MERGE, tmp_path / "ab", roots[2])
@@ -184,6 +187,10 @@ def test_a_merge_of_a_merge_nests(tmp_path: Path) -> None:
     assert derivation is not None
     assert "derived" in derivation.sources[0]["settings"]
     assert derivation.sources[1]["key_offset"] == 12
+    shards_made(tmp_path / "c", select(split="test"), roots[0])
+    merged = shards_made(tmp_path / "d", MERGE, tmp_path / "c", roots[1])
+    test_part = {"test-000002.tar": scenes(0)["test-000002.tar"]}
+    assert samples_of(merged) == given(test_part) | given(scenes(1), 6)
 
 
 def test_equal_inputs_give_equal_bytes_wherever_they_lie(tmp_path: Path) -> None:
@@ -195,14 +202,14 @@ def test_equal_inputs_give_equal_bytes_wherever_they_lie(tmp_path: Path) -> None
         made(tmp_path / place / "merge", MERGE, a, b)
         for derive in (select(split="train"), reshard(3)):
             shards_made(tmp_path / place / derive.operation, derive, a)
-        results.append(bytes_of(tmp_path / place))
+        results.append(files_of(tmp_path / place))
         assert not [path.name for path in (tmp_path / place).iterdir() if path.name[0] == "."]
     assert results[0] == results[1]
     documents = ("README.md", "LICENSE.md", "croissant.json", "attribution.csv")
     assert {f"merge/{name}" for name in documents} <= set(results[0])
 
 
-def test_a_selection_keeps_keys_and_bytes(tmp_path: Path) -> None:
+def test_a_selection_keeps_keys_bytes_and_only_the_rights_of_what_it_holds(tmp_path: Path) -> None:
     a = finished(tmp_path / "a", scenes(0))
     whole = given(scenes(0))
     rows = [
@@ -215,23 +222,10 @@ def test_a_selection_keeps_keys_and_bytes(tmp_path: Path) -> None:
     for number, (derive, keys) in enumerate(rows):
         chosen = samples_of(shards_made(tmp_path / str(number), derive, a))
         assert chosen == {sample_key(key): whole[sample_key(key)] for key in keys}, derive
-
-
-def test_a_merge_after_a_selection_gives_no_key_twice(tmp_path: Path) -> None:
-    """A selection keeps its keys, which then go beyond its number of scenes."""
-    a, b = finished(tmp_path / "a", scenes(0)), finished(tmp_path / "b", scenes(1), seed=1)
-    chosen = shards_made(tmp_path / "c", select(split="test"), a)
-    merged = shards_made(tmp_path / "d", MERGE, chosen.folder.root, b)
-    test_part = {"test-000002.tar": scenes(0)["test-000002.tar"]}
-    assert samples_of(merged) == given(test_part) | given(scenes(1), 6)
-
-
-def test_a_selection_keeps_only_the_rights_of_what_it_holds(tmp_path: Path) -> None:
-    a = finished(tmp_path / "a", scenes(0))
-    chosen = made(tmp_path / "c", select(split="train"), a)
-    assert [entry.uid for entry in read_objects_lock(chosen.folder.objects_lock)] == ["a"]
-    assert 'license: "cc0-1.0"' in chosen.folder.card.read_text()
-    assert "CC-BY-4.0" not in chosen.folder.attribution.read_text()
+    train = made(tmp_path / "train", select(split="train"), a)
+    assert [entry.uid for entry in read_objects_lock(train.folder.objects_lock)] == ["a"]
+    assert 'license: "cc0-1.0"' in train.folder.card.read_text()
+    assert "CC-BY-4.0" not in train.folder.attribution.read_text()
 
 
 def test_resharding_divides_each_split_evenly(tmp_path: Path) -> None:
@@ -316,17 +310,14 @@ def maps_in(dataset: Dataset) -> list[list[str]]:
     return names
 
 
-def test_a_selection_takes_the_maps_that_it_needs_and_no_other(tmp_path: Path) -> None:
+def test_each_new_shard_has_once_the_maps_that_it_needs_and_no_other(tmp_path: Path) -> None:
+    """By a selection, and by resharding."""
     a = finished(tmp_path / "a", textured_scenes())
-    made = shards_made(tmp_path / "b", select(where=f'key == "{sample_key(3)}"'), a)
+    chosen = shards_made(tmp_path / "chosen", select(where=f'key == "{sample_key(3)}"'), a)
     held = [colour_texture(1).sha256, number_texture().sha256, sky().sha256]
-    assert sorted(maps_in(made)[0]) == sorted(f"__map-{sha256}__" for sha256 in held)
-    left = shards_made(tmp_path / "c", select(where='template == "plane"'), a)
+    assert sorted(maps_in(chosen)[0]) == sorted(f"__map-{sha256}__" for sha256 in held)
+    left = shards_made(tmp_path / "left", select(where='template == "plane"'), a)
     assert left.manifest.num_samples == 1 and maps_in(left) == [[]]
-
-
-def test_resharding_stores_each_map_once_in_each_new_shard(tmp_path: Path) -> None:
-    a = finished(tmp_path / "a", textured_scenes())
     whole = shards_made(tmp_path / "b", reshard(4), a)
     (shard,) = whole.manifest.shards
     assert [len(names) for names in maps_in(whole)] == [4]
@@ -416,8 +407,11 @@ def test_a_key_that_is_no_number_is_refused_before_a_shard_is_written(tmp_path: 
     assert not out.root.exists()
 
 
-def test_damage_and_what_is_not_finished_are_refused(tmp_path: Path) -> None:
+def test_damage_what_is_not_finished_and_what_holds_nothing_are_refused(tmp_path: Path) -> None:
     a, out, derive = finished(tmp_path / "a", scenes(0)), tmp_path / "c", reshard(3)
+    assert "none of the 6 scenes" in refused(out, select(template="no"), a)
+    with pytest.raises(TrilightError, match="split is 'tset'; expected"):
+        Selection(split="tset")  # type: ignore[arg-type]
     manifest = open_dataset(str(a)).manifest
     write_manifest(a / "manifest.json", dataclasses.replace(manifest, num_scenes=7))
     assert "3 of 4 shards" in refused(out, derive, a)
@@ -445,13 +439,6 @@ def test_a_column_that_is_not_declared_here_is_no_damage(tmp_path: Path) -> None
     assert "'coat' is not declared here" in said and "damaged" not in said
 
 
-def test_arguments_that_make_nothing_are_refused(tmp_path: Path) -> None:
-    said = refused(tmp_path / "c", select(template="no"), finished(tmp_path / "a", scenes(0)))
-    assert "none of the 6 scenes" in said
-    with pytest.raises(TrilightError, match="split is 'tset'; expected"):
-        Selection(split="tset")  # type: ignore[arg-type]
-
-
 def test_nothing_is_overwritten_and_nothing_grows(tmp_path: Path) -> None:
     a, out, derive = finished(tmp_path / "a", scenes(0)), tmp_path / "c", reshard(3)
     out.mkdir()
@@ -459,7 +446,7 @@ def test_nothing_is_overwritten_and_nothing_grows(tmp_path: Path) -> None:
     with pytest.raises(TrilightError, match="is there already"):
         derive_dataset([str(a)], derive, out)
     with pytest.raises(TrilightError, match=r"made by `trilight shards reshard`.*cannot grow"):
-        begin_or_resume_dataset(PublishedShards(DatasetFolder(out)), _build(), ENVIRONMENT, 4)
+        begin_tiny(out)
 
 
 KILLED = """

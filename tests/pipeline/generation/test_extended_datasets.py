@@ -12,7 +12,7 @@ from prefect.exceptions import ParameterTypeError
 from infra.repair import repair
 from pipeline.exchange.reader import LIMITS
 from pipeline.executors.threads import ThreadRunner
-from pipeline.generation.dataset_writer import DatasetWriter, begin_or_resume_dataset
+from pipeline.flows.prefect_flows import generate_scenes
 from pipeline.generation.derive_dataset import _extensions
 from pipeline.generation.freeze_objects import ObjectLock
 from pipeline.generation.generate_options import GenerateOptions
@@ -33,7 +33,7 @@ from tests.command_line import trilight
 from tests.extensions_kit import EXAMPLES, loaded, parts_of, room_for_extensions, written
 from tests.for_each import case, for_each
 from tests.pipeline.documents.dataset_by_hand import edit_manifest
-from tests.pipeline.generation.test_dataset_writer import ENVIRONMENT, begin_tiny, make_tiny_shard
+from tests.pipeline.generation.test_dataset_writer import begin_tiny, make_tiny_shard
 from tests.pipeline.generation.tiny_scenes_kit import (
     Undocumented,
     shard_job,
@@ -46,38 +46,26 @@ TRAP = "from pathlib import Path\nPath(__file__).with_suffix('.ran').touch()\n"
 """Leaves a mark when it is imported."""
 
 
-def _begin(root: Path, scenes: int = 4, seed: int | None = None) -> DatasetWriter:
-    build = preset_settings("smoke", seed=seed)
-    shards = PublishedShards(DatasetFolder(root))
-    return begin_or_resume_dataset(shards, build, ENVIRONMENT, scenes)
-
-
-def test_the_manifest_records_what_had_part_in_a_dataset(tmp_path: Path) -> None:
+def test_the_manifest_records_what_had_part_in_a_dataset_and_nothing_else(tmp_path: Path) -> None:
     with loaded(TEMPLATE) as extension:
-        _begin(tmp_path)
+        begin_tiny(tmp_path)
     manifest = read_manifest(tmp_path / "manifest.json")
     assert manifest.extensions == {"template.py": extension.sha256}
     assert str(EXAMPLES) not in (tmp_path / "manifest.json").read_text()
     with pytest.raises(TrilightError, match=r"begun with the extension template\.py, which is not"):
-        _begin(tmp_path)
+        begin_tiny(tmp_path)
     other = written(tmp_path, TEMPLATE.read_text() + "\n# changed\n", "template.py")
     changed = r"another extension template\.py: its sha256 was"
     with loaded(other), pytest.raises(TrilightError, match=changed):
-        _begin(tmp_path)
+        begin_tiny(tmp_path)
     with loaded(TEMPLATE):
-        _begin(tmp_path)
-
-
-def test_a_manifest_without_extensions_is_what_it_was(tmp_path: Path) -> None:
+        begin_tiny(tmp_path)
     with loaded(EXAMPLES / "executor.py"):  # changes how a dataset is made, and nothing of it
-        _begin(tmp_path)
-    assert "extensions" not in json.loads((tmp_path / "manifest.json").read_text())
+        begin_tiny(tmp_path / "plain")
+    assert "extensions" not in json.loads((tmp_path / "plain" / "manifest.json").read_text())
     added = r"begun without the extension template\.py; leave"
     with loaded(TEMPLATE), pytest.raises(TrilightError, match=added):
-        _begin(tmp_path)
-
-
-def test_a_worker_without_the_extension_is_refused(tmp_path: Path) -> None:
+        begin_tiny(tmp_path / "plain")
     job = shard_job(tmp_path, extensions={"template.py": "1" * 64})
     with pytest.raises(TrilightError, match=r"this worker: .* add --extend template\.py"):
         make_task(job, ())
@@ -139,7 +127,7 @@ def test_a_template_is_checked_when_it_is_made(tmp_path: Path) -> None:
 
 
 @for_each("extended", [{}, {"trap.py": "0" * 64}])
-def test_a_dataset_never_causes_an_import(
+def test_neither_a_dataset_nor_a_form_ever_causes_an_import(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, extended: dict[str, str]
 ) -> None:
     """Its preset may say FILE.py:FUNCTION, and its extensions may lie beside it."""
@@ -158,15 +146,8 @@ def test_a_dataset_never_causes_an_import(
     for words in (["generate", "trap.py:f"], ["generate", "smoke", "--extend", "trap.py"]):
         write_asked(DatasetFolder(folder), words)
         assert read_asked(open_dataset(str(folder))) is None
-    assert not list(tmp_path.rglob("*.ran"))
-
-
-def test_a_form_cannot_name_a_file(tmp_path: Path) -> None:
-    from pipeline.flows.prefect_flows import generate_scenes
-
-    trap = written(tmp_path, TRAP)
     with pytest.raises(ParameterTypeError, match="build"):
-        generate_scenes.validate_parameters({"build": f"{trap}:f"})
+        generate_scenes.validate_parameters({"build": f"{tmp_path / 'trap.py'}:f"})
     assert not list(tmp_path.rglob("*.ran"))
 
 
@@ -205,7 +186,7 @@ def test_an_extension_that_is_left_out_is_asked_for(tmp_path: Path) -> None:
     """Of a dataset that has objects, by its file; else as something that may be missing."""
     words = ["generate", "smoke", "--set", "scenes.families=corridor", "--out", str(tmp_path)]
     with loaded(TEMPLATE):
-        _begin(tmp_path)
+        begin_tiny(tmp_path)
     said = trilight(words).mistake
     assert "setting 'scenes.families' is 'corridor'" in said
     assert "alone, an extension's by --extend FILE, or one of its settings by name" in said
@@ -279,7 +260,7 @@ def test_what_was_only_begun_is_begun_anew_and_what_has_objects_or_scenes_is_not
     without_rendering(monkeypatch)
     folder = DatasetFolder(tmp_path / "set")
     with folder.hold_shared_lock():
-        _begin(folder.root, 24, seed=5)
+        begin_tiny(folder.root, 24, seed=5)
     order = tiny_order(out=str(folder.root), scenes=4, seed=7)
     run = prepare_dataset(order)  # its objects are frozen, no more
     assert run.publication.manifest.settings["seed"] == 7
@@ -315,7 +296,7 @@ def test_the_command_is_there_while_objects_are_prepared(
 def test_nobody_forgets_while_another_is_at_work(tmp_path: Path) -> None:
     folder = DatasetFolder(tmp_path / "set")
     with PublishedShards(folder).hold_lock():
-        _begin(folder.root, seed=5)
+        begin_tiny(folder.root, seed=5)
         with PublishedShards(folder).hold_lock():
             assert read_manifest(folder.manifest).settings["seed"] == 5
 
@@ -324,9 +305,9 @@ def test_who_was_replaced_all_the_same_stops(tmp_path: Path) -> None:
     """Locks do not reach every machine: a maker whose manifest has become another's says so."""
     folder = DatasetFolder(tmp_path / "set")
     with folder.hold_shared_lock():
-        mine = _begin(folder.root, seed=5)
+        mine = begin_tiny(folder.root, seed=5)
         folder.manifest.unlink()
-        _begin(folder.root, seed=7)
+        begin_tiny(folder.root, seed=7)
         with pytest.raises(TrilightError, match="another dataset has been begun here"):
             mine.lock_objects([])
 

@@ -23,7 +23,6 @@ from pipeline.generation.scene_origins import AcceptedObjects, ComposedScenes, r
 from pipeline.generation.scene_worker import AssetMissing, SceneAttempt, SplitPool, user_maps
 from pipeline.objects.maps.prepared import prepare_map
 from pipeline.presets.registry import preset_settings
-from pipeline.presets.settings import DatasetSettings
 from pipeline.scenes.triangle_budget import PooledAsset, draw_rows
 from scene_templates.scene_maps import UserMap, draw_user_map
 from storage.conventions import SPLITS
@@ -43,7 +42,8 @@ from storage.seeds import SceneKey, rng_for
 from storage.typed_json import read_json_lines
 from tests.infra.child_here import ChildHere
 from tests.pipeline.documents.dataset_by_hand import locked, write_dataset
-from tests.pipeline.generation.frozen_kit import BUILD, SOURCE, asked, begun, frozen, prepared
+from tests.pipeline.generation.frozen_kit import BUILD, SOURCE, asked, frozen, prepared
+from tests.pipeline.generation.test_dataset_writer import begin_tiny
 from tests.pipeline.objects.maps.test_maps import exr, noise, png, sun_map
 from tests.pipeline.scenes.small_pool import ListPool, composed, first_scene, small_pool
 from tests.scenes_by_hand import tiny_sample
@@ -58,7 +58,7 @@ def made(
     folder = tmp_path_factory.mktemp("frozen")
     with pytest.MonkeyPatch.context() as patch:
         patch.setenv("TRILIGHT_CACHE", str(folder / "cache"))
-        writer = begun(folder / "set")
+        writer = begin_tiny(folder / "set")
         yield writer, frozen(writer, [prepared(n) for n in range(NUM_OBJECTS)])
 
 
@@ -71,22 +71,20 @@ def _rows(writer: DatasetWriter) -> list[LockedObject]:
     return [row for row in read_objects_lock(writer.folder.objects_lock) if row.split == "train"]
 
 
-def _whole(writer: DatasetWriter, accepted: AcceptedObjects) -> list[PooledAsset]:
-    """The pool as it would be with every object of the split in memory."""
+def test_scenes_of_opened_objects_are_those_of_objects_in_memory(
+    made: tuple[DatasetWriter, AcceptedObjects],
+) -> None:
+    """Those in memory are every object of the split."""
+    writer, accepted = made
     stored = {
         each.asset_sha256: asset_store().asset_path(each.asset_name)
         for each in map(prepared, range(NUM_OBJECTS))
     }
-    return [
+    whole = [
         PooledAsset(locked=row, asset=decode_asset(stored[row.asset_sha256].read_bytes()))
         for row in _rows(writer)
     ]
-
-
-def test_scenes_of_opened_objects_are_those_of_objects_in_memory(
-    made: tuple[DatasetWriter, AcceptedObjects],
-) -> None:
-    whole, opened = _whole(*made), _opened(made[1])
+    opened = _opened(accepted)
     assert [entry.locked for entry in opened] == [entry.locked for entry in whole]
     for room in (30, 60, 200, 5000):  # some objects do not fit, or all do
         draws = [
@@ -230,13 +228,11 @@ SHARES = {
 }
 
 
-@pytest.fixture(scope="module")
-def settings() -> DatasetSettings:
-    return preset_settings("smoke", changes=SHARES)
+SETTINGS = preset_settings("smoke", changes=SHARES)
 
 
 @pytest.fixture(scope="module")
-def accepted(settings: DatasetSettings, tmp_path_factory: pytest.TempPathFactory) -> AcceptedMaps:
+def accepted(tmp_path_factory: pytest.TempPathFactory) -> AcceptedMaps:
     """Twelve of each, one in a second copy, and a map that is no map."""
     root = tmp_path_factory.mktemp("own")
     for number in range(12, 24):
@@ -251,7 +247,7 @@ def accepted(settings: DatasetSettings, tmp_path_factory: pytest.TempPathFactory
         patch.setattr(freeze_objects, "IsolatedChild", ChildHere)
         folders = {TEXTURE: str(root / "textures"), SKY: str(root / "skies")}
         stated: dict[str, Any] = {"source": "", "licence": None, "writer": None}
-        return ObjectLock(settings=settings, map_folders=folders, **stated).accept_maps()
+        return ObjectLock(settings=SETTINGS, map_folders=folders, **stated).accept_maps()
 
 
 def test_rows_have_splits_by_content_and_copies_stay_together(accepted: AcceptedMaps) -> None:
@@ -267,9 +263,7 @@ def test_rows_have_splits_by_content_and_copies_stay_together(accepted: Accepted
     assert read_json_lines(lock, LockedObject, "lock") == in_order
 
 
-def test_no_texture_or_map_of_test_is_in_train(
-    accepted: AcceptedMaps, settings: DatasetSettings
-) -> None:
+def test_no_texture_or_map_of_test_is_in_train(accepted: AcceptedMaps) -> None:
     """By their bytes: not only the uids differ, but what scenes show."""
     uids: dict[str, set[str]] = {}
     shown: dict[str, set[str]] = {}
@@ -279,7 +273,7 @@ def test_no_texture_or_map_of_test_is_in_train(
         for index in range(5):
             try:
                 key = SceneKey(0, index)
-                scene = composed(settings.scenes, small_pool(), key, user_maps=own)
+                scene = composed(SETTINGS.scenes, small_pool(), key, user_maps=own)
             except Rejected:
                 continue
             scene.check()

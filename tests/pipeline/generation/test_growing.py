@@ -433,7 +433,10 @@ def test_a_place_that_is_free_is_taken_before_the_result_is_looked_at() -> None:
     assert submitted == [0, 1, 2, 3, 4]
 
 
-def test_cores_are_those_of_the_affinity_unless_said(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_cores_and_gpus_are_those_of_this_process_unless_said(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    """A GPU has as many children as keep it busy and fit."""
     monkeypatch.delenv("TRILIGHT_CORES", raising=False)
     before = os.sched_getaffinity(0)
     assert 1 <= available_cores() <= len(before)
@@ -447,15 +450,9 @@ def test_cores_are_those_of_the_affinity_unless_said(monkeypatch: pytest.MonkeyP
     monkeypatch.setenv("TRILIGHT_CORES", "many")
     with pytest.raises(TrilightError, match="TRILIGHT_CORES is 'many'"):
         available_cores()
-
-
-def test_cards_are_those_that_are_visible(monkeypatch: pytest.MonkeyPatch) -> None:
-    for value, cards in (("0,2", ("0", "2")), ("GPU-1a", ("GPU-1a",)), ("", ()), ("-1", ())):
+    for value, gpus in (("0,2", ("0", "2")), ("GPU-1a", ("GPU-1a",)), ("", ()), ("-1", ())):
         monkeypatch.setenv("CUDA_VISIBLE_DEVICES", value)
-        assert visible_gpus() == cards, value
-
-
-def test_a_card_has_as_many_children_as_keep_it_busy_and_fit() -> None:
+        assert visible_gpus() == gpus, value
     rows = [(256, 80, 4), (512, 8, 4), (512, 4, 2), (2048, 24, 2), (2048, 141, 4), (256, 0, 1)]
     for resolution, memory_gib, children in rows:
         assert children_of_gpu(resolution, memory_gib << 30) == children, (resolution, memory_gib)

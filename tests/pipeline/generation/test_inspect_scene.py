@@ -1,7 +1,6 @@
 """One sample as it is rendered, and commands on one scene, whose killed children change nothing."""
 
 import dataclasses
-import json
 import multiprocessing
 from collections.abc import Callable, Iterator
 from pathlib import Path
@@ -40,7 +39,7 @@ from storage.renderer import Camera, Sampling
 from storage.seeds import seed_for
 from storage.settings.described import settings_record
 from storage.settings.overrides import json_or_word
-from tests.command_line import trilight
+from tests.command_line import expect_json, expect_mistake
 from tests.infra.child_here import use_children_here
 from tests.pipeline.scenes.small_pool import first_scene, small_pool
 from tests.scenes_by_hand import tiny_sample, tiny_scene
@@ -53,10 +52,7 @@ def test_a_summary_and_a_sheet(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) 
     variant = dataclasses.replace(choose_variant(), note="the GPU renders no right picture")
     monkeypatch.setattr(inspecting, "choose_variant", {"auto": variant}.__getitem__)
     write_usd(tmp_path / "a.usdz", tiny_scene())
-    words = ["inspect", str(tmp_path / "a.usdz"), "--turntable", str(tmp_path / "t.png"), "--json"]
-    result = trilight(words)
-    assert result.exit_code == 0, result.exception
-    found = json.loads(result.output)
+    found = expect_json("inspect", tmp_path / "a.usdz", "--turntable", tmp_path / "t.png")
     assert found["triangles"] == 3 and found["lights"] == 1
     assert found["objects"] == "1 emitter, 1 shell"
     assert found["notes"] == ["the GPU renders no right picture; see trilight doctor"]
@@ -81,10 +77,7 @@ def test_mistakes(tmp_path: Path) -> None:
         ([str(tmp_path), "--turntable", "x.png"], "expected one scene"),
         ([str(tmp_path / "absent.usda")], "no such file"),
     ):
-        result = trilight(["inspect", *words])
-        assert isinstance(result.exception, TrilightError)
-        with pytest.raises(TrilightError, match=message):
-            raise result.exception
+        assert message in expect_mistake("inspect", *words)
 
 
 def test_walls_before_the_objects_are_left_out() -> None:
@@ -291,7 +284,7 @@ def build(**changes: object) -> DatasetSettings:
     return preset_settings("smoke", resolution=16, changes={**small, **changes})
 
 
-def test_what_stores_some_says_so_in_the_order_of_the_table() -> None:
+def test_passes_that_are_asked_for_are_settings_in_the_order_of_the_table_and_rendered() -> None:
     assert settings_record(build(**ASKED))["storage"]["passes"] == list(NAMES)
     assert build(**ASKED).digest == build(**{"storage.passes": list(NAMES)}).digest
     assert build(**ASKED).digest != build().digest
@@ -299,9 +292,6 @@ def test_what_stores_some_says_so_in_the_order_of_the_table() -> None:
         build(**{"storage.passes": ["dept"]})
     with pytest.raises(TrilightError, match="profile' is 'tiny'; expected"):
         build(**{"storage.profile": "tiny"})
-
-
-def test_a_rendered_sample_holds_what_is_asked() -> None:
     activate(choose_variant())
     scene = tiny_scene(provenance={"camera_attempts": [0, 0]})
     sample, plain = (

@@ -86,7 +86,7 @@ def made(source: Path, tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, 
     return out, run(source, out, workers=2)
 
 
-def test_every_object_has_its_outcome_and_meshes_open_elsewhere(
+def test_every_object_has_its_outcome_in_every_document_and_meshes_open_elsewhere(
     made: tuple[Path, AssetReport],
 ) -> None:
     out, report = made
@@ -101,24 +101,6 @@ def test_every_object_has_its_outcome_and_meshes_open_elsewhere(
         # The box of the source is 1 wide; a vertex may leave it by 1 % of its diagonal.
         assert mesh.extents.max() == pytest.approx(1, abs=2 * 0.01 * 3**0.5)
     assert any(row.method != "source" for row in report.rows)
-
-
-def test_the_folder_is_a_source_of_objects(made: tuple[Path, AssetReport], tmp_path: Path) -> None:
-    out, report = made
-    listed = list_objects(str(out), work_dir=tmp_path, allowed_licences=DEFAULT_ALLOWED)
-    found = listed.fetch_selected()
-    assert not found.failures
-    assert [record.uid for record in found.records] == [row.uid for row in report.rows]
-    for record, row in zip(found.records, report.rows, strict=True):
-        for field in ("title", "licence", "licence_source", "attribution", "source_url"):
-            assert getattr(record, field) == getattr(row, field)
-    again = run(out, tmp_path / "again")
-    assert [row.num_faces for row in again.rows] == [row.num_faces for row in report.rows]
-    assert {row.method for row in again.rows} == {"source"}
-
-
-def test_every_document_tells_the_same(made: tuple[Path, AssetReport]) -> None:
-    out, report = made
     assert set(read_failures(AssetFolder(out).failures)) == set(report.failures)
     summary = json.loads(AssetFolder(out).summary.read_bytes())
     assert (summary["accepted"], summary["rejected"]) == (len(REAL), len(BAD))
@@ -133,6 +115,20 @@ def test_every_document_tells_the_same(made: tuple[Path, AssetReport]) -> None:
     logged = json.loads((AssetFolder(out).logs / "unread.json").read_bytes())
     assert logged == {"classic/suzanne": ["statement 'curv'"]}
     assert not list(out.rglob("*.part"))
+
+
+def test_the_folder_is_a_source_of_objects(made: tuple[Path, AssetReport], tmp_path: Path) -> None:
+    out, report = made
+    listed = list_objects(str(out), work_dir=tmp_path, allowed_licences=DEFAULT_ALLOWED)
+    found = listed.fetch_selected()
+    assert not found.failures
+    assert [record.uid for record in found.records] == [row.uid for row in report.rows]
+    for record, row in zip(found.records, report.rows, strict=True):
+        for field in ("title", "licence", "licence_source", "attribution", "source_url"):
+            assert getattr(record, field) == getattr(row, field)
+    again = run(out, tmp_path / "again")
+    assert [row.num_faces for row in again.rows] == [row.num_faces for row in report.rows]
+    assert {row.method for row in again.rows} == {"source"}
 
 
 def test_again_gives_the_same_folder(made: tuple[Path, AssetReport], source: Path) -> None:

@@ -32,8 +32,9 @@ from storage.remote import store
 from storage.remote.url import RemoteUrl, parse_url
 from tests.conftest import ROOT
 from tests.pipeline.generation.bucket_kit import OUT, Killed, Machines, Writes
-from tests.pipeline.generation.frozen_kit import Mesher, begun, object_records, use_mesher
+from tests.pipeline.generation.frozen_kit import Mesher, object_records, use_mesher
 from tests.pipeline.generation.killed_worker import BATCH, KILL_AFTER_S
+from tests.pipeline.generation.test_dataset_writer import begin_tiny
 from tests.pipeline.generation.tiny_scenes_kit import (
     Undocumented,
     tiny_order,
@@ -54,7 +55,7 @@ def _prepare(
     fetch: Callable[[list[ObjectRecord]], Fetched] | None = None,
 ) -> tuple[PrepareResult, int]:
     counted: list[int] = []
-    work = ObjectWork(settings=AssetSettings(), writer=begun(out), fetch=fetch)
+    work = ObjectWork(settings=AssetSettings(), writer=begin_tiny(out), fetch=fetch)
     found = prepare_in_batches(records, work, workers=1, done=counted.append)
     return found, sum(counted)
 

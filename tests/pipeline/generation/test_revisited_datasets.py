@@ -80,17 +80,12 @@ def members(dataset: Dataset) -> dict[str, bytes]:
 
 
 @pytest.fixture(scope="module")
-def here() -> Iterator[pytest.MonkeyPatch]:
-    """Make scenes in this process."""
+def source(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Dataset]:
+    """Scenes are made in this process."""
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(render_workers, "IsolatedChild", ChildHere)
-        yield patch
+        yield generated(tmp_path_factory.mktemp("source") / "one", 1)
         render_workers.close_children()
-
-
-@pytest.fixture(scope="module")
-def source(here: pytest.MonkeyPatch, tmp_path_factory: pytest.TempPathFactory) -> Dataset:
-    return generated(tmp_path_factory.mktemp("source") / "one", 1)
 
 
 def test_another_view_is_that_of_a_dataset_with_more_views(
@@ -163,17 +158,13 @@ def test_a_kept_camera_is_rendered_again_where_it_would_see_something_else(
         assert changed == ("seed" not in asked)
 
 
-def test_of_a_file_with_frames_all_cameras_of_the_first_are_given(
-    source: Dataset, tmp_path: Path
-) -> None:
+def test_given_cameras_are_those_of_every_scene(source: Dataset, tmp_path: Path) -> None:
+    """And all cameras of the first frame where a file has several."""
     path, scene = tmp_path / "frames.usdc", tiny_scene()
     write_usd_shard(path, [("a", scene), ("b", scene), ("c", scene)])
     asked = order_of(source.folder.root, tmp_path / "given", cameras=str(path))
-    given = asked.changes["revisit"]["given_cameras"]
-    assert [camera["c2w"] for camera in given] == [pose.ravel().tolist() for pose in scene.c2w]
-
-
-def test_given_cameras_are_those_of_every_scene(source: Dataset, tmp_path: Path) -> None:
+    poses = [camera["c2w"] for camera in asked.changes["revisit"]["given_cameras"]]
+    assert poses == [pose.ravel().tolist() for pose in scene.c2w]
     look = {"position": [0, -2, 1], "look_at": [0, 0, 0], "up": [0, 0, 1], "fov": 40}
     path = tmp_path / "cameras.json"
     path.write_text(json.dumps({"cameras": [look]}))
@@ -214,16 +205,15 @@ def test_a_repair_from_other_objects_is_refused_before_a_shard_is_moved(
     assert {path.name: path.read_bytes() for path in copy.iterdir() if path.is_file()} == before
 
 
-def test_another_source_is_refused(source: Dataset, tmp_path: Path) -> None:
+def test_another_source_and_scenes_of_files_without_layout_are_refused(
+    source: Dataset, tmp_path: Path
+) -> None:
     order = order_of(source.folder.root, tmp_path / "set")
     other = dict(order.changes["revisit"], source_digest="0" * 64)
     changed = dataclasses.replace(order, changes={**order.changes, "revisit": other})
     with pytest.raises(TrilightError, match="its dataset digest is .*; expected 0000"):
         make_dataset(changed, Undocumented())
     assert not (tmp_path / "set" / "manifest.json").exists()
-
-
-def test_scenes_of_files_have_no_layout_to_draw_from(source: Dataset, tmp_path: Path) -> None:
     of_files = {"splits.listed_scenes": 4}
     for name, value in (("cameras", "new:2"), ("lights", "new")):
         asked = {"changes": of_files, name: value}

@@ -18,7 +18,7 @@ from pipeline.generation.generate_options import GenerateOptions
 from pipeline.generation.generation_run import Piece, Run, Runner, ShardJob, TaskResult
 from pipeline.generation.pipeline import make_dataset, make_piece
 from pipeline.generation.scene_worker import SceneAttempt
-from pipeline.isolation import ChildFailed, IsolatedChild
+from pipeline.isolation import ChildFailed
 from pipeline.shards import pack_shards as pack
 from pipeline.shards.pack_shards import UnfinishedShard, pack_shard
 from storage import file_locks
@@ -44,20 +44,6 @@ from tests.scenes_by_hand import stage_scene
 NAME = "train-000000.tar"
 
 
-class FakeChild:
-    """Makes tiny samples at once, and counts."""
-
-    def __init__(self, made: "Counter[int]", broken: int = -1) -> None:
-        self._made = made
-        self._broken = broken
-
-    def call_method(self, method: Any, split: str, scene_index: int, attempt: int) -> SceneAttempt:
-        if scene_index == self._broken and attempt == 0:
-            raise ChildFailed("crashed_signal_11", "native code ended by SIGSEGV")
-        self._made[scene_index] += 1
-        return SceneAttempt(sample=_sample(scene_index), failures=[])
-
-
 @pytest.fixture(autouse=True)
 def _begun(tmp_path: Path) -> None:
     """Begin the dataset whose shard this is."""
@@ -65,7 +51,15 @@ def _begun(tmp_path: Path) -> None:
 
 
 def _make(root: Path, first: int, last: int, made: "Counter[int]", broken: int = -1) -> Any:
-    child = cast(IsolatedChild, FakeChild(made, broken))
+    """Make a piece with a child that makes tiny samples at once, and counts."""
+
+    def attempt(method: Any, split: str, scene_index: int, attempt: int) -> SceneAttempt:
+        if scene_index == broken and attempt == 0:
+            raise ChildFailed("crashed_signal_11", "native code ended by SIGSEGV")
+        made[scene_index] += 1
+        return SceneAttempt(sample=_sample(scene_index), failures=[])
+
+    child: Any = SimpleNamespace(call_method=attempt)
     piece = Piece(shard_index=0, first=first, last=last)
     _, shard = make_piece(shard_job(root), piece, child)
     return shard

@@ -270,14 +270,6 @@ def child() -> Iterator[IsolatedChild]:
         yield child
 
 
-@pytest.fixture
-def hurried() -> Iterator[IsolatedChild]:
-    """For calls that must come to the end of their time; others may be slow on a busy machine."""
-    limits = dataclasses.replace(LIMITS, wall_s=1.5)
-    with closing(IsolatedChild(limits=limits)) as child:
-        yield child
-
-
 def test_a_hostile_pickle_makes_no_file(tmp_path: Path) -> None:
     code = pickle.dumps(Hostile(tmp_path / "made"))
     for parts in ([code], [b'["result"]', code], [b'["result"]', b"[0]", code]):
@@ -300,12 +292,18 @@ def test_an_answer_that_is_larger_than_its_child_may_be_is_not_read(
         child.call(called.taken_over, [np.array(claim, "<u8").tobytes()], 0.0)
 
 
-def test_an_answer_that_never_ends_does(hurried: IsolatedChild) -> None:
-    """Its pieces, each of which comes in time, do not hold its owner."""
-    began_s = time.monotonic()
-    with pytest.raises(ChildFailed, match="timeout_wall"):
-        hurried.call(called.taken_over, [frame(bytes(200))[:16], *([b"x"] * 199)], 0.1)
-    assert time.monotonic() - began_s < 15  # a busy machine starts a child in that
+def test_an_answer_that_never_ends_does_and_a_child_that_reads_no_more_is_given_up() -> None:
+    """Pieces of an answer, each of which comes in time, do not hold its owner."""
+    # for calls that must come to the end of their time; others may be slow on a busy machine
+    limits = dataclasses.replace(LIMITS, wall_s=1.5)
+    with closing(IsolatedChild(limits=limits)) as hurried:
+        began_s = time.monotonic()
+        with pytest.raises(ChildFailed, match="timeout_wall"):
+            hurried.call(called.taken_over, [frame(bytes(200))[:16], *([b"x"] * 199)], 0.1)
+        assert time.monotonic() - began_s < 15  # a busy machine starts a child in that
+        hurried.call(called.deaf, frame(*encode_result(1)))
+        with pytest.raises(ChildFailed, match="timeout_wall"):
+            hurried.call(called.length_of, bytes(8 << 20))
 
 
 def test_an_owner_without_memory_for_an_answer_has_a_failed_call(
@@ -322,12 +320,6 @@ def test_an_owner_without_memory_for_an_answer_has_a_failed_call(
     with pytest.raises(ChildFailed, match="out_of_memory: this process has no memory"):
         child.call(called.large)
     assert child.call(called.double, 4) == 8
-
-
-def test_a_child_that_reads_no_more_is_given_up(hurried: IsolatedChild) -> None:
-    hurried.call(called.deaf, frame(*encode_result(1)))
-    with pytest.raises(ChildFailed, match="timeout_wall"):
-        hurried.call(called.length_of, bytes(8 << 20))
 
 
 def test_values_come_whole_and_only_as_their_function_declares_them(child: IsolatedChild) -> None:

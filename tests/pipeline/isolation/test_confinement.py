@@ -56,26 +56,19 @@ def place(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return root
 
 
-@pytest.fixture(scope="module")
-def child(place: Path) -> Iterator[IsolatedChild]:
+@needs_landlock
+def test_inputs_are_read_outputs_written_and_nothing_outside(place: Path) -> None:
     files = reach(files=[place / "in" / "file"], writes=[place / "out"])
     with closing(confined(files)) as child:
-        yield child
-
-
-@needs_landlock
-def test_inputs_are_read_outputs_written_and_nothing_outside(
-    child: IsolatedChild, place: Path
-) -> None:
-    assert child.call(called.read, place / "in" / "file") == "in"
-    child.call(called.write, place / "out" / "new")
-    child.call(called.replace, place / "out" / "file", place / "out" / "new")
-    assert (place / "out" / "file").read_text() == "written"
-    outside = [place / name for name in ("outside/file", "in/link", "in/../outside/file")]
-    secrets = Path(f"/proc/{os.getpid()}/environ")  # of another process
-    assert child.call(called.refused_paths, [*outside, secrets], False) == [*outside, secrets]
-    paths = [place / name for name in ("in/file", "in/new", "outside/file", "new")]
-    assert child.call(called.refused_paths, paths, True) == paths
+        assert child.call(called.read, place / "in" / "file") == "in"
+        child.call(called.write, place / "out" / "new")
+        child.call(called.replace, place / "out" / "file", place / "out" / "new")
+        assert (place / "out" / "file").read_text() == "written"
+        outside = [place / name for name in ("outside/file", "in/link", "in/../outside/file")]
+        secrets = Path(f"/proc/{os.getpid()}/environ")  # of another process
+        assert child.call(called.refused_paths, [*outside, secrets], False) == [*outside, secrets]
+        paths = [place / name for name in ("in/file", "in/new", "outside/file", "new")]
+        assert child.call(called.refused_paths, paths, True) == paths
     assert (place / "in" / "file").read_text() == "in"
 
 
@@ -282,38 +275,27 @@ def plain_child() -> Iterator[IsolatedChild]:
 
 
 def test_a_signal_of_native_code_is_told_from_one_of_somebody_else(
-    plain_child: IsolatedChild,
+    plain_child: IsolatedChild, monkeypatch: pytest.MonkeyPatch
 ) -> None:
+    """Two as they happen, and others by the status of the child."""
     for end, reason in ((signal.SIGSEGV, "crashed_signal_11"), (signal.SIGTERM, "killed")):
         with pytest.raises(ChildFailed, match=end.name) as caught:
             plain_child.call(called.die_by, end)
         assert (caught.value.reason, caught.value.is_verdict) == (reason, reason != "killed")
-
-
-@for_each(
-    ("number", "reason"),
-    [
+    for number, reason in (
         (signal.SIGABRT, "crashed_signal_6"),
         (signal.SIGFPE, "crashed_signal_8"),
         (signal.SIGKILL, "killed"),
         (signal.SIGHUP, "killed"),
         (signal.SIGBUS, "killed"),
         (signal.SIGXCPU, "killed"),  # a limit of somebody else: these children have none
-    ],
-)
-def test_ends_by_other_signals_are_told_apart_by_the_status(
-    plain_child: IsolatedChild, monkeypatch: pytest.MonkeyPatch, number: signal.Signals, reason: str
-) -> None:
-    ended = SimpleNamespace(exitcode=-number, join=lambda timeout_s: None)
-    monkeypatch.setattr(plain_child, "_process", ended)
-    death = plain_child._death()
-    assert (death.reason, death.is_verdict) == (reason, reason != "killed")
-    assert number.name in death.message
-
-
-def test_the_same_call_is_made_again(plain_child: IsolatedChild, tmp_path: Path) -> None:
-    call = called.count_and_die, str(tmp_path), signal.SIGKILL, 2
-    assert call_with_retries(plain_child, *call) == 3
+    ):
+        ended = SimpleNamespace(exitcode=-number, join=lambda timeout_s: None)
+        with monkeypatch.context() as patch, case(number):
+            patch.setattr(plain_child, "_process", ended)
+            death = plain_child._death()
+        assert (death.reason, death.is_verdict) == (reason, reason != "killed")
+        assert number.name in death.message
 
 
 def test_tries_end_and_only_two_ends_are_verdicts() -> None:
@@ -331,13 +313,17 @@ def test_tries_end_and_only_two_ends_are_verdicts() -> None:
     assert not is_transient("degenerate")
 
 
-def test_kills_while_a_child_is_set_up_are_tried_again_and_end_the_run_at_last(
-    tmp_path: Path,
+def test_kills_in_a_call_or_its_set_up_are_tried_again_and_end_the_run_at_last(
+    plain_child: IsolatedChild, tmp_path: Path
 ) -> None:
+    (tmp_path / "call").mkdir()
+    call = called.count_and_die, str(tmp_path / "call"), signal.SIGKILL, 2
+    assert call_with_retries(plain_child, *call) == 3
+    (tmp_path / "once").mkdir()
     dying_child = functools.partial(IsolatedChild, limits=PATIENT, factory=called.count_and_die)
-    with closing(dying_child(args=(str(tmp_path), signal.SIGKILL, 2))) as child:
+    with closing(dying_child(args=(str(tmp_path / "once"), signal.SIGKILL, 2))) as child:
         assert child.call(called.double, 4) == 8
-    assert len(list(tmp_path.iterdir())) == 3
+    assert len(list((tmp_path / "once").iterdir())) == 3
     (tmp_path / "again").mkdir()
     child = dying_child(args=(str(tmp_path / "again"), signal.SIGKILL, 99))
     with pytest.raises(EnvironmentFailure, match="cannot be set up.*SIGKILL.*doctor"):

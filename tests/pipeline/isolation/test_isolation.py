@@ -10,7 +10,7 @@ import sys
 import tempfile
 import threading
 import time
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import closing
 from multiprocessing import popen_forkserver
@@ -33,7 +33,7 @@ from pipeline.isolation import (
 from pipeline.isolation.stand_in_library import load_stand_in
 from storage.errors import EnvironmentFailure, Rejected, TrilightError
 from tests.conftest import ROOT
-from tests.for_each import for_each
+from tests.for_each import case, for_each
 from tests.pipeline.isolation import called
 
 LIMITS = ChildLimits(memory_bytes=2 << 30, wall_s=60, calls_per_child=3)
@@ -61,26 +61,23 @@ def test_a_child_that_cannot_start_leaves_the_program_as_it_was(
     assert (sys.modules["__main__"], sys.path, os.environ.copy()) == before
 
 
-def test_results_and_rejections_come_back(child: IsolatedChild) -> None:
+def test_results_and_rejections_come_back_and_a_failure_costs_one_call(
+    child: IsolatedChild,
+) -> None:
     assert child.call(called.double, 21) == 42
     with pytest.raises(Rejected, match="no_faces: nothing there"):
         child.call(called.reject)
     with pytest.raises(TrilightError, match="output: cannot be written"):
         child.call(called.mistake)
-
-
-@for_each(
-    ("function", "reason"),
-    [
+    failing: tuple[tuple[Callable[[], object], str], ...] = (
         (called.crash, "crashed_signal_11"),
         (called.eat_memory, "out_of_memory"),
         (called.divide, "exception: .*ZeroDivisionError"),
-    ],
-)
-def test_a_failure_costs_one_call(child: IsolatedChild, function, reason: str) -> None:  # type: ignore[no-untyped-def]
-    with pytest.raises(ChildFailed, match=f"(?s){reason}"):
-        child.call(function)
-    assert child.call(called.double, 4) == 8
+    )
+    for function, reason in failing:
+        with case(reason), pytest.raises(ChildFailed, match=f"(?s){reason}"):
+            child.call(function)
+        assert child.call(called.double, 4) == 8
 
 
 @for_each("times", [1, 3])
@@ -106,10 +103,18 @@ def test_a_fork_server_that_is_killed_is_replaced(
             child.call(called.double, 4)
 
 
-def test_a_child_is_replaced_after_its_calls(child: IsolatedChild, tmp_path: Path) -> None:
+def test_a_child_is_replaced_after_its_calls_or_when_it_is_retired(
+    child: IsolatedChild, tmp_path: Path
+) -> None:
     for _ in range(LIMITS.calls_per_child + 1):
         child.call(called.double, 1)
     assert len(list(tmp_path.iterdir())) == 2
+    first = child.call(called.process_id)
+    assert child.call(called.process_id) == first
+    child.retire()
+    child.retire()
+    assert not Path(f"/proc/{first}").exists()
+    assert child.call(called.process_id) != first
 
 
 def test_closing_frees_a_waiting_caller(child: IsolatedChild) -> None:
@@ -151,15 +156,6 @@ def test_waiting_uses_no_processor_seconds() -> None:
         assert child.call(called.double, 4) == 8
 
 
-def test_a_retired_child_is_replaced(child: IsolatedChild) -> None:
-    first = child.call(called.process_id)
-    assert child.call(called.process_id) == first
-    child.retire()
-    child.retire()
-    assert not Path(f"/proc/{first}").exists()
-    assert child.call(called.process_id) != first
-
-
 @pytest.fixture
 def watched(monkeypatch: pytest.MonkeyPatch) -> Iterator[IsolatedChild]:
     """Looked at twenty times a second, and given up after three quarters of one."""
@@ -173,6 +169,7 @@ def watched(monkeypatch: pytest.MonkeyPatch) -> Iterator[IsolatedChild]:
 def test_a_stopped_child_is_noticed_and_its_work_done_again(
     watched: IsolatedChild, tmp_path: Path, caplog: pytest.LogCaptureFixture
 ) -> None:
+    """One that stays stopped is the fault of the environment."""
     stopped = watched.call(called.process_id)
     os.kill(stopped, signal.SIGSTOP)
     (tmp_path / "go").touch()
@@ -181,9 +178,6 @@ def test_a_stopped_child_is_noticed_and_its_work_done_again(
     assert record.levelno == logging.WARNING
     assert f"child process {stopped} has been stopped" in record.getMessage()
     assert f"`kill -CONT {stopped}`" in record.getMessage()
-
-
-def test_a_child_that_stays_stopped_is_the_fault_of_the_environment(watched: IsolatedChild) -> None:
     os.kill(watched.call(called.process_id), signal.SIGSTOP)
     with pytest.raises(ChildFailed, match="stopped: stopped from outside") as caught:
         watched.call(called.process_id)
@@ -254,17 +248,14 @@ def compare_exchange() -> Any:
     return function
 
 
-def _aligned_pair() -> tuple[Any, Any]:
-    """Return a buffer, and two numbers in it at a multiple of 16 bytes."""
+def _aligned_pair() -> Any:
+    """Return two numbers at a multiple of 16 bytes, which keep the memory that they are in."""
     room = ctypes.create_string_buffer(32)
-    offset = -ctypes.addressof(room) % 16
-    return room, (_WORD * 2).from_buffer(room, offset)
+    return (_WORD * 2).from_buffer(room, -ctypes.addressof(room) % 16)
 
 
-def test_it_exchanges_sixteen_bytes_where_all_are_as_expected(
-    compare_exchange: Any,
-) -> None:
-    room, value = _aligned_pair()
+def test_it_exchanges_sixteen_bytes_where_all_are_as_expected(compare_exchange: Any) -> None:
+    value = _aligned_pair()
     value[:] = 5, 6
     for expected in ((5, 7), (4, 6)):
         found = (_WORD * 2)(*expected)
@@ -273,12 +264,11 @@ def test_it_exchanges_sixteen_bytes_where_all_are_as_expected(
     found = (_WORD * 2)(5, 6)
     assert compare_exchange(ctypes.byref(value), found, 1, 2, 5, 5)
     assert list(value) == [1, 2]
-    assert room is not None
 
 
 def test_threads_lose_no_exchange(compare_exchange: Any) -> None:
     """ctypes holds no lock of Python in a call, so two processors meet."""
-    room, value = _aligned_pair()
+    value = _aligned_pair()
     times = 20_000
 
     def count() -> None:
@@ -293,7 +283,6 @@ def test_threads_lose_no_exchange(compare_exchange: Any) -> None:
         for done in [threads.submit(count) for _ in range(2)]:
             done.result()
     assert list(value) == [2 * times, (1 << 64) - 2 * times]
-    assert room is not None
 
 
 _STAND_INS = """

@@ -90,38 +90,34 @@ def test_every_object_keeps_the_laws(family: str) -> None:
     for number in range(SAMPLES):
         with case(number):
             mesh = made(family, number)
-            parts = parts_of(mesh)
-            _require_good_faces(mesh)
+            positions, faces = mesh
+            assert np.isfinite(positions).all()
+            assert 300 <= len(faces) <= 6000
+            assert faces.min() == 0 and len(np.unique(faces)) == len(positions)
+            # No face is without area or there twice.
+            unit = positions / np.ptp(positions, axis=0).max()
+            a, b, c = unit[faces].transpose(1, 0, 2)
+            assert (np.linalg.norm(np.cross(b - a, c - a), axis=1) > 1e-9).all()
+            assert len(np.unique(np.sort(faces, axis=1), axis=0)) == len(faces)
+            # The mesh stage welds what shares a cell of 2^-20: then parts would share edges.
+            cells = np.rint(unit.astype(np.float32).astype(np.float64) * 2**20)
+            assert len(np.unique(cells, axis=0)) == len(cells)
             # Closed parts face outward.
+            parts = parts_of(mesh)
             closed = [part for part in parts if is_closed(part)]
             assert all(volume(part) > 0 for part in closed)
             assert closed and (len(closed) < len(parts)) == (family in WITH_SHEETS)
-            _require_no_floating_part(parts)
-
-
-def _require_good_faces(mesh: Mesh) -> None:
-    """None is without area or there twice."""
-    positions, faces = mesh
-    assert np.isfinite(positions).all()
-    assert 300 <= len(faces) <= 6000
-    assert faces.min() == 0 and len(np.unique(faces)) == len(positions)
-    unit = positions / np.ptp(positions, axis=0).max()
-    a, b, c = unit[faces].transpose(1, 0, 2)
-    assert (np.linalg.norm(np.cross(b - a, c - a), axis=1) > 1e-9).all()
-    # The mesh stage welds what shares a cell of 2^-20: then parts would share edges.
-    cells = np.rint(unit.astype(np.float32).astype(np.float64) * 2**20)
-    assert len(np.unique(cells, axis=0)) == len(cells)
-    assert len(np.unique(np.sort(faces, axis=1), axis=0)) == len(faces)
-
-
-def _require_no_floating_part(parts: list[Mesh]) -> None:
-    boxes = np.array([(p.min(axis=0), p.max(axis=0)) for p, _ in parts])
-    low, high = boxes[:, 0], boxes[:, 1]
-    apart = np.asarray(((low[:, None] > high[None]) | (low[None] > high[:, None])).any(axis=2))
-    reached = {0}
-    for _ in boxes:
-        reached = {int(part) for part in np.flatnonzero(~apart[sorted(reached)].all(axis=0))}
-    assert len(reached) == len(boxes)
+            # No part floats.
+            boxes = np.array([(p.min(axis=0), p.max(axis=0)) for p, _ in parts])
+            low, high = boxes[:, 0], boxes[:, 1]
+            outside = (low[:, None] > high[None]) | (low[None] > high[:, None])
+            apart = np.asarray(outside.any(axis=2))
+            reached = {0}
+            for _ in boxes:
+                reached = {
+                    int(part) for part in np.flatnonzero(~apart[sorted(reached)].all(axis=0))
+                }
+            assert len(reached) == len(boxes)
 
 
 @for_each("windings", [(2, 3), (3, 2), (2, 5), (3, 4), (1, 5), (4, 3), (5, 2)])
@@ -149,19 +145,15 @@ def _lattice(cells: tuple[int, int, int], **changes: object) -> Mesh:
         return surfaces.sample_lattice(rng_for(0, "any"))
 
 
-def _graph(x: int, y: int, z: int) -> tuple[int, int]:
-    """Crossings and bars of a lattice."""
-    bars = x * (y + 1) * (z + 1) + y * (x + 1) * (z + 1) + z * (x + 1) * (y + 1)
-    return (x + 1) * (y + 1) * (z + 1), bars
-
-
 @for_each(
     "cells, splits",
     itertools.product([(1, 1, 1), (2, 1, 3), (3, 3, 2), (4, 0, 3), (1, 0, 1)], [1, 3]),
 )
 def test_a_lattice_has_the_genus_of_its_graph(cells: tuple[int, int, int], splits: int) -> None:
     mesh = _lattice(cells, splits=splits)
-    crossings, bars = _graph(*cells)
+    x, y, z = cells
+    crossings = (x + 1) * (y + 1) * (z + 1)
+    bars = x * (y + 1) * (z + 1) + y * (x + 1) * (z + 1) + z * (x + 1) * (y + 1)
     assert is_closed(mesh) and len(parts_of(mesh)) == 1
     assert len(mesh[0]) - len(mesh[1]) // 2 == 2 * (crossings - bars)
     # Every side of every piece of a bar is a quad, and so is every side of a crossing without bar.

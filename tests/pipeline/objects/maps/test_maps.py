@@ -256,22 +256,20 @@ def _with(value: float) -> NDArray[np.float32]:
     return radiance
 
 
-WRONG: dict[str, list[NDArray[np.float32]]] = {
-    "not_a_number": [_with(np.nan)],
-    "infinite_radiance": [_with(np.inf)],
-    "negative_radiance": [_with(-1.0), -np.ones((4, 8, 3), np.float32)],
-    "too_bright": [_with(2e9)],
-    "black_map": [np.zeros((4, 8, 3), np.float32)],
-    "not_two_to_one": [np.ones((1, 1, 3), np.float32)],
-}
-
-
 def test_what_is_wrong_with_a_map_is_said_and_a_good_one_is_as_it_is() -> None:
-    for reason, maps in WRONG.items():
-        for radiance in maps:
-            with pytest.raises(Rejected) as found:
-                usable_map(radiance, 16)
-            assert found.value.reason == reason
+    wrong: list[tuple[str, NDArray[np.float32]]] = [
+        ("not_a_number", _with(np.nan)),
+        ("infinite_radiance", _with(np.inf)),
+        ("negative_radiance", _with(-1.0)),
+        ("negative_radiance", -np.ones((4, 8, 3), np.float32)),
+        ("too_bright", _with(2e9)),
+        ("black_map", np.zeros((4, 8, 3), np.float32)),
+        ("not_two_to_one", np.ones((1, 1, 3), np.float32)),
+    ]
+    for reason, radiance in wrong:
+        with pytest.raises(Rejected) as found:
+            usable_map(radiance, 16)
+        assert found.value.reason == reason
     with pytest.raises(Rejected, match="row 1, column 2"):
         usable_map(_with(np.nan), 16)
     slightly = _with(-1e-3)

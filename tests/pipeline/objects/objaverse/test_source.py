@@ -15,7 +15,7 @@ from pipeline.objects.listing import Listing
 from pipeline.objects.objaverse import source as objaverse
 from tests.for_each import case, for_each
 from tests.http_server import Fault, Site
-from tests.pipeline.objects import find_kit
+from tests.pipeline.objects import conftest
 
 pytestmark = pytest.mark.usefixtures("place")
 
@@ -46,8 +46,22 @@ def packed(value: object) -> bytes:
     return gzip.compress(json.dumps(value).encode())
 
 
-def fill_site(site: Site) -> None:
-    """Serve the metadata and the objects."""
+def find(text: str, **options: Any) -> Listing:
+    return conftest.find(f"objaverse:{text}", **options)
+
+
+def found_names(found: Listing) -> list[str]:
+    return [NAME[record.uid.removeprefix("objaverse/")] for record in found.records]
+
+
+def reasons(found: Listing) -> dict[str, str]:
+    rows = conftest.reasons(found).items()
+    return {NAME.get(item.removeprefix("objaverse/"), item): reason for item, reason in rows}
+
+
+@pytest.fixture
+def place(site: Site, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    """Serve metadata and objects of a small Objaverse; returns where its files are kept."""
     site.files["/object-paths.json.gz"] = packed({UID[name]: glb(name)[1:] for name in NAMES})
     for number in range(3):
         rows = {UID[name]: annotation(name) for name in NAMES if NAMES.index(name) % 3 == number}
@@ -59,25 +73,6 @@ def fill_site(site: Site) -> None:
     )  # fmt: skip
     for name in NAMES:
         site.files[glb(name)] = f"glTF {name}".encode()
-
-
-def find(text: str, **options: Any) -> Listing:
-    return find_kit.find(f"objaverse:{text}", **options)
-
-
-def found_names(found: Listing) -> list[str]:
-    return [NAME[record.uid.removeprefix("objaverse/")] for record in found.records]
-
-
-def reasons(found: Listing) -> dict[str, str]:
-    rows = find_kit.reasons(found).items()
-    return {NAME.get(item.removeprefix("objaverse/"), item): reason for item, reason in rows}
-
-
-@pytest.fixture
-def place(site: Site, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
-    """Lead to the small Objaverse; returns where its files are kept."""
-    fill_site(site)
     url = dataclasses.replace(objaverse._URL, scheme="http", root=site.url)
     monkeypatch.setattr(objaverse, "_URL", url)
     folder = tmp_path / "hf-objaverse-v1"
@@ -102,10 +97,28 @@ def test_uids_come_with_their_rights(site: Site) -> None:
     assert site.requests == []
 
 
-def test_a_file_of_uids(tmp_path: Path) -> None:
+def test_a_file_of_uids_and_mistakes(tmp_path: Path) -> None:
     path = tmp_path / "uids.txt"
     path.write_text(f"# mine\n\n{UID['a']}  # good\r\n  {UID['d']}\n")
     assert found_names(find(str(path))) == [name for name in IN_ORDER if name in "ad"]
+    for content, message in (
+        (f"{UID['a']}\nchair\n".encode(), r"uids\.txt:2: got 'chair'"),
+        (f"{UID['a']} {UID['b']}".encode(), r"uids\.txt:1"),
+        (b"# nothing\n", "holds no uid"),
+        (b"\xff\xfe", "UTF-8"),
+    ):
+        path.write_bytes(content)
+        conftest.refusal(f"objaverse:{path}", message)
+    for text, message in (
+        ("", "names no file and no uid"),
+        ("category/", "malformed"),
+        ("category/chair:0", "malformed"),
+        ("category/chair,,vase", "malformed"),
+        ("category/chairs", "no such category.*3 LVIS categories.*Did you mean chair"),
+        ("category/sofabed", "Did you mean sofa_bed"),
+    ):
+        with case(text):
+            conftest.refusal(f"objaverse:{text}", message)
 
 
 @for_each("count", [1, 2, 3, 99])
@@ -150,31 +163,6 @@ def test_unknown_uids_and_paths_that_lead_out_cost_themselves_only(site: Site) -
     assert reasons(found) == dict.fromkeys(("a", "c", f"objaverse/{'0' * 32}"), "unknown_uid")
 
 
-def test_mistakes() -> None:
-    for text, message in (
-        ("", "names no file and no uid"),
-        ("category/", "malformed"),
-        ("category/chair:0", "malformed"),
-        ("category/chair,,vase", "malformed"),
-        ("category/chairs", "no such category.*3 LVIS categories.*Did you mean chair"),
-        ("category/sofabed", "Did you mean sofa_bed"),
-    ):
-        with case(text):
-            find_kit.refusal(f"objaverse:{text}", message)
-
-
-def test_mistakes_in_a_file_of_uids(tmp_path: Path) -> None:
-    path = tmp_path / "uids.txt"
-    for content, message in (
-        (f"{UID['a']}\nchair\n".encode(), r"uids\.txt:2: got 'chair'"),
-        (f"{UID['a']} {UID['b']}".encode(), r"uids\.txt:1"),
-        (b"# nothing\n", "holds no uid"),
-        (b"\xff\xfe", "UTF-8"),
-    ):
-        path.write_bytes(content)
-        find_kit.refusal(f"objaverse:{path}", message)
-
-
 @for_each("status, message", [(404, "no such file"), (500, "status 500")])
 def test_a_dead_link_costs_one_object(site: Site, place: Path, status: int, message: str) -> None:
     site.always = {glb("d"): Fault(status=status)}
@@ -217,6 +205,6 @@ def test_a_transfer_that_breaks_leaves_nothing_broken(site: Site) -> None:
 def test_no_server_at_all(site: Site) -> None:
     site.always = {"/object-paths.json.gz": Fault(status=503)}
     source = f"objaverse:{UID['a']}"
-    find_kit.refusal(source, r"object-paths\.json\.gz cannot be downloaded .*503")
+    conftest.refusal(source, r"object-paths\.json\.gz cannot be downloaded .*503")
     site.always = {glb("a"): Fault(status=503)}
-    find_kit.refusal(source, "none of 1 objects could be downloaded.*503")
+    conftest.refusal(source, "none of 1 objects could be downloaded.*503")

@@ -18,12 +18,18 @@ from storage.remote import url as remote_url
 from storage.remote.url import PACKAGES, RemoteUrl, open_driver, parse_url
 from tests.for_each import case, for_each
 from tests.http_server import Fault, Site, serve
-from tests.pipeline.objects.find_kit import find, reasons, refusal
+from tests.pipeline.objects.conftest import find, reasons, refusal
 
 pytest.importorskip("aiohttp", reason="http needs the package aiohttp")
 
 
-def test_folders_of_this_machine() -> None:
+def remote(source: str) -> RemoteUrl:
+    url = parse_url(source, what="objects")
+    assert isinstance(url, RemoteUrl)
+    return url
+
+
+def test_folders_of_this_machine_and_of_servers() -> None:
     for source, path in (
         ("objects", "objects"),
         ("/a/b c", "/a/b c"),
@@ -34,15 +40,6 @@ def test_folders_of_this_machine() -> None:
         ("a::b", "a::b"),
     ):
         assert parse_url(source, what="objects") == Path(path), source
-
-
-def remote(source: str) -> RemoteUrl:
-    url = parse_url(source, what="objects")
-    assert isinstance(url, RemoteUrl)
-    return url
-
-
-def test_folders_of_servers() -> None:
     for source, scheme, root in (
         ("https://host/a/b/", "https", "https://host/a/b"),
         ("HTTP://host", "http", "http://host"),
@@ -133,7 +130,16 @@ def bucket(monkeypatch: pytest.MonkeyPatch) -> _Bucket:
     return made
 
 
-def test_a_bucket_is_listed_at_once(bucket: _Bucket, cache: Path) -> None:
+def test_a_bucket_is_listed_at_once_and_what_is_not_wanted_stays_there(
+    bucket: _Bucket, cache: Path
+) -> None:
+    listed = list_objects("s3://bucket", work_dir=cache, allowed_licences=DEFAULT_ALLOWED)
+    assert bucket.fetched == []
+    found = listed.fetch_selected(lambda uid: uid == "b")
+    assert [record.uid for record in found.records] == ["b"]
+    assert bucket.fetched == ["bucket/b.obj"]
+    assert listed.num_found == 3
+    bucket.fetched.clear()
     names = ("a?b#c%20.obj", "x/d.obj", ".f.obj", "x/", "/g.obj")
     bucket.files = {f"bucket/set/{name}": name.encode() for name in names}
     bucket.files["bucket/settee/e.obj"] = b"e"
@@ -158,15 +164,6 @@ def test_a_catalogue_that_changed_nothing_is_looked_up_in_one_listing(bucket: _B
     found = find("s3://bucket")
     bucket.listed.clear()
     assert find("s3://bucket") == found and len(bucket.listed) == 1
-
-
-def test_what_is_not_wanted_stays_on_the_server(bucket: _Bucket, cache: Path) -> None:
-    listed = list_objects("s3://bucket", work_dir=cache, allowed_licences=DEFAULT_ALLOWED)
-    assert bucket.fetched == []
-    found = listed.fetch_selected(lambda uid: uid == "b")
-    assert [record.uid for record in found.records] == ["b"]
-    assert bucket.fetched == ["bucket/b.obj"]
-    assert listed.num_found == 3
 
 
 def gltf(*uris: str) -> str:
@@ -331,14 +328,11 @@ def test_credentials_go_to_the_server_and_nowhere_else(site: Site, cache: Path) 
     assert len(kept) == 2
     for path in kept:
         assert "cret" not in str(path) and b"cret" not in path.read_bytes()
-
-
-def test_credentials_do_not_follow_to_another_server(site: Site) -> None:
-    site.put("a.obj", "A")
-    with serve() as other:
+    with serve() as other:  # nor do they follow to another server
         other.put("elsewhere.obj", "E")
-        site.moved["/a.obj"] = f"{other.url}/elsewhere.obj"
-        (record,) = find(f"{site.url.replace('//', '//lovelace:s3cret@')}?sig=s3cret").records
+        site.put("t/a.obj", "A")
+        site.moved["/t/a.obj"] = f"{other.url}/elsewhere.obj"
+        (record,) = find(f"{site.url.replace('//', '//lovelace:s3cret@')}/t?sig=s3cret").records
         assert Path(record.path).read_text() == "E"
         assert other.requests
         assert not any("Authorization" in request.headers for request in other.requests)
@@ -401,6 +395,16 @@ def forbid(name: str) -> Callable[[Site], None]:
     return prepare
 
 
+def hide_catalogue(site: Site) -> None:
+    site.put("objects.jsonl", '{"uid": "a", "path": "a.obj", "licence": "LicenseRef-shop"}')
+    site.put("a.obj")
+    site.forbidden.add("/objects.jsonl")
+
+
+def list_without_end(site: Site) -> None:
+    vars(site)["page"] = lambda path: '<a href="deeper/">' if path[-1] == "/" else None
+
+
 @pytest.mark.parametrize(
     ("prepare", "message"),
     [
@@ -409,6 +413,8 @@ def forbid(name: str) -> Callable[[Site], None]:
         (always("/objects.jsonl", status=500), "cannot be read .*status 500"),
         (forbid("a.obj"), "none of 1 .*403"),
         (lambda site: site.put("objects.jsonl", "{"), "objects.jsonl:1: not JSON"),
+        (hide_catalogue, "objects.jsonl is listed but cannot be fetched"),
+        (list_without_end, "has no end"),
     ],
 )
 def test_folders_that_give_nothing(
@@ -417,13 +423,6 @@ def test_folders_that_give_nothing(
     prepare(site)
     text = refusal(f"{site.url.replace('//', '//lovelace:s3cret@')}?s3cret", message)
     assert "s3cret" not in text and "lovelace" not in text
-
-
-def test_a_catalogue_that_is_kept_from_us_still_rules(site: Site) -> None:
-    site.put("objects.jsonl", '{"uid": "a", "path": "a.obj", "licence": "LicenseRef-shop"}')
-    site.put("a.obj")
-    site.forbidden.add("/objects.jsonl")
-    refusal(site.url, "objects.jsonl is listed but cannot be fetched")
 
 
 def test_what_killed_runs_left_is_cleared_after_a_day(site: Site) -> None:
@@ -436,13 +435,6 @@ def test_what_killed_runs_left_is_cleared_after_a_day(site: Site) -> None:
         os.utime(folder / name, (when, when))
     find(site.url)
     assert sorted(path.name for path in folder.iterdir()) == ["a.obj", "young.obj.7.part"]
-
-
-def test_a_listing_without_end_is_left(site: Site, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(
-        Site, "page", lambda self, path: '<a href="deeper/">' if path[-1] == "/" else None
-    )
-    refusal(site.url, "has no end")
 
 
 def test_a_full_disk_ends_the_run(site: Site, monkeypatch: pytest.MonkeyPatch) -> None:
