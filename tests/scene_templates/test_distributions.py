@@ -2,9 +2,10 @@
 
 2000 layouts per setting with balls for objects. See `statistics` for the line that is drawn. The
 stated numbers are written here once more, from what the default settings promise, and not read from
-the settings that are under test; those of the published families are pinned (`published`). Places
-(rooms, resting objects, lights, cameras) are also drawn each by itself, since in a whole scene one
-hides the other; so are the paths of cameras, and how evenly their views stand.
+the settings that are under test; those of the published recipes are pinned by the digests of their
+presets (tests/pipeline/presets/test_registry.py). Places (rooms, resting objects, lights, cameras)
+are also drawn each by itself, since in a whole scene one hides the other; so are the paths of
+cameras, and how evenly their views stand.
 """
 
 import dataclasses
@@ -19,6 +20,7 @@ from numpy.typing import NDArray
 from scipy import stats
 
 from pipeline.presets.registry import preset_settings
+from scene_templates.checks import Range
 from scene_templates.families import FAMILIES, Family
 from scene_templates.layout import CameraPose, Emitter, SurfaceLook
 from scene_templates.renderformer_v1 import Policy, stage_1_families, stage_2_families
@@ -39,7 +41,6 @@ from storage.settings.described import from_record, settings_record
 from storage.settings.overrides import apply_overrides
 from tests.for_each import case, for_each
 from tests.scene_templates.balls import MANY, Drawn, drawn, template_settings
-from tests.scene_templates.published import DEFAULT, STAGE_1, STAGE_2, Row
 from tests.scene_templates.statistics import (
     Table,
     alike,
@@ -50,6 +51,31 @@ from tests.scene_templates.statistics import (
     share,
     uniform,
 )
+
+Row = tuple[str, float, tuple[int, int], Range, float]
+"""Name, weight, fewest and most objects, diameter of their spheres before halving, smooth share."""
+
+
+def _rows(families: Iterable[Family]) -> tuple[Row, ...]:
+    return tuple(
+        (one.name, one.weight, one.num_objects, one.object_scale, one.smooth_share)
+        for one in families
+    )
+
+
+STAGE_1 = _rows(stage_1_families("de-biased"))
+STAGE_2 = _rows(stage_2_families("de-biased"))
+
+DEFAULT: tuple[Row, ...] = tuple(
+    row
+    for name in ("plane", "wall", "corner", "open_box")
+    for row in (
+        (f"{name}-single", 1.0, (1, 1), (1.2, 2.2), 0.5),
+        (f"{name}-multi", 2.0, (2, 3), (0.8, 1.8), 0.5),
+    )
+)
+"""Our own families: each layout and each number of objects from 1 to 3 equally often."""
+
 
 ROUGH_LOW, ROUGH_HIGH, ROUGH_BIAS = 0.06, 1.055, 0.05
 """exp(U(ln 0.06, ln 1.055)) - 0.05, clipped to at most 1."""

@@ -38,6 +38,7 @@ from storage.records.scene_file import encode_arrays
 from storage.remote.url import parse_local_path
 from tests.conftest import ROOT
 from tests.for_each import case, for_each
+from tests.hostile.cases import tar_of
 from tests.pipeline.documents.dataset_by_hand import five_scenes, write_dataset
 from tests.scenes_by_hand import tiny_sample
 from tests.textured_by_hand import colour_texture, number_texture, sky, textured_sample
@@ -46,11 +47,7 @@ MEMBERS = {"json": b"{}", "scene.safetensors": b"abc", "0.exr": b"x" * 1000}
 
 
 def _tar(path: Path, entries: Iterable[tuple[str, bytes]]) -> Path:
-    with tarfile.open(path, "w", format=tarfile.USTAR_FORMAT) as archive:
-        for name, data in entries:
-            info = tarfile.TarInfo(name)
-            info.size = len(data)
-            archive.addfile(info, io.BytesIO(data))
+    path.write_bytes(tar_of(entries))
     return path
 
 
@@ -86,7 +83,7 @@ def test_a_shard_cut_at_any_block_is_refused(tmp_path: Path, kept_blocks: int) -
 
 
 def test_names_without_a_suffix_and_samples_in_two_places_are_refused(tmp_path: Path) -> None:
-    """Kinds of members, their paths and sizes are those of tests/hostile/file_cases.py."""
+    """Kinds of members, their paths and sizes are those of tests/hostile/cases.py."""
     for names in (("README",), ("0.json", "0.json"), ("0.json", "1.json", "0.exr")):
         with case(names), pytest.raises(TrilightError, match="refused|twice"):
             list(open_shard(_tar(tmp_path / "hostile.tar", [(name, b"") for name in names])))

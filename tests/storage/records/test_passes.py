@@ -35,7 +35,7 @@ from tests.columns_kit import COAT, WAVES, declared
 from tests.for_each import for_each
 from tests.pipeline.renders.scene_kit import join, light, material, quad, sampled_like_scene
 from tests.scenes_by_hand import FLOOR, tiny_sample, tiny_scene
-from tests.storage.records.test_parts import faults
+from tests.storage.records.test_sample import faults
 from tests.textured_by_hand import sky, textured_scene
 
 
