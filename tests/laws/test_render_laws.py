@@ -47,7 +47,7 @@ from tests.pipeline.renders.scene_kit import (
     sphere,
 )
 from tests.pipeline.scenes.small_pool import first_scene, small_pool
-from tests.rigid_motion import moved
+from tests.scenes_by_hand import mirrored, moved
 from tests.sky_maps import night, one_sun, smooth
 from tests.storage.test_optics import slow_albedo
 
@@ -220,23 +220,13 @@ def test_rendering_commutes_with_motion(made: Callable[[], Scene]) -> None:
 
 
 def test_rendering_commutes_with_a_mirror_and_with_an_exchange_of_channels() -> None:
-    scene, flip, order = _scene(0), np.diag([-1.0, 1.0, 1.0]), np.array([2, 0, 1])
-    pose = scene.c2w.copy()
-    pose[:, :3, :3] = flip @ pose[:, :3, :3] @ flip
-    pose[:, 0, 3] *= -1
-    mirrored = dataclasses.replace(
-        scene,
-        vertex_positions=(scene.vertex_positions @ flip).astype(np.float32),
-        vertex_normals=(scene.vertex_normals @ flip).astype(np.float32),
-        faces=scene.faces[:, [0, 2, 1]],
-        c2w=pose,
-    )
+    scene, order = _scene(0), np.array([2, 0, 1])
     recoloured = scene.materials.copy()
     for part in (DIFFUSE, SPECULAR, EMISSION):
         recoloured[:, part] = recoloured[:, part][:, order]
     here = render_blocks(scene, first_seed=99, passes=8)
     for other, seen in (
-        (mirrored, np.s_[:, ::-1]),
+        (mirrored(scene), np.s_[:, ::-1]),
         (dataclasses.replace(scene, materials=recoloured), np.s_[..., np.argsort(order)]),
     ):
         other.check()

@@ -47,7 +47,6 @@ from tests.textured_by_hand import (
 KEY = "000000000"
 Members = dict[str, bytes]
 
-
 HALVES = Texture(texels=np.array([[[0.5]], [[0.25]]], np.float32))
 SCENES = {
     "textured": textured_scene(),
@@ -388,13 +387,17 @@ def test_a_texture_is_the_sum_of_its_tents(texture: Texture) -> None:
         assert texture_values(texture, (u, v)) == pytest.approx(_slow(texture, u, v), abs=1e-13)
 
 
-def test_row_0_is_the_bottom_and_column_0_the_left() -> None:
+def test_row_0_is_the_bottom_column_0_the_left_and_far_coordinates_lose_no_digits() -> None:
     texture = Texture(texels=np.array([[[0], [0.25]], [[0.5], [0.75]]], np.float32))
     corners = {(0.25, 0.25): 0, (0.75, 0.25): 1, (0.25, 0.75): 2, (0.75, 0.75): 3}
     for place, value in corners.items():
         assert texture_values(texture, place) == value / 4
         further = np.add(place, (5, -3))
         assert texture_values(texture, further) == value / 4
+    # 1023 + 1/8 is exact in float32, and means 1/8
+    far = texture_values(colour_texture(), np.array([1023.125, -1023.875], np.float32))
+    assert (far == texture_values(colour_texture(), (0.125, 0.125))).all()
+    assert math.isfinite(far.sum())
 
 
 def test_eight_bits_are_decoded_before_they_are_mixed() -> None:
@@ -434,13 +437,6 @@ def test_mean_greatest_and_constant() -> None:
         assert (texture.greatest == linear.max(axis=(0, 1))).all()
         assert texture.constant is None
     assert Texture(texels=np.full((3, 2, 1), 255, np.uint8)).constant == np.ones(1)
-
-
-def test_far_coordinates_lose_no_digits() -> None:
-    """1023 + 1/8 is exact in float32, and means 1/8."""
-    far = texture_values(colour_texture(), np.array([1023.125, -1023.875], np.float32))
-    assert (far == texture_values(colour_texture(), (0.125, 0.125))).all()
-    assert math.isfinite(far.sum())
 
 
 HEIGHT = 90
