@@ -278,16 +278,14 @@ def test_weights_stay_finite_at_the_ends_of_training(changes: dict[str, Any]) ->
     assert same == (run.learning_rate < 1e-300)
 
 
-STRONGEST = AugmentationSettings(
-    rotation="uniform", translation=100.0, mirror=True, channels=True, vertex_order=True,
-    light_scale=1000.0,
-)  # fmt: skip
-
-
 def test_the_strongest_augmentation_leaves_scenes_finite() -> None:
+    strongest = AugmentationSettings(
+        rotation="uniform", translation=100.0, mirror=True, channels=True, vertex_order=True,
+        light_scale=1000.0,
+    )  # fmt: skip
     scene = training_scene(toy_sample(0), 16)
     for seed in range(20):
-        shown = augment_scene(scene, STRONGEST, np.random.default_rng(seed))
+        shown = augment_scene(scene, strongest, np.random.default_rng(seed))
         assert torch.isfinite(shown.target_VRR3).all()
         for tensor in tensors_of(shown.tensors).values():
             assert torch.isfinite(tensor).all()
@@ -323,10 +321,7 @@ def batch() -> TrainingBatch:
     return collate_batch([training_scene(toy_sample(index), 16) for index in range(2)])
 
 
-RUNS = [*(tiny_run(loss=terms) for terms in TERMS), tiny_run(precision="bfloat16")]
-
-
-@for_each("run", RUNS)
+@for_each("run", [*(tiny_run(loss=terms) for terms in TERMS), tiny_run(precision="bfloat16")])
 def test_every_target_that_can_be_stored_gives_a_step(run: TrainSettings) -> None:
     usual = batch()
     for target, noise in ((0.0, 0.0), (0.0, 10.0), (1e-7, 1e-5), (BRIGHTEST, 0.0)):
@@ -363,7 +358,6 @@ def test_losses_and_their_gradients_are_finite_wherever_predictions_are(
 
 
 EMISSIONS = [0.0, 1e-6, 1.0, 1e6]
-
 
 WHOLE_NETWORKS = {
     "random": lambda: awake(SIZES["tiny"](), torch.float32),

@@ -305,17 +305,12 @@ READERS: list[Callable[[Path], object]] = [
 ]
 
 
-def _others(folder: Path) -> Iterator[Path]:
-    os.mkfifo(folder / "train-000000.safetensors")
-    yield folder / "train-000000.safetensors"
-    (folder / "train-000001.safetensors").symlink_to("/dev/zero")
-    yield folder / "train-000001.safetensors"
-    (folder / "train-000002.safetensors").mkdir()
-    yield folder / "train-000002.safetensors"
-
-
 def test_what_is_no_plain_file_is_refused_at_once(tmp_path: Path) -> None:
-    for path in _others(tmp_path):
+    pipe, device, folder = (tmp_path / f"train-00000{row}.safetensors" for row in range(3))
+    os.mkfifo(pipe)
+    device.symlink_to("/dev/zero")
+    folder.mkdir()
+    for path in (pipe, device, folder):
         for read in READERS:
             with case((read.__name__, path.name)):
                 signal.alarm(10)  # a pipe would be waited for without end

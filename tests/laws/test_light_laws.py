@@ -158,12 +158,8 @@ def _glossy_room(strength: float) -> Scene:
         quad([[-4, 2, 0], [4, 2, 0], [4, 2, 4], [-4, 2, 4]], material(diffuse=0.8)),
     ]
     lamps = [light(LIGHT, 4 * strength), light(LIGHT + np.array([1, 0, 0.5]), strength)]
-    return join([*walls, _ball(), *lamps], eye=(0, -3, 2))
-
-
-def _ball() -> Part:
     row = material(diffuse=0.2, specular=[0.5, 0.6, 0.7], roughness=0.4)
-    return sphere([0.4, 0.3, 0.3], 0.3, row, rings=8)
+    return join([*walls, sphere([0.4, 0.3, 0.3], 0.3, row, rings=8), *lamps], eye=(0, -3, 2))
 
 
 def _bowl(albedo: float) -> Part:

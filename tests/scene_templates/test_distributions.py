@@ -393,19 +393,13 @@ def test_a_single_object_is_placed_evenly_and_rests_half_the_time() -> None:
     require_plausible(table)
 
 
-def _off_deg(directions: NDArray[np.float64], sector: Sector) -> NDArray[np.float64]:
-    """Angle of the azimuth of each direction from the middle of a sector."""
-    azimuth_deg = np.degrees(np.arctan2(directions[:, 1], directions[:, 0]))
-    return np.asarray((azimuth_deg - sector.azimuth_deg + 180) % 360 - 180)
-
-
 def _sector_table(directions: NDArray[np.float64], sector: Sector) -> Table:
     low, high = (math.sin(math.radians(angle)) for angle in sector.elevation_deg)
+    azimuth_deg = np.degrees(np.arctan2(directions[:, 1], directions[:, 0]))
+    off_deg = (azimuth_deg - sector.azimuth_deg + 180) % 360 - 180
     return {
         "elevation": uniform(directions[:, 2], low, high),
-        "azimuth": uniform(
-            _off_deg(directions, sector), -sector.half_width_deg, sector.half_width_deg
-        ),
+        "azimuth": uniform(off_deg, -sector.half_width_deg, sector.half_width_deg),
     }
 
 

@@ -7,7 +7,6 @@ published families as published.
 
 import ast
 import dataclasses
-import functools
 import itertools
 import math
 from collections import Counter
@@ -307,15 +306,10 @@ def _gaps(one: Drawn) -> list[float]:
     ]
 
 
-@functools.cache
-def _sixty(name: str) -> list[Drawn]:
-    return drawn(template_settings(name), 60)
-
-
 @for_each("name", ROOMS)
-def test_objects_do_not_meet_nor_leave_the_room(name: str) -> None:
+def test_objects_do_not_meet_nor_leave_the_room_and_emitters_hang_outside(name: str) -> None:
     overlapping = 0
-    for one in _sixty(name):
+    for one in drawn(template_settings(name), 60):
         if one.plan.overlaps:
             overlapping += min(_gaps(one), default=1.0) < 0
         else:
@@ -328,6 +322,13 @@ def test_objects_do_not_meet_nor_leave_the_room(name: str) -> None:
             for part in one.layout.shell:
                 heights = plane_of(part.positions).height(one.points(row))
                 assert heights.min() >= -TOUCHING
+        shell = one.layout.shell
+        reach = max(float(np.linalg.norm(part.positions, axis=1).max()) for part in shell)
+        floor = plane_of(shell[0].positions)
+        for emitter in one.layout.emitters:
+            centre = emitter.triangle.mean(axis=0)
+            assert np.linalg.norm(centre) > min(reach, 1.7)
+            assert floor.height(centre) > 0
     # One scene in ten may overlap, and those of two or three objects mostly do: else the branch
     # above has never been taken, and proves nothing.
     assert overlapping > 0
@@ -377,18 +378,6 @@ def test_objects_that_cannot_fit_are_rejected_with_a_reason() -> None:
         sample_layout(rng_for(0, "scene", 0, 0), settings, plan, [BALL] * 3)
     overlapping = template_settings("open_box", {**changes, "placement.overlap_share": 1.0})
     assert len(one_drawn(overlapping, 0).layout.objects) == 3
-
-
-@for_each("name", ROOMS)
-def test_emitters_hang_outside(name: str) -> None:
-    for one in _sixty(name):
-        shell = one.layout.shell
-        reach = max(float(np.linalg.norm(part.positions, axis=1).max()) for part in shell)
-        floor = plane_of(shell[0].positions)
-        for emitter in one.layout.emitters:
-            centre = emitter.triangle.mean(axis=0)
-            assert np.linalg.norm(centre) > min(reach, 1.7)
-            assert floor.height(centre) > 0
 
 
 @for_each("name", ROOMS)
@@ -453,6 +442,7 @@ def _shells(ranges: SharedRoom, name: str, count: int) -> list[tuple[ShellPart, 
 def test_parts_are_flat_patches_of_128_faces_that_face_the_room(
     ranges: SharedRoom, name: str
 ) -> None:
+    """In square rooms, walls stand exactly on the floor's edge."""
     for shell in _shells(ranges, name, 20):
         assert [part.name for part in shell] == list(TEMPLATES[name].parts)
         for part in shell:
@@ -464,6 +454,12 @@ def test_parts_are_flat_patches_of_128_faces_that_face_the_room(
             assert (np.einsum("ti,i->t", normals, plane.normal) > 0).all()
             # The room's middle is at most 0.125 from the origin, its sides at least 0.375.
             assert plane.height(np.zeros(3)) > 0.2
+        floor = shell[0].positions
+        for wall in shell[1:] if ranges is SQUARE else ():
+            foot = wall.positions[wall.positions[:, 2] < floor[:, 2].max() + SUM_ROUNDING]
+            assert len(foot) == 9
+            gaps = np.abs(foot[:, None] - floor[None]).max(axis=-1).min(axis=1)
+            assert gaps.max() < SUM_ROUNDING
 
 
 def test_the_nominal_room_is_the_unit_cube_and_a_quarter_spin_swaps_the_diagonals() -> None:
@@ -487,17 +483,6 @@ def test_the_nominal_room_is_the_unit_cube_and_a_quarter_spin_swaps_the_diagonal
         return {tuple(row) for row in rows.tolist()}
 
     assert not diagonals(plain) & diagonals(spun)
-
-
-@pytest.mark.parametrize("name", ["wall", "corner", "open_box"])
-def test_in_square_rooms_walls_stand_exactly_on_the_floors_edge(name: str) -> None:
-    for shell in _shells(SQUARE, name, 20):
-        floor = shell[0].positions
-        for wall in shell[1:]:
-            foot = wall.positions[wall.positions[:, 2] < floor[:, 2].max() + SUM_ROUNDING]
-            assert len(foot) == 9
-            gaps = np.abs(foot[:, None] - floor[None]).max(axis=-1).min(axis=1)
-            assert gaps.max() < SUM_ROUNDING
 
 
 @for_each(("ranges", "name"), itertools.product([SQUARE, LOOSE], ["wall", "corner", "open_box"]))

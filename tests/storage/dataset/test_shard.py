@@ -373,13 +373,10 @@ def test_roots_and_shards_are_not_mixed(tmp_path: Path) -> None:
 Members = dict[str, bytes]
 
 
-def _same_key(_: Path) -> tuple[str, Members]:
-    return "000000000", encode_sample(tiny_sample("000000000"))
-
-
-def _continued(_: Path) -> tuple[str, Members]:
-    """The end of the first shard's last sample, as a torn pair of shards would hold it."""
-    return "000000001", {"1.exr": encode_sample(tiny_sample("000000001"))["1.exr"]}
+def _members_of(key: str, *suffixes: str) -> Callable[[Path], tuple[str, Members]]:
+    """Return what makes a sample, or some members of it."""
+    members = encode_sample(tiny_sample(key))
+    return lambda _: (key, {suffix: members[suffix] for suffix in suffixes or members})
 
 
 def _pickled(folder: Path) -> tuple[str, Members]:
@@ -388,12 +385,6 @@ def _pickled(folder: Path) -> tuple[str, Members]:
     members = encode_sample(tiny_sample("000000009"))
     return "000000009", {**members, "json": bomb, "extra.pyd": bomb}
 
-
-HOSTILE_SHARDS = {
-    "a key of another shard": (_same_key, "sample 000000000 is in another shard too"),
-    "members of another shard's sample": (_continued, "000000001 is in another shard too"),
-    "a pickle": (_pickled, "000000009.json is not JSON"),
-}
 
 FORBIDDEN = {"os.system", "os.exec", "os.fork", "os.posix_spawn", "subprocess.Popen", "os.mkdir",
              "pickle.find_class", "exec", "compile", "socket.connect"}  # fmt: skip
@@ -416,7 +407,15 @@ def audited() -> Iterator[list[str]]:
         state["on"] = False
 
 
-@for_each(("hostile", "message"), HOSTILE_SHARDS.values())
+@for_each(
+    ("hostile", "message"),
+    [
+        (_members_of("000000000"), "sample 000000000 is in another shard too"),
+        # the end of the first shard's last sample, as a torn pair of shards would hold it
+        (_members_of("000000001", "1.exr"), "000000001 is in another shard too"),
+        (_pickled, "000000009.json is not JSON"),
+    ],
+)
 def test_hostile_shards_are_refused_and_run_nothing(
     tmp_path: Path, hostile: Callable[[Path], tuple[str, Members]], message: str
 ) -> None:

@@ -12,6 +12,7 @@ import os
 import signal
 import threading
 import time
+from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 
 import pytest
@@ -101,12 +102,8 @@ def test_threads_fetch_a_shard_once(server: Site, cache: Path) -> None:
     (url,) = put(server, "a.tar")
     server.faults["/a.tar"] = [Fault(stall_after=10)]  # so that all are waiting together
     store = ShardCache(cache, 10**6)
-    found: list[bytes] = []
-    threads = [threading.Thread(target=lambda: found.append(fetch(store, url))) for _ in range(8)]
-    for thread in threads:
-        thread.start()
-    for thread in threads:
-        thread.join()
+    with ThreadPoolExecutor(8) as pool:
+        found = list(pool.map(lambda _: fetch(store, url), range(8)))
     assert found == [b"a" * BYTES] * 8
     assert server.ranges_of("/a.tar") == ["", "bytes=10-"]
 
