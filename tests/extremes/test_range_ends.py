@@ -43,8 +43,7 @@ from storage.seeds import SceneKey
 from storage.settings.fields import FieldDescription
 from storage.settings.overrides import apply_overrides
 from tests.extremes.test_ranges import FIELDS, SMOKE, End
-from tests.extremes.test_renders import FLOOR, LAMP
-from tests.extremes.test_scenes import require_laws
+from tests.extremes.test_scenes import FLOOR, LAMP, require_laws
 from tests.for_each import case, for_each
 from tests.model.kit import (
     FAMILIES,
