@@ -58,6 +58,13 @@ def tiny_scene(**changes: Any) -> Scene:
     return Scene(**{**fields, **changes})
 
 
+def from_above(height: float = 1.0, fov_deg: float = 90.0, **changes: Any) -> Scene:
+    """Return the floor of the tiny scene, seen straight from above, +Y at the picture's top."""
+    pose = look_at_c2w(eye=[0, 0, height], target=[0, 0, 0], up=[0, 1, 0])[None]
+    cameras = {"c2w": pose.astype(np.float32), "fov_deg": np.array([fov_deg], np.float32)}
+    return tiny_scene(**cameras, **changes)
+
+
 def tiny_sample(key: str = "000000000", resolution: int = 16, seed: int = 0) -> Sample:
     """Return a sample of the tiny scene with random pictures that half floats hold exactly."""
     rng = np.random.default_rng(seed)

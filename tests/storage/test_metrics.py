@@ -31,7 +31,7 @@ from storage.metrics import (
 )
 from storage.raycast import MISS, FirstHits, SeenFrom, Surfaces, first_hits
 from tests.pipeline.renders.scene_kit import join, light
-from tests.scenes_by_hand import tiny_scene
+from tests.scenes_by_hand import from_above, tiny_scene
 
 angles = st.floats(1, 170)
 
@@ -170,10 +170,7 @@ def test_seams_are_steps_between_tiles() -> None:
 
 
 def test_the_floor_in_closed_form() -> None:
-    scene = tiny_scene(
-        c2w=look_at_c2w(eye=[0, 0, 1], target=[0, 0, 0], up=[0, 1, 0])[None].astype(np.float32),
-        fov_deg=np.array([90], np.float32),
-    )
+    scene = from_above()
     hits = first_hits(scene, resolution=4)
     _, rays = camera_rays(scene.c2w[0], 90, 4)
     assert hits.met.all()  # the lamp hangs behind the camera; the picture is the floor exactly
@@ -185,11 +182,9 @@ def test_the_floor_in_closed_form() -> None:
 
 
 def test_emitters_are_hidden_and_normals_interpolated() -> None:
-    lamp_before_floor = look_at_c2w(eye=[0, 0, 4], target=[0, 0, 0], up=[0, 1, 0])
     slanted = np.tile(np.array([0, 0, 1], np.float32), (7, 1))
     slanted[0] = [0.6, 0, 0.8]
-    scene = tiny_scene(c2w=lamp_before_floor[None].astype(np.float32), vertex_normals=slanted,
-                       fov_deg=np.array([40], np.float32))  # fmt: skip
+    scene = from_above(4, 40, vertex_normals=slanted)  # the lamp is before the floor
     hit = first_hits(scene, resolution=9, pixel=(4, 4))
     assert hit.object == 0
     assert hit.depth_m == pytest.approx(4, abs=1e-9)

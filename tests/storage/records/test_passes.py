@@ -34,7 +34,7 @@ from storage.records.scene import Scene
 from tests.columns_kit import COAT, WAVES, declared
 from tests.for_each import for_each
 from tests.pipeline.renders.scene_kit import join, light, material, quad, sampled_like_scene
-from tests.scenes_by_hand import FLOOR, mirrored, tiny_sample, tiny_scene
+from tests.scenes_by_hand import FLOOR, from_above, mirrored, tiny_sample, tiny_scene
 from tests.storage.records.test_sample import faults
 from tests.textured_by_hand import sky, textured_scene
 
@@ -42,12 +42,6 @@ from tests.textured_by_hand import sky, textured_scene
 def room(seed: int = 0, num_views: int = 2) -> Scene:
     """Return shell, objects with curved and flat faces, and lights, in a view with empty pixels."""
     return sampled_like_scene(np.random.default_rng(seed), num_views=num_views)
-
-
-def from_above(height: float = 1.0, fov_deg: float = 90.0) -> Scene:
-    """Return the floor of the tiny scene, seen straight from above, +Y at the picture's top."""
-    pose = look_at_c2w(eye=[0, 0, height], target=[0, 0, 0], up=[0, 1, 0])[None]
-    return tiny_scene(c2w=pose.astype(np.float32), fov_deg=np.array([fov_deg], np.float32))
 
 
 EXACT = 1e-9
@@ -240,7 +234,7 @@ def test_a_camera_and_a_floor_that_step_aside_in_closed_form() -> None:
 
     Points are followed by their triangles: a floor that slides by 0.5 m moves by 4.
     """
-    scene = from_above(height=1, fov_deg=90)
+    scene = from_above()
     poses = np.concatenate([scene.c2w, scene.c2w])
     poses[1, :3, 3] += [0.25, 0.125, 0]  # right and up in the picture
     both = scene.with_cameras(poses, np.array([90, 90], np.float32))
@@ -253,6 +247,11 @@ def test_a_camera_and_a_floor_that_step_aside_in_closed_form() -> None:
     later = dataclasses.replace(scene, vertex_positions=moved)
     slid = view_passes(scene, ["motion_px"], resolution=16, then=later)["motion_px"]
     np.testing.assert_allclose(slid, np.broadcast_to([4.0, 0.0], (16, 16, 2)), atol=1e-6)
+    # what is behind the other camera does not move
+    up = look_at_c2w(eye=[0, 0, 1], target=[0, 0, 2], up=[0, 1, 0])[None].astype(np.float32)
+    later = scene.with_cameras(up, scene.fov_deg)
+    seen = view_passes(scene, resolution=4, rays_a_side=2, then=later)
+    assert seen["hit"].all() and np.isnan(seen["motion_px"]).all()
 
 
 def test_it_is_the_difference_of_projections() -> None:
@@ -263,14 +262,6 @@ def test_it_is_the_difference_of_projections() -> None:
         for view in (0, 1)
     )
     np.testing.assert_allclose(seen["motion_px"], then - now, atol=1e-6)
-
-
-def test_what_is_behind_the_other_camera_does_not_move() -> None:
-    scene = from_above()
-    up = look_at_c2w(eye=[0, 0, 1], target=[0, 0, 2], up=[0, 1, 0])[None].astype(np.float32)
-    later = scene.with_cameras(up, scene.fov_deg)
-    seen = view_passes(scene, resolution=4, rays_a_side=2, then=later)
-    assert seen["hit"].all() and np.isnan(seen["motion_px"]).all()
 
 
 def test_other_triangles_are_refused() -> None:

@@ -350,11 +350,6 @@ def _lit_sample(**changes: Any) -> Sample:
     return dataclasses.replace(made, **fields | changes)
 
 
-def test_a_sum_beyond_half_floats_is_seen() -> None:
-    lights = np.full((2, 8, 8, 3), HALF_FLOAT_MAX * 0.6, np.float32)
-    assert np.isinf(sum_of_lights(rounded_to_half(lights))).all()
-
-
 def test_a_sky_is_one_more_light_of_a_sample() -> None:
     scene = dataclasses.replace(_lit_sample().scene, environment=constant(0.5))
     assert num_light_pictures(scene) == 3 and num_lights(scene) == 2
@@ -571,7 +566,9 @@ def test_verify_demands_the_sum_of_parts() -> None:
     assert len(found) == 2 and "a light that is not the sum" in found[0]
 
 
-def test_light_that_is_not_finite_is_refused() -> None:
+def test_light_that_is_not_finite_is_refused_and_a_sum_beyond_half_floats_is_seen() -> None:
+    bright = np.full((2, 8, 8, 3), HALF_FLOAT_MAX * 0.6, np.float32)
+    assert np.isinf(sum_of_lights(rounded_to_half(bright))).all()
     for lights in (False, True):
         sample = _sample(lights=lights)
         assert sample.parts_rgb is not None
