@@ -316,9 +316,7 @@ NUMBERS = {
 }  # fmt: skip
 
 
-def test_numbers_of_json_come_back_digit_by_digit_and_none_that_is_no_number(
-    tmp_path: Path,
-) -> None:
+def test_numbers_of_json_come_back_digit_by_digit_and_no_others(tmp_path: Path) -> None:
     """Of provenance, in samples and in USD, and of settings: also integers beyond 64 bits."""
     scene = tiny_scene(provenance=NUMBERS)
     sample = dataclasses.replace(tiny_sample(), scene=scene)

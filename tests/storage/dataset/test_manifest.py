@@ -387,9 +387,7 @@ def test_rate_and_cost_are_those_of_the_logs(tmp_path: Path) -> None:
     assert found.last_scene_unix_s == 1010.0
 
 
-def test_a_manifest_that_does_not_say_how_it_is_divided_is_a_mistake_in_words(
-    tmp_path: Path,
-) -> None:
+def test_a_manifest_that_does_not_say_how_it_is_divided_is_refused(tmp_path: Path) -> None:
     path = begin_tiny(tmp_path, 4).folder.manifest
     manifest = read_manifest(path)
     for splits in ({}, {"splits": {"shards": 3}}, {"splits": 3}):

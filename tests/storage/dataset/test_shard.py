@@ -157,9 +157,7 @@ def dataset(tmp_path: Path) -> Dataset:
     return write_dataset(tmp_path, {TRAIN: four_samples(), "test-000001.tar": test})
 
 
-def test_headers_find_every_member_and_each_map_once_before_its_first_sample(
-    dataset: Dataset,
-) -> None:
+def test_headers_find_every_member_and_each_map_before_its_first_sample(dataset: Dataset) -> None:
     shard = dataset.folder.shard(TRAIN)
     data = shard.read_bytes()
     with tarfile.open(shard) as archive:
