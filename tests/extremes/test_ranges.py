@@ -49,7 +49,6 @@ from train.settings import TrainSettings, WatchSettings
 End = Literal["low", "high"]
 
 SMOKE = preset_settings("smoke")
-RUN = training_preset("smoke")
 
 FIELDS = [
     (settings, field)
@@ -69,8 +68,11 @@ def _walk_settings(settings: Any) -> Iterator[Any]:
             yield from _walk_settings(value)
 
 
-_PRESETS = (SMOKE, RUN, WatchSettings())
-_FROM_PRESETS = {type(each): each for preset in _PRESETS for each in _walk_settings(preset)}
+_FROM_PRESETS = {
+    type(each): each
+    for preset in (SMOKE, training_preset("smoke"), WatchSettings())
+    for each in _walk_settings(preset)
+}
 _HAND_MADE: tuple[Any, ...] = (
     DatasetInRuns(), ONE_FAMILY_EACH[0], SharedRoom(), SideRanges(),
     dataclasses.replace(SMOKE.scenes.cameras, elevation_deg=(0.0, 60.0)),

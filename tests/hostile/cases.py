@@ -162,9 +162,6 @@ def leaks() -> Iterator[tuple[str, Make, str]]:
     yield "value clips", text(clip), "refused"
 
 
-LIBRARY = f'{HEAD}def "L" (references = @OUT@</B>) {{}}'
-
-
 def packages() -> Iterator[tuple[str, Make, str]]:
     def package(members: dict[str, str], **options: int) -> Make:
         def make(folder: Path) -> None:
@@ -176,6 +173,7 @@ def packages() -> Iterator[tuple[str, Make, str]]:
         return make
 
     root = f"{HEAD}{SEEN}"
+    library = f'{HEAD}def "L" (references = @OUT@</B>) {{}}'
     arcs = {
         "absolute": f'{root}def "x" (references = @OUT@</B>) {{}}',
         "upwards": f'{root}def "x" (references = @../outside/secret.usda@</B>) {{}}',
@@ -187,7 +185,7 @@ def packages() -> Iterator[tuple[str, Make, str]]:
     for kind, content in arcs.items():
         # what leads out of an archive is not in it
         ended = "read" if kind in ("upwards", "texture") else "refused"
-        yield f"usdz {kind}", package({"s.usda": content, "lib.usda": LIBRARY}), ended
+        yield f"usdz {kind}", package({"s.usda": content, "lib.usda": library}), ended
     packed = package({"s.usda": root * 99}, compress_type=zipfile.ZIP_DEFLATED)
     yield "usdz compressed", packed, "refused"
     yield "usdz with a path out", package({"s.usda": root, "../x.usda": root}), "refused"

@@ -433,12 +433,15 @@ def _camera_table(sector: Sector, **changes: object) -> Table:
     poses = _cameras(sector, **changes)
     backward = np.stack([pose.c2w[:3, 2] for pose in poses])
     roll = [_roll(pose.c2w[:3, 1], pose.c2w[:3, 2]) for pose in poses]
+    rng = np.random.default_rng(1)
+    leans = np.array([0, 0, 1]) + rng.uniform(-0.1, 0.1, size=(2 * COUNT, 3))
+    twin = [_roll(up, sector.sample_direction(rng)) for up in leans]
     still = _cameras(sector, **{**changes, "target_jitter": 0.0})
     near = _cameras(sector, **{**changes, "distance": (1e-3, 1e-3)})
     table = {
         "fov": uniform([pose.fov_deg for pose in poses], 30, 60),
         "distance": uniform([np.linalg.norm(pose.c2w[:3, 3]) for pose in still], 1.5, 2.0),
-        "roll": alike(roll, _roll_twin(sector)),
+        "roll": alike(roll, twin),
         **_sector_table(backward, sector),
     }
     for axis in range(3):
@@ -451,14 +454,6 @@ def _roll(up: NDArray[np.float64], backward: NDArray[np.float64]) -> float:
     """Angle by which a picture's up leans from the one that +Z gives."""
     right = np.array([-backward[1], backward[0], 0.0])
     return math.atan2(float(up @ right), float(up @ np.cross(backward, right)))
-
-
-def _roll_twin(sector: Sector) -> list[float]:
-    rng = np.random.default_rng(1)
-    return [
-        _roll(np.array([0, 0, 1]) + rng.uniform(-0.1, 0.1, size=3), sector.sample_direction(rng))
-        for _ in range(2 * COUNT)
-    ]
 
 
 def test_cameras_are_drawn_as_stated_and_wrong_ones_are_noticed() -> None:

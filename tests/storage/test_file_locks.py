@@ -138,11 +138,8 @@ def test_what_may_pass_is_told_from_what_will_not(number: int, passes: bool, mes
 
 def test_a_folder_that_can_never_be_made_is_said_at_once() -> None:
     """Where /proc says of a folder that it does not exist, as a deleted one would, waiting ends."""
-    with (
-        pytest.raises(TrilightError, match="/proc/nowhere"),
-        hold_lock(Path("/proc/nowhere/lock")),
-    ):
-        pass
+    with pytest.raises(TrilightError, match="/proc/nowhere"):
+        hold_lock(Path("/proc/nowhere/lock")).__enter__()
 
 
 @for_each("number", [errno.ENOSYS, errno.ENOLCK, errno.EOPNOTSUPP, errno.EIO, errno.EINVAL])

@@ -397,23 +397,19 @@ def test_a_manifest_that_does_not_say_how_it_is_divided_is_refused(tmp_path: Pat
             read_status(str(tmp_path))
 
 
-def _write_log(folder: DatasetFolder, number: int, *, end_s: float) -> None:
-    """Write a log of two scenes of 10 s on two cores, and of a row that a kill has cut."""
-    path = folder.logs / f"part-{number // 8:04d}" / f"train-{number:06d}.tar.jsonl"
-    path.parent.mkdir(parents=True, exist_ok=True)
-    rows = [{"seconds": 10.0, "cores": 2, "finished_unix_s": end_s + at} for at in (0.0, 5.0)]
-    path.write_text("".join(f"{json.dumps(row)}\n" for row in rows) + '{"seconds": 1')
-    os.utime(path, (end_s + 5.0, end_s + 5.0))
-
-
 def test_of_many_logs_few_are_read_and_the_last_scenes_are_all_there(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
+    """Each log has two scenes of 10 s on two cores, and a row that a kill has cut."""
     folder = DatasetFolder(tmp_path)
     assert sample_logs(folder) == ([], None)
     ends_s = [1000.0 + 7.0 * ((5 * number) % 24) for number in range(24)]  # in no order
     for number, end_s in enumerate(ends_s):
-        _write_log(folder, number, end_s=end_s)
+        path = folder.logs / f"part-{number // 8:04d}" / f"train-{number:06d}.tar.jsonl"
+        path.parent.mkdir(parents=True, exist_ok=True)
+        rows = [{"seconds": 10.0, "cores": 2, "finished_unix_s": end_s + at} for at in (0.0, 5.0)]
+        path.write_text("".join(f"{json.dumps(row)}\n" for row in rows) + '{"seconds": 1')
+        os.utime(path, (end_s + 5.0, end_s + 5.0))
     (folder.logs / "asked.json").write_text("[]")
     every, core_s = sample_logs(folder)
     assert core_s == 24 * 2 * 10 * 2 and len(every) == 48

@@ -506,7 +506,7 @@ def test_other_parts_are_refused(
 
 @for_each("lights", [False, True])
 @for_each("names", KNOWN_PARTS)
-def test_a_sample_with_parts_comes_back_and_verify_accepts_it(
+def test_samples_with_parts_come_back_and_are_verified(
     names: tuple[str, ...], lights: bool
 ) -> None:
     sample = _sample(names, lights=lights)

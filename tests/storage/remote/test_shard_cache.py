@@ -283,8 +283,7 @@ def test_a_file_that_changes_meanwhile_is_read_from_the_start(server: Site, loca
     assert PATH not in server.gets()
 
     def change() -> None:
-        while PATH not in server.gets():
-            pass
+        until(lambda: PATH in server.gets())
         fresh = path.with_suffix(".fresh")
         fresh.write_bytes(other)
         fresh.replace(path)  # at once: the server must not find half of it
