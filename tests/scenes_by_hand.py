@@ -1,9 +1,14 @@
-"""Small scenes made by hand, for tests that need a valid scene and not a sampled one."""
+"""Small scenes made by hand, for tests that need a valid scene and not a sampled one.
 
+And moves of a scene and its cameras together, which must not change what the cameras see.
+"""
+
+import dataclasses
 from pathlib import Path
 from typing import Any
 
 import numpy as np
+from numpy.typing import ArrayLike, NDArray
 
 from storage.conventions import look_at_c2w
 from storage.dataset.staging import stage_members
@@ -53,6 +58,13 @@ def tiny_scene(**changes: Any) -> Scene:
     return Scene(**{**fields, **changes})
 
 
+def from_above(height: float = 1.0, fov_deg: float = 90.0, **changes: Any) -> Scene:
+    """Return the floor of the tiny scene, seen straight from above, +Y at the picture's top."""
+    pose = look_at_c2w(eye=[0, 0, height], target=[0, 0, 0], up=[0, 1, 0])[None]
+    cameras = {"c2w": pose.astype(np.float32), "fov_deg": np.array([fov_deg], np.float32)}
+    return tiny_scene(**cameras, **changes)
+
+
 def tiny_sample(key: str = "000000000", resolution: int = 16, seed: int = 0) -> Sample:
     """Return a sample of the tiny scene with random pictures that half floats hold exactly."""
     rng = np.random.default_rng(seed)
@@ -85,3 +97,46 @@ def stage_scene(
 ) -> None:
     """Stage what became of a scene, as a worker does."""
     stage_members(folder, scene_index, encode_sample(sample, profile) if sample else {}, failures)
+
+
+def moved(scene: Scene, rotation: NDArray[np.float64], translation: ArrayLike) -> Scene:
+    """Return the scene, its sky and its cameras after the rigid motion x -> R x + t.
+
+    Sums are taken in float64 and rounded once.
+
+    Args:
+        scene: what is moved.
+        rotation: [3, 3] R.
+        translation: [3] t, world units.
+    """
+    shift = np.asarray(translation, np.float64)
+    pose = scene.c2w.astype(np.float64)
+    pose[:, :3] = np.einsum("ij,cjk->cik", rotation, pose[:, :3])
+    pose[:, :3, 3] += shift
+    positions = np.einsum("ij,vj->vi", rotation, scene.vertex_positions.astype(np.float64)) + shift
+    normals = np.einsum("ij,vj->vi", rotation, scene.vertex_normals.astype(np.float64))
+    sky = scene.environment
+    if sky is not None:
+        sky = dataclasses.replace(sky, rotation=(rotation @ sky.rotation).astype(np.float32))
+    return dataclasses.replace(
+        scene,
+        environment=sky,
+        vertex_positions=positions.astype(np.float32),
+        vertex_normals=normals.astype(np.float32),
+        c2w=pose.astype(np.float32),
+    )
+
+
+def mirrored(scene: Scene) -> Scene:
+    """Return the scene with x negated, its triangles' second and third corners exchanged."""
+    flip = np.array([-1, 1, 1], np.float32)
+    poses = scene.c2w.copy()
+    poses[:, :3] *= flip[:, None]
+    poses[:, :3, 0] *= -1  # a camera stays right-handed: its own x points to the other side
+    return dataclasses.replace(
+        scene,
+        vertex_positions=scene.vertex_positions * flip,
+        vertex_normals=scene.vertex_normals * flip,
+        faces=scene.faces[:, [0, 2, 1]],
+        c2w=poses,
+    )

@@ -42,8 +42,7 @@ from storage.seeds import SceneKey
 from storage.settings.fields import FieldDescription
 from storage.settings.overrides import apply_overrides
 from tests.extremes.test_ranges import FIELDS, SMOKE, End
-from tests.extremes.test_renders import FLOOR, LAMP
-from tests.extremes.test_scenes import require_laws
+from tests.extremes.test_scenes import FLOOR, LAMP, require_laws
 from tests.for_each import case, for_each
 from tests.model.kit import (
     FAMILIES,
@@ -143,9 +142,6 @@ def _require_scene_or_reason(
             require_laws(scene, wanted)
 
 
-SCENE_REASONS = ("no_room", "over_budget", "no_faces", "no_camera", "emitter_inside")
-"""Why a room may not be possible."""
-
 CHEAP = [
     name for name, _ in SCENE_FIELDS
     if name not in ("num_views", "fill_to", "views.coverage_grid", "lights.count")
@@ -167,7 +163,8 @@ def test_scenes_at_several_ends_keep_their_laws_or_have_a_reason(
     try:
         require_laws(composed(wanted, pool, SceneKey(0, 0)), wanted)
     except Rejected as rejection:
-        assert rejection.reason in SCENE_REASONS, rejection
+        possible = ("no_room", "over_budget", "no_faces", "no_camera", "emitter_inside")
+        assert rejection.reason in possible, rejection
 
 
 RENDER = view_settings(8, resolution=8, noise_floor_db=1.0, aux_spp=4, min_mean_radiance=0.0)
@@ -277,16 +274,14 @@ def test_weights_stay_finite_at_the_ends_of_training(changes: dict[str, Any]) ->
     assert same == (run.learning_rate < 1e-300)
 
 
-STRONGEST = AugmentationSettings(
-    rotation="uniform", translation=100.0, mirror=True, channels=True, vertex_order=True,
-    light_scale=1000.0,
-)  # fmt: skip
-
-
 def test_the_strongest_augmentation_leaves_scenes_finite() -> None:
+    strongest = AugmentationSettings(
+        rotation="uniform", translation=100.0, mirror=True, channels=True, vertex_order=True,
+        light_scale=1000.0,
+    )  # fmt: skip
     scene = training_scene(toy_sample(0), 16)
     for seed in range(20):
-        shown = augment_scene(scene, STRONGEST, np.random.default_rng(seed))
+        shown = augment_scene(scene, strongest, np.random.default_rng(seed))
         assert torch.isfinite(shown.target_VRR3).all()
         for tensor in tensors_of(shown.tensors).values():
             assert torch.isfinite(tensor).all()
@@ -322,10 +317,7 @@ def batch() -> TrainingBatch:
     return collate_batch([training_scene(toy_sample(index), 16) for index in range(2)])
 
 
-RUNS = [*(tiny_run(loss=terms) for terms in TERMS), tiny_run(precision="bfloat16")]
-
-
-@for_each("run", RUNS)
+@for_each("run", [*(tiny_run(loss=terms) for terms in TERMS), tiny_run(precision="bfloat16")])
 def test_every_target_that_can_be_stored_gives_a_step(run: TrainSettings) -> None:
     usual = batch()
     for target, noise in ((0.0, 0.0), (0.0, 10.0), (1e-7, 1e-5), (BRIGHTEST, 0.0)):
@@ -362,7 +354,6 @@ def test_losses_and_their_gradients_are_finite_wherever_predictions_are(
 
 
 EMISSIONS = [0.0, 1e-6, 1.0, 1e6]
-
 
 WHOLE_NETWORKS = {
     "random": lambda: awake(SIZES["tiny"](), torch.float32),

@@ -48,14 +48,7 @@ from train.settings import TrainSettings, WatchSettings
 
 End = Literal["low", "high"]
 
-ASKED = RenderOptions(
-    source="a.json", out=Path("a.exr"), engine="mitsuba", checkpoint=None, resolution=64,
-    noise_floor_db=40.0, max_spp=64, view=0, orbit=None, arc_deg=360.0, cameras=None, fps=24,
-    tone_map="plain", exposure_ev=0.0, precision="float32", lights_per_pass=8,
-    seed=0, threads=None,
-)  # fmt: skip
 SMOKE = preset_settings("smoke")
-RUN = training_preset("smoke")
 
 FIELDS = [
     (settings, field)
@@ -75,15 +68,19 @@ def _walk_settings(settings: Any) -> Iterator[Any]:
             yield from _walk_settings(value)
 
 
-_PRESETS = (SMOKE, RUN, WatchSettings())
-_FROM_PRESETS = {type(each): each for preset in _PRESETS for each in _walk_settings(preset)}
+_FROM_PRESETS = {
+    type(each): each
+    for preset in (SMOKE, training_preset("smoke"), WatchSettings())
+    for each in _walk_settings(preset)
+}
 _HAND_MADE: tuple[Any, ...] = (
     DatasetInRuns(), ONE_FAMILY_EACH[0], SharedRoom(), SideRanges(),
     dataclasses.replace(SMOKE.scenes.cameras, elevation_deg=(0.0, 60.0)),
     Excursion(axis="fov_deg", value=10.0, changes=()), ListedShard(split="train", scenes=4),
     RevisitOptions(dataset="a", out="b"),
     RevisitSettings(source_digest="", kept_cameras=4, lights="new", num_lights=2),
-    GivenCamera(c2w=(0.0,) * 16, fov_deg=40.0), ASKED, CorePrice(), TrainOptions(),
+    GivenCamera(c2w=(0.0,) * 16, fov_deg=40.0),
+    RenderOptions(source="a.json", out=Path("a.exr")), CorePrice(), TrainOptions(),
     SIZES["tiny"](), EvaluationOptions(checkpoint="a", data=("b",)),
     LeaderboardOptions(source="a", width=(64,)),
 )  # fmt: skip
@@ -110,8 +107,6 @@ BESIDE: dict[tuple[type, str, End], dict[str, Any]] = {
     (MaterialSettings, "roughness_bias", "high"): {"roughness_log": (1.0, 2.0)},
     (RevisitSettings, "kept_cameras", "low"): {"new_cameras": 1},
     (RevisitSettings, "new_cameras", "high"): {"kept_cameras": 0},
-    **{(RenderOptions, name, end): {"noise_floor_db": None}
-       for name in ("seconds", "error_db", "spp") for end in ("low", "high")},
     (RenderSettings, "min_spp", "high"): {"max_spp": MAX_SPP},
     (RenderSettings, "max_spp", "low"): {"min_spp": 8},
     (TrainSettings, "resolution", "low"): {

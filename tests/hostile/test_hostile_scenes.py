@@ -38,7 +38,7 @@ from storage.records.objects import SKY, TEXTURE, read_failures, read_objects_lo
 from storage.records.scene_file import read_scene_file
 from tests.conftest import ROOT
 from tests.for_each import case, with_folders
-from tests.hostile import file_cases, usd_cases
+from tests.hostile import cases
 from tests.pipeline.assets.meshes_by_hand import WRITERS, cube, prepare, write_glb
 from tests.pipeline.assets.source_materials import textured_kit as kit
 from tests.pipeline.assets.source_materials.textured_kit import textured_usd
@@ -48,12 +48,12 @@ from train.folder import read_rows
 from train.loop.checkpoints import read_checkpoint
 
 LIMITS = ChildLimits(memory_bytes=8 << 30, wall_s=300, cpu_s=30, calls_per_child=1000)
-CASES: dict[str, Callable[[], Iterator[tuple[str, usd_cases.Make, str]]]] = {
-    "usd": usd_cases.cases,
-    "json": file_cases.json_cases,
-    "safetensors": file_cases.safetensors_cases,
-    "h5": file_cases.h5_cases,
-    "tar": file_cases.tar_cases,
+CASES: dict[str, Callable[[], Iterator[tuple[str, cases.Make, str]]]] = {
+    "usd": cases.usd_cases,
+    "json": cases.json_cases,
+    "safetensors": cases.safetensors_cases,
+    "h5": cases.h5_cases,
+    "tar": cases.tar_cases,
 }
 FILES = ("s.usda", "s.usdz", "s.json", "s.safetensors", "s.h5", "s.tar")
 
@@ -83,7 +83,7 @@ def outcome(path: str) -> Outcome:
     """Read the first scene of a file; only children come here."""
     source = scene_source(path, many=True)
     if source.path.suffix == ".tar":
-        source = scene_source(f"{path}::{file_cases.KEY}")
+        source = scene_source(f"{path}::{cases.KEY}")
     else:
         source_keys(source)
     found = load_source(source)
@@ -114,8 +114,8 @@ def lay_out(folder: Path) -> Path:
     outside, inner = folder / "outside", folder / "inner"
     outside.mkdir()
     inner.mkdir()
-    (outside / "secret.usda").write_text(usd_cases.SECRET)
-    (outside / "secret.obj").write_text(file_cases.LEAK_OBJ)
+    (outside / "secret.usda").write_text(cases.SECRET)
+    (outside / "secret.obj").write_text(cases.LEAK_OBJ)
     Image.fromarray(np.full((4, 4, 3), 77, np.uint8)).save(outside / "secret.png")
     (outside / "secret.h5").write_bytes(_secret_h5())
     for suffix in ("usda", "obj"):
@@ -125,7 +125,7 @@ def lay_out(folder: Path) -> Path:
 
 
 def read(
-    child: IsolatedChild, folder: Path, make: usd_cases.Make, look: Callable[[str], Outcome]
+    child: IsolatedChild, folder: Path, make: cases.Make, look: Callable[[str], Outcome]
 ) -> tuple[str, Outcome]:
     """Return `read`, `refused` or `ended`, and what came of the file that is made."""
     inner = lay_out(folder)
@@ -175,7 +175,7 @@ def object_outcome(path: str) -> Outcome:
 @pytest.mark.slow("hostile")
 def test_every_object_ends_well(tmp_path: Path, child: IsolatedChild) -> None:
     """The cases are those of scenes; there a missing part is noted, here it refuses the object."""
-    for folder, (name, make, expected) in with_folders(tmp_path, usd_cases.cases()):
+    for folder, (name, make, expected) in with_folders(tmp_path, cases.usd_cases()):
         ended, found = read(child, folder, make, object_outcome)
         assert found.farthest < 700, (name, found)
         if name.startswith("texture ") and expected == "refused":
@@ -305,17 +305,12 @@ READERS: list[Callable[[Path], object]] = [
 ]
 
 
-def _others(folder: Path) -> Iterator[Path]:
-    os.mkfifo(folder / "train-000000.safetensors")
-    yield folder / "train-000000.safetensors"
-    (folder / "train-000001.safetensors").symlink_to("/dev/zero")
-    yield folder / "train-000001.safetensors"
-    (folder / "train-000002.safetensors").mkdir()
-    yield folder / "train-000002.safetensors"
-
-
 def test_what_is_no_plain_file_is_refused_at_once(tmp_path: Path) -> None:
-    for path in _others(tmp_path):
+    pipe, device, folder = (tmp_path / f"train-00000{row}.safetensors" for row in range(3))
+    os.mkfifo(pipe)
+    device.symlink_to("/dev/zero")
+    folder.mkdir()
+    for path in (pipe, device, folder):
         for read in READERS:
             with case((read.__name__, path.name)):
                 signal.alarm(10)  # a pipe would be waited for without end

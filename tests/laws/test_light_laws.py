@@ -21,7 +21,6 @@ from tests.pipeline.renders.sampling import (
     render_blocks,
 )
 from tests.pipeline.renders.scene_kit import (
-    Part,
     box,
     furnace,
     join,
@@ -132,24 +131,24 @@ def test_a_bowl_fills_with_light_bounce_by_bounce(
     itself is 1 - aperture / area everywhere, and the light inside is uniform. With roulette from
     the first edge on, which takes and gives equally, it is as bright as its series says.
     """
-    expected = _bowl_radiance(albedo, bounces)
+    whole = sphere([0, 0, 0], 1.0, material(diffuse=albedo), rings=BOWL_RINGS)
+    below = (whole.triangles[..., 2] < 1e-9).all(axis=1)
+    corners = whole.triangles[below]
+    bowl = dataclasses.replace(whole, triangles=corners, normals=whole.normals[below])
+    cross = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
+    area = 0.5 * np.linalg.norm(cross, axis=1).sum()
+    aperture = BOWL_RINGS * np.sin(np.pi / BOWL_RINGS)  # the rim: a polygon of 2 * rings corners
+    to_itself = 1 - aperture / area
+    series = sum((albedo * to_itself) ** k for k in range(bounces))
+    expected = albedo * (1 - to_itself) * series
     if albedo == 1:
         assert abs(expected - (1 - 0.5**bounces)) < 2e-3  # the mesh is a little off the sphere
-    scene = join([_bowl(albedo), furnace()], eye=(0, 0.01, 2.5), target=(0, 0, -1), fov_deg=16)
+    scene = join([bowl, furnace()], eye=(0, 0.01, 2.5), target=(0, 0, -1), fov_deg=16)
     depths = {"max_depth": bounces + 1, "rr_depth": rr_depth}
     estimate = render_blocks(scene, resolution=16, block=16, passes=16, **depths)
     assert (SIGMAS * estimate.error < 0.02 * estimate.mean).all()  # small enough to tell
     # The facets make the light uneven by some 1e-3.
     assert_agree(estimate, exact(np.full((1, 1, 3), expected)), slack=3e-3)
-
-
-def _bowl_radiance(albedo: float, bounces: int) -> float:
-    corners = _bowl(albedo).triangles
-    cross = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
-    area = 0.5 * np.linalg.norm(cross, axis=1).sum()
-    aperture = BOWL_RINGS * np.sin(np.pi / BOWL_RINGS)  # the rim: a polygon of 2 * rings corners
-    to_itself = 1 - aperture / area
-    return albedo * (1 - to_itself) * sum((albedo * to_itself) ** k for k in range(bounces))
 
 
 def _glossy_room(strength: float) -> Scene:
@@ -158,20 +157,8 @@ def _glossy_room(strength: float) -> Scene:
         quad([[-4, 2, 0], [4, 2, 0], [4, 2, 4], [-4, 2, 4]], material(diffuse=0.8)),
     ]
     lamps = [light(LIGHT, 4 * strength), light(LIGHT + np.array([1, 0, 0.5]), strength)]
-    return join([*walls, _ball(), *lamps], eye=(0, -3, 2))
-
-
-def _ball() -> Part:
     row = material(diffuse=0.2, specular=[0.5, 0.6, 0.7], roughness=0.4)
-    return sphere([0.4, 0.3, 0.3], 0.3, row, rings=8)
-
-
-def _bowl(albedo: float) -> Part:
-    whole = sphere([0, 0, 0], 1.0, material(diffuse=albedo), rings=BOWL_RINGS)
-    below = (whole.triangles[..., 2] < 1e-9).all(axis=1)
-    return dataclasses.replace(
-        whole, triangles=whole.triangles[below], normals=whole.normals[below]
-    )
+    return join([*walls, sphere([0.4, 0.3, 0.3], 0.3, row, rings=8), *lamps], eye=(0, -3, 2))
 
 
 pytestmark = pytest.mark.usefixtures("llvm")

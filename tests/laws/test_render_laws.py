@@ -47,11 +47,9 @@ from tests.pipeline.renders.scene_kit import (
     sphere,
 )
 from tests.pipeline.scenes.small_pool import first_scene, small_pool
-from tests.rigid_motion import moved
+from tests.scenes_by_hand import mirrored, moved
 from tests.sky_maps import night, one_sun, smooth
 from tests.storage.test_optics import slow_albedo
-
-PLATE = [[-1, -1, 0], [1, -1, 0], [1, 1, 0], [-1, 1, 0]]
 
 
 def _albedo(row: NDArray, cos_in: float) -> NDArray[np.float64]:
@@ -65,15 +63,14 @@ def _albedo(row: NDArray, cos_in: float) -> NDArray[np.float64]:
 
 def _furnace_plate(row: NDArray, cos_view: float) -> Scene:
     eye = 3 * np.array([0.0, -np.sqrt(1 - cos_view**2), cos_view])
-    return join([quad(PLATE, row), furnace()], eye=eye, fov_deg=0.5)
+    plate = quad([[-1, -1, 0], [1, -1, 0], [1, 1, 0], [-1, 1, 0]], row)
+    return join([plate, furnace()], eye=eye, fov_deg=0.5)
 
 
 @pytest.mark.parametrize(
     ("roughness", "cos_view"), [(0.01, 0.3), (0.1, 0.95), (0.4, 0.3), (1.0, 0.95), (1.0, 0.3)]
 )
-def test_a_plate_in_a_furnace_returns_the_directional_albedo(
-    roughness: float, cos_view: float
-) -> None:
+def test_a_plate_in_a_furnace_returns_directional_albedo(roughness: float, cos_view: float) -> None:
     """Each channel of a coloured mirror loses its own share at every further reflection."""
     row = material(diffuse=[0.2, 0, 0.1], specular=[0.75, 1.0, 0.1], roughness=roughness)
     expected = _albedo(row, cos_view)
@@ -199,16 +196,14 @@ def test_single_scattering_would_lose_most_of_it(monkeypatch: pytest.MonkeyPatch
     assert _mean_radiance_of_a_ball() == pytest.approx(0.409, abs=0.004)
 
 
-SETTINGS = SceneSettings(families=DEFAULT_FAMILIES, num_views=1)
-
-
-def _scene(scene_index: int) -> Scene:
-    return first_scene(SETTINGS, small_pool(), seed=11, scene_index=scene_index)
+def _scene() -> Scene:
+    settings = SceneSettings(families=DEFAULT_FAMILIES, num_views=1)
+    return first_scene(settings, small_pool(), seed=11, scene_index=0)
 
 
 @pytest.mark.parametrize(
     "made",
-    [lambda: _scene(0), lambda: open_scene(one_sun(3e3)), bumpy_room],
+    [_scene, lambda: open_scene(one_sun(3e3)), bumpy_room],
     ids=["composed", "sky", "normal map"],
 )
 def test_rendering_commutes_with_motion(made: Callable[[], Scene]) -> None:
@@ -220,23 +215,13 @@ def test_rendering_commutes_with_motion(made: Callable[[], Scene]) -> None:
 
 
 def test_rendering_commutes_with_a_mirror_and_with_an_exchange_of_channels() -> None:
-    scene, flip, order = _scene(0), np.diag([-1.0, 1.0, 1.0]), np.array([2, 0, 1])
-    pose = scene.c2w.copy()
-    pose[:, :3, :3] = flip @ pose[:, :3, :3] @ flip
-    pose[:, 0, 3] *= -1
-    mirrored = dataclasses.replace(
-        scene,
-        vertex_positions=(scene.vertex_positions @ flip).astype(np.float32),
-        vertex_normals=(scene.vertex_normals @ flip).astype(np.float32),
-        faces=scene.faces[:, [0, 2, 1]],
-        c2w=pose,
-    )
+    scene, order = _scene(), np.array([2, 0, 1])
     recoloured = scene.materials.copy()
     for part in (DIFFUSE, SPECULAR, EMISSION):
         recoloured[:, part] = recoloured[:, part][:, order]
     here = render_blocks(scene, first_seed=99, passes=8)
     for other, seen in (
-        (mirrored, np.s_[:, ::-1]),
+        (mirrored(scene), np.s_[:, ::-1]),
         (dataclasses.replace(scene, materials=recoloured), np.s_[..., np.argsort(order)]),
     ):
         other.check()
@@ -248,7 +233,7 @@ def test_rendering_commutes_with_a_mirror_and_with_an_exchange_of_channels() -> 
 
 
 def test_what_a_camera_sees_commutes_with_motion() -> None:
-    scene = _scene(0)
+    scene = _scene()
     there = moved(scene, uniform_rotation(np.random.default_rng(5)), [1.0, 2.0, -3.0])
     before, after = (Visibility(s).facts(s.c2w[0], float(s.fov_deg[0]), 64) for s in (scene, there))
     # 4096 rays: a few graze an edge and fall on the other side after rounding.

@@ -2,9 +2,10 @@
 
 2000 layouts per setting with balls for objects. See `statistics` for the line that is drawn. The
 stated numbers are written here once more, from what the default settings promise, and not read from
-the settings that are under test; those of the published families are pinned (`published`). Places
-(rooms, resting objects, lights, cameras) are also drawn each by itself, since in a whole scene one
-hides the other; so are the paths of cameras, and how evenly their views stand.
+the settings that are under test; those of the published recipes are pinned by the digests of their
+presets (tests/pipeline/presets/test_registry.py). Places (rooms, resting objects, lights, cameras)
+are also drawn each by itself, since in a whole scene one hides the other; so are the paths of
+cameras, and how evenly their views stand.
 """
 
 import dataclasses
@@ -19,6 +20,7 @@ from numpy.typing import NDArray
 from scipy import stats
 
 from pipeline.presets.registry import preset_settings
+from scene_templates.checks import Range
 from scene_templates.families import FAMILIES, Family
 from scene_templates.layout import Emitter, SurfaceLook
 from scene_templates.renderformer_v1 import Policy, stage_1_families, stage_2_families
@@ -39,7 +41,6 @@ from storage.settings.described import from_record, settings_record
 from storage.settings.overrides import apply_overrides
 from tests.for_each import case, for_each
 from tests.scene_templates.balls import MANY, Drawn, drawn, template_settings
-from tests.scene_templates.published import DEFAULT, STAGE_1, STAGE_2, Row
 from tests.scene_templates.statistics import (
     Table,
     alike,
@@ -50,6 +51,31 @@ from tests.scene_templates.statistics import (
     share,
     uniform,
 )
+
+Row = tuple[str, float, tuple[int, int], Range, float]
+"""Name, weight, fewest and most objects, diameter of their spheres before halving, smooth share."""
+
+
+def _rows(families: Iterable[Family]) -> tuple[Row, ...]:
+    return tuple(
+        (one.name, one.weight, one.num_objects, one.object_scale, one.smooth_share)
+        for one in families
+    )
+
+
+STAGE_1 = _rows(stage_1_families("de-biased"))
+STAGE_2 = _rows(stage_2_families("de-biased"))
+
+DEFAULT: tuple[Row, ...] = tuple(
+    row
+    for name in ("plane", "wall", "corner", "open_box")
+    for row in (
+        (f"{name}-single", 1.0, (1, 1), (1.2, 2.2), 0.5),
+        (f"{name}-multi", 2.0, (2, 3), (0.8, 1.8), 0.5),
+    )
+)
+"""Our own families: each layout and each number of objects from 1 to 3 equally often."""
+
 
 ROUGH_LOW, ROUGH_HIGH, ROUGH_BIAS = 0.06, 1.055, 0.05
 """exp(U(ln 0.06, ln 1.055)) - 0.05, clipped to at most 1."""
@@ -367,19 +393,13 @@ def test_a_single_object_is_placed_evenly_and_rests_half_the_time() -> None:
     require_plausible(table)
 
 
-def _off_deg(directions: NDArray[np.float64], sector: Sector) -> NDArray[np.float64]:
-    """Angle of the azimuth of each direction from the middle of a sector."""
-    azimuth_deg = np.degrees(np.arctan2(directions[:, 1], directions[:, 0]))
-    return np.asarray((azimuth_deg - sector.azimuth_deg + 180) % 360 - 180)
-
-
 def _sector_table(directions: NDArray[np.float64], sector: Sector) -> Table:
     low, high = (math.sin(math.radians(angle)) for angle in sector.elevation_deg)
+    azimuth_deg = np.degrees(np.arctan2(directions[:, 1], directions[:, 0]))
+    off_deg = (azimuth_deg - sector.azimuth_deg + 180) % 360 - 180
     return {
         "elevation": uniform(directions[:, 2], low, high),
-        "azimuth": uniform(
-            _off_deg(directions, sector), -sector.half_width_deg, sector.half_width_deg
-        ),
+        "azimuth": uniform(off_deg, -sector.half_width_deg, sector.half_width_deg),
     }
 
 
@@ -413,12 +433,15 @@ def _camera_table(sector: Sector, **changes: object) -> Table:
     poses = _cameras(sector, **changes)
     backward = np.stack([c2w[:3, 2] for c2w, _ in poses])
     roll = [_roll(c2w[:3, 1], c2w[:3, 2]) for c2w, _ in poses]
+    rng = np.random.default_rng(1)
+    leans = np.array([0, 0, 1]) + rng.uniform(-0.1, 0.1, size=(2 * COUNT, 3))
+    twin = [_roll(up, sector.sample_direction(rng)) for up in leans]
     still = _cameras(sector, **{**changes, "target_jitter": 0.0})
     near = _cameras(sector, **{**changes, "distance": (1e-3, 1e-3)})
     table = {
         "fov": uniform([fov_deg for _, fov_deg in poses], 30, 60),
         "distance": uniform([np.linalg.norm(c2w[:3, 3]) for c2w, _ in still], 1.5, 2.0),
-        "roll": alike(roll, _roll_twin(sector)),
+        "roll": alike(roll, twin),
         **_sector_table(backward, sector),
     }
     for axis in range(3):
@@ -431,14 +454,6 @@ def _roll(up: NDArray[np.float64], backward: NDArray[np.float64]) -> float:
     """Angle by which a picture's up leans from the one that +Z gives."""
     right = np.array([-backward[1], backward[0], 0.0])
     return math.atan2(float(up @ right), float(up @ np.cross(backward, right)))
-
-
-def _roll_twin(sector: Sector) -> list[float]:
-    rng = np.random.default_rng(1)
-    return [
-        _roll(np.array([0, 0, 1]) + rng.uniform(-0.1, 0.1, size=3), sector.sample_direction(rng))
-        for _ in range(2 * COUNT)
-    ]
 
 
 def test_cameras_are_drawn_as_stated_and_wrong_ones_are_noticed() -> None:

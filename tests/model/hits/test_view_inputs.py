@@ -25,7 +25,7 @@ from tests.for_each import for_each
 from tests.model.hits.kit import FLOOR, LAMP, corner, direct, textured, traced
 from tests.model.kit import awake, hits_config
 from tests.pipeline.renders.scene_kit import box, join, light, material, quad, sphere
-from tests.rigid_motion import moved
+from tests.scenes_by_hand import moved
 
 LIGHTS = slice(Channel.OPEN_DIFFUSE.start, Channel.MIRRORED.stop)
 

@@ -56,7 +56,7 @@ from tests.pipeline.renders.scene_kit import (
     textured,
     textured_floor,
 )
-from tests.rigid_motion import moved
+from tests.scenes_by_hand import moved
 from tests.sky_maps import as_sky, constant, night, one_sun, six_poles, smooth
 from tests.textured_by_hand import bumps
 from trilight import render

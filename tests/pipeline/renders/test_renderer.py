@@ -191,7 +191,7 @@ def test_the_measured_floor_is_below_the_true_agreement_here() -> None:
 
 
 def test_a_camera_that_looks_away_and_a_lamp_of_no_triangles_are_rejected() -> None:
-    """What else cannot be lit or held is in tests/extremes/test_renders.py."""
+    """What else cannot be lit or held is in tests/extremes/test_scenes.py."""
     away = look_at_c2w(eye=[0, -3, 2], target=[0, -9, 4], up=[0, 0, 1])
     with pytest.raises(Rejected, match="black_view"):
         SceneRenderer(simple_scene(), CHEAP).render_view(away, 40.0, seed=0)

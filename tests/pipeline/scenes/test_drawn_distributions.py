@@ -30,7 +30,6 @@ from tests.pipeline.scenes.small_pool import (
     rows_of,
     triangles_of,
 )
-from tests.scene_templates.published import DEFAULT, STAGE_1
 from tests.scene_templates.statistics import (
     choices,
     implausible,
@@ -38,6 +37,7 @@ from tests.scene_templates.statistics import (
     share,
     uniform,
 )
+from tests.scene_templates.test_distributions import DEFAULT, STAGE_1
 
 
 def _composed_table(

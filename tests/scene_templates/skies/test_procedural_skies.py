@@ -42,8 +42,6 @@ from tests.scene_templates.statistics import (
     with_draws,
 )
 
-MANY = 60
-
 
 def _with_draws(family: str, seed: int, **changes: Any) -> tuple[NDArray, Mapping[str, Any]]:
     settings = apply_overrides(SkyMapSettings(families=(family,), height=32), changes)
@@ -68,7 +66,7 @@ def test_parameters_are_distributed_as_stated(family: str) -> None:
         return draws
 
     for coloured_share in (0.0, 1.0):
-        found = merged(made(seed, coloured_share).made for seed in range(MANY))
+        found = merged(made(seed, coloured_share).made for seed in range(60))
         assert len(found) >= 2
         require_plausible(stated_table(found))
 

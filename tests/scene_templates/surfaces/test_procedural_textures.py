@@ -43,7 +43,6 @@ from tests.scene_templates.statistics import (
     with_draws,
 )
 
-MANY = 100
 ALBEDO = (0.02, 0.9)
 
 
@@ -67,7 +66,7 @@ def test_parameters_are_distributed_as_stated(family: str) -> None:
         return draws
 
     for natural_share in (0.0, 1.0):
-        found = merged(made(seed, natural_share).made for seed in range(MANY))
+        found = merged(made(seed, natural_share).made for seed in range(100))
         assert len(found) >= 7
         require_plausible(stated_table(found))
 

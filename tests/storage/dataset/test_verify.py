@@ -177,15 +177,15 @@ def test_every_flipped_bit_beside_the_shards_is_found(tmp_path: Path) -> None:
     assert verify_dataset(tmp_path).problems == ["README.md: missing"]
 
 
-LIES: dict[str, Callable[[dict[str, Any]], object]] = {
-    "dataset_digest is 0+; its shards": lambda record: record.update(dataset_digest="0" * 64),
-    "settings have": lambda record: record["settings"].update(seed=999),
-    "totals are .*samples=7": lambda record: record["totals"].update(samples=7),
-    "is listed 2 times": lambda record: record["shards"].append(record["shards"][0]),
-}
-
-
-@for_each("fault, lie", LIES.items())
+@for_each(
+    ("fault", "lie"),
+    [
+        ("dataset_digest is 0+; its shards", lambda record: record.update(dataset_digest="0" * 64)),
+        ("settings have", lambda record: record["settings"].update(seed=999)),
+        ("totals are .*samples=7", lambda record: record["totals"].update(samples=7)),
+        ("is listed 2 times", lambda record: record["shards"].append(record["shards"][0])),
+    ],
+)
 def test_a_manifest_that_contradicts_itself_is_a_fault(
     tmp_path: Path, fault: str, lie: Callable[[dict[str, Any]], object]
 ) -> None:

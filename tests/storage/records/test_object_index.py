@@ -20,6 +20,7 @@ from storage.licences import (
 from storage.records.object_index import ObjectIndex, write_object_index
 from storage.records.objects import LockedObject, LockRows, write_objects_lock
 from tests.for_each import for_each
+from tests.pipeline.documents.dataset_by_hand import locked
 
 LICENCES = ("CC0-1.0", "CC-BY-SA-4.0", "MIT", "CC-BY-SA-3.0")
 SPLITS = ("train", "test", "train", "validation", "train")
@@ -31,15 +32,12 @@ def _rows(count: int) -> list[LockedObject]:
         f"{chr(int(rng.integers(33, 0x3000)))}/{int(rng.integers(10**6))}" for _ in range(count)
     }
     return [
-        LockedObject(
-            uid=uid,
-            asset_sha256=f"{number:064x}",
+        locked(
+            uid,
+            LICENCES[number % 4],
             split=SPLITS[number % 5],
-            licence=LICENCES[number % 4],
-            licence_source="tests",
             title="long " * int(rng.integers(900 if number % 17 == 0 else 3)),
             attribution='"\n\\',
-            source_url="",
         )
         for number, uid in enumerate(sorted(uids))
     ]

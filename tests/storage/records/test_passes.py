@@ -34,20 +34,14 @@ from storage.records.scene import Scene
 from tests.columns_kit import COAT, WAVES, declared
 from tests.for_each import for_each
 from tests.pipeline.renders.scene_kit import join, light, material, quad, sampled_like_scene
-from tests.scenes_by_hand import FLOOR, tiny_sample, tiny_scene
-from tests.storage.records.test_parts import faults
+from tests.scenes_by_hand import FLOOR, from_above, mirrored, tiny_sample, tiny_scene
+from tests.storage.records.test_sample import faults
 from tests.textured_by_hand import sky, textured_scene
 
 
 def room(seed: int = 0, num_views: int = 2) -> Scene:
     """Return shell, objects with curved and flat faces, and lights, in a view with empty pixels."""
     return sampled_like_scene(np.random.default_rng(seed), num_views=num_views)
-
-
-def from_above(height: float = 1.0, fov_deg: float = 90.0) -> Scene:
-    """Return the floor of the tiny scene, seen straight from above, +Y at the picture's top."""
-    pose = look_at_c2w(eye=[0, 0, height], target=[0, 0, 0], up=[0, 1, 0])[None]
-    return tiny_scene(c2w=pose.astype(np.float32), fov_deg=np.array([fov_deg], np.float32))
 
 
 EXACT = 1e-9
@@ -99,7 +93,7 @@ def test_the_axes_of_the_camera() -> None:
 
 def test_a_mirrored_scene_has_mirrored_passes() -> None:
     scene, resolution = room(0), 40
-    before, after = (view_passes(each, resolution=resolution) for each in (scene, _mirrored(scene)))
+    before, after = (view_passes(each, resolution=resolution) for each in (scene, mirrored(scene)))
     back = {name: picture[:, ::-1] for name, picture in after.items()}
     # rays along a rim may fall to either triangle
     same = (before["triangle"] == back["triangle"]) & (before["hit"] == back["hit"])
@@ -114,21 +108,6 @@ def test_a_mirrored_scene_has_mirrored_passes() -> None:
         np.testing.assert_allclose(
             before[name][same], (back[name] * signs)[same], atol=1e-4, err_msg=name
         )
-
-
-def _mirrored(scene: Scene) -> Scene:
-    """Return the scene with x negated, its triangles' second and third corners exchanged."""
-    flip = np.array([-1, 1, 1], np.float32)
-    poses = scene.c2w.copy()
-    poses[:, :3] *= flip[:, None]
-    poses[:, :3, 0] *= -1  # a camera stays right-handed: its own x points to the other side
-    return dataclasses.replace(
-        scene,
-        vertex_positions=scene.vertex_positions * flip,
-        vertex_normals=scene.vertex_normals * flip,
-        faces=scene.faces[:, [0, 2, 1]],
-        c2w=poses,
-    )
 
 
 @for_each("a_side", [2, 3])
@@ -157,7 +136,7 @@ def test_blocks_of_rows_join_to_the_same_picture(
                     np.testing.assert_array_equal(whole[each.name], centre[each.name])
 
 
-def test_what_is_asked_for_comes_as_it_is_declared() -> None:
+def test_what_is_asked_for_comes_as_it_is_declared_and_no_two_share_a_channel() -> None:
     seen = view_passes(textured_scene(), resolution=6, then_view=1)
     assert list(seen) == [each.name for each in declared_passes()]
     for each in declared_passes():
@@ -168,6 +147,10 @@ def test_what_is_asked_for_comes_as_it_is_declared() -> None:
     assert "motion_px" not in view_passes(room(0), resolution=6)
     assert list(view_passes(room(0), ["hit", "object"], resolution=6)) == ["hit", "object"]
     assert len({each.name for each in PASSES}) == len(PASSES)
+    channels = [channel for each in declared_passes() for channel in each.exr_channels]
+    assert len(channels) == len(set(channels))
+    for channel in channels:  # Blender and Nuke skip channels with longer names
+        assert len(channel.rpartition(".")[2]) == 1, channel
 
 
 def test_nothing_is_seen() -> None:
@@ -251,7 +234,7 @@ def test_a_camera_and_a_floor_that_step_aside_in_closed_form() -> None:
 
     Points are followed by their triangles: a floor that slides by 0.5 m moves by 4.
     """
-    scene = from_above(height=1, fov_deg=90)
+    scene = from_above()
     poses = np.concatenate([scene.c2w, scene.c2w])
     poses[1, :3, 3] += [0.25, 0.125, 0]  # right and up in the picture
     both = scene.with_cameras(poses, np.array([90, 90], np.float32))
@@ -264,6 +247,11 @@ def test_a_camera_and_a_floor_that_step_aside_in_closed_form() -> None:
     later = dataclasses.replace(scene, vertex_positions=moved)
     slid = view_passes(scene, ["motion_px"], resolution=16, then=later)["motion_px"]
     np.testing.assert_allclose(slid, np.broadcast_to([4.0, 0.0], (16, 16, 2)), atol=1e-6)
+    # what is behind the other camera does not move
+    up = look_at_c2w(eye=[0, 0, 1], target=[0, 0, 2], up=[0, 1, 0])[None].astype(np.float32)
+    later = scene.with_cameras(up, scene.fov_deg)
+    seen = view_passes(scene, resolution=4, rays_a_side=2, then=later)
+    assert seen["hit"].all() and np.isnan(seen["motion_px"]).all()
 
 
 def test_it_is_the_difference_of_projections() -> None:
@@ -274,14 +262,6 @@ def test_it_is_the_difference_of_projections() -> None:
         for view in (0, 1)
     )
     np.testing.assert_allclose(seen["motion_px"], then - now, atol=1e-6)
-
-
-def test_what_is_behind_the_other_camera_does_not_move() -> None:
-    scene = from_above()
-    up = look_at_c2w(eye=[0, 0, 1], target=[0, 0, 2], up=[0, 1, 0])[None].astype(np.float32)
-    later = scene.with_cameras(up, scene.fov_deg)
-    seen = view_passes(scene, resolution=4, rays_a_side=2, then=later)
-    assert seen["hit"].all() and np.isnan(seen["motion_px"]).all()
 
 
 def test_other_triangles_are_refused() -> None:
@@ -370,13 +350,6 @@ def test_the_names_and_values_that_other_programs_read() -> None:
         assert (channels[name][missed] == 0).all()
 
 
-def test_no_two_passes_share_a_channel() -> None:
-    channels = [channel for each in declared_passes() for channel in each.exr_channels]
-    assert len(channels) == len(set(channels))
-    for channel in channels:  # Blender and Nuke skip channels with longer names
-        assert len(channel.rpartition(".")[2]) == 1, channel
-
-
 def test_words_mean_passes() -> None:
     assert pass_names(["normal", "depth", "depth_axis_m"]) == ("depth_axis_m", "shading_normal")
     assert pass_names(["roughness"]) == ("material_roughness",)
@@ -420,7 +393,6 @@ def test_verify_compares_with_the_scene() -> None:
 
 
 RESOLUTION = 24
-COLUMNS = ("material_diffuse", "material_specular", "material_roughness", "material_emission")
 
 
 @for_each("view", [0, 1])
@@ -440,7 +412,8 @@ def test_coordinates_and_columns_are_those_of_the_point(view: int) -> None:
     np.testing.assert_array_equal(seen["material_roughness"][met], roughness[:, 0].astype("f4"))
     specular = np.broadcast_to(scene.materials[FLOOR, 3:6], diffuse.shape)
     np.testing.assert_array_equal(seen["material_specular"][met], specular)
-    assert all(np.isnan(seen[name][~met]).all() for name in COLUMNS)
+    for column in ("diffuse", "specular", "roughness", "emission"):
+        assert np.isnan(seen[f"material_{column}"][~met]).all()
     assert np.ptp(diffuse, axis=0).min() > 0.1  # it is a texture that was looked up
 
 

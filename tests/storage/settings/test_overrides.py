@@ -132,13 +132,10 @@ def test_values_come_as_json_has_them() -> None:
 
 
 def test_one_entry_of_a_list_and_whole_groups_may_be_named() -> None:
-    assert [b.height for b in apply_overrides(TREE, {"branches.1.height": 3}).branches] == [
-        2.0,
-        3.0,
-    ]
-    assert apply_overrides(TREE, {"branches.0.leaves.1.pair": [0, 2]}).branches[0].leaves[
-        1
-    ].pair == (0, 2)
+    raised = apply_overrides(TREE, {"branches.1.height": 3})
+    assert [branch.height for branch in raised.branches] == [2.0, 3.0]
+    paired = apply_overrides(TREE, {"branches.0.leaves.1.pair": [0, 2]})
+    assert paired.branches[0].leaves[1].pair == (0, 2)
     after = apply_overrides(TREE, {"branches": [{"height": 9}], "branches.0.leaf.count": 4})
     assert after.branches == (Branch(height=9.0, leaf=Leaf(count=4)),)
     assert apply_overrides(TREE, {"branch": {"height": 1}}).branch == Branch(height=1.0)

@@ -14,7 +14,7 @@ from pipeline.foreign.usd.stage import OpenedStage, read_quietly
 from pipeline.foreign.usd.texture_nodes import asset_bytes
 from storage.errors import TrilightError
 from tests.for_each import for_each
-from tests.hostile.usd_cases import HEAD, chain, paired_arcs
+from tests.hostile.cases import HEAD, chain, paired_arcs
 from tests.scenes_by_hand import tiny_scene
 
 
