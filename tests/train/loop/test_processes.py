@@ -78,17 +78,8 @@ def run(dataset: Dataset, out: Path, processes: int, *rest: str, **changes: obje
     return out
 
 
-def weights(out: Path) -> dict[str, np.ndarray]:
-    return load_file(out / "checkpoints/step-000000008.safetensors")
-
-
-@pytest.fixture(scope="module")
-def alone(dataset: Dataset, tmp_path_factory: pytest.TempPathFactory) -> Path:
-    return run(dataset, tmp_path_factory.mktemp("alone"), 1)
-
-
 def same_to_rounding(ours: Path, theirs: Path) -> None:
-    a, b = weights(ours), weights(theirs)
+    a, b = (load_file(out / "checkpoints/step-000000008.safetensors") for out in (ours, theirs))
     assert a.keys() == b.keys()
     one = np.concatenate([a[name].ravel() for name in sorted(a)])
     other = np.concatenate([b[name].ravel() for name in sorted(a)])
@@ -112,19 +103,17 @@ def curve(out: Path) -> list[dict]:
     return [{name: row[name] for name in CURVE if name in row} for row in rows]
 
 
-def test_several_processes_train_as_one(dataset: Dataset, alone: Path, tmp_path: Path) -> None:
+def test_several_processes_and_passes_that_add_up_train_as_one_batch_of_one(
+    dataset: Dataset, tmp_path: Path
+) -> None:
+    alone = run(dataset, tmp_path / "alone", 1)
+    same_to_rounding(run(dataset, tmp_path / "passes", 1, scenes_per_pass=1), alone)
     several = run(dataset, tmp_path / "several", 2)
     same_to_rounding(several, alone)
     settings = json.loads((several / "settings.json").read_text())
     assert settings["processes"] == 2
     rows = [row["step"] for row in read_rows(several / "metrics.jsonl") if "loss" in row]
     assert rows == [2, 4, 6, 8], "one process writes"
-
-
-def test_passes_that_add_up_train_as_one_batch(
-    dataset: Dataset, alone: Path, tmp_path: Path
-) -> None:
-    same_to_rounding(run(dataset, tmp_path / "passes", 1, scenes_per_pass=1), alone)
 
 
 LONGER = {"num_steps": 60, "validate_every": 20, "checkpoint_every": 20, "muon_rate": 3.0}
