@@ -11,7 +11,7 @@ import torch
 from torch import Tensor
 
 from model.config import ModelConfig
-from model.open import path_of_step
+from model.open import path_of_step, saved_steps
 from model.renderformer import RenderFormer
 from model.scene_tensors import SceneTensors
 from storage.dataset.dataset import Dataset
@@ -23,6 +23,7 @@ from train.data.loader import load_batches
 from train.data.order import RankSlice
 from train.data.scenes import TrainingScene, training_scene
 from train.evaluation.evaluate import EvalConfig
+from train.folder import read_rows
 from train.loop.distributed import DistributedContext
 from train.loop.step import Stepper, StepReport
 from train.loop.train_state import TrainState, new_state
@@ -109,6 +110,25 @@ def trained(
     result = run_training(settings, data=places, out=out, start=start, **rest)
     assert result is not None
     return result
+
+
+TIMINGS = {"views_per_s", "data_wait_share", "flops_per_s", "peak_share", "time_s", "memory_mb"}
+TIMINGS |= {"own_s"}
+
+
+def require_same_run(out: Path, whole: Path) -> None:
+    """Compare what two finished runs of one training have written, but for clocks and memory."""
+    last = path_of_step(Path("checkpoints"), saved_steps(whole / "checkpoints")[-1])
+    for name in ("model.safetensors", last, "validation_sheet.png"):
+        assert (out / name).read_bytes() == (whole / name).read_bytes(), name
+    ours, theirs = (
+        [
+            {name: value for name, value in row.items() if name not in TIMINGS}
+            for row in read_rows(folder / "metrics.jsonl")
+        ]
+        for folder in (out, whole)
+    )
+    assert ours == theirs
 
 
 def apart(one: dict[str, Tensor], other: dict[str, Tensor]) -> float:

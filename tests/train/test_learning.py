@@ -11,8 +11,6 @@ in a process of their own.
 
 import dataclasses
 import json
-from collections.abc import Iterator
-from concurrent.futures import ProcessPoolExecutor
 from pathlib import Path
 from typing import Any
 
@@ -32,7 +30,7 @@ from storage.metrics import psnr_log_db
 from storage.records.retextured import with_textures
 from storage.records.scene import Scene
 from storage.records.texture import Texture
-from tests.for_each import for_each
+from tests.for_each import case
 from tests.model.kit import hits_config, tiny_config
 from tests.sky_maps import smooth
 from tests.train.fake_card import CARD, card_process, fake_card
@@ -203,42 +201,19 @@ def test_a_run_that_is_told_hits_below_skies_resumes_to_the_bit_and_one_that_is_
     assert not list((tmp_path / "run").glob("checkpoints/*"))
 
 
-@pytest.fixture(scope="module")
-def card(tmp_path_factory: pytest.TempPathFactory) -> Iterator[ProcessPoolExecutor]:
-    """A process with a card that is not there."""
-    with card_process(tmp_path_factory.mktemp("card")) as process:
-        yield process
-
-
-@pytest.fixture(scope="module")
-def data(tmp_path_factory: pytest.TempPathFactory) -> str:
-    folder = tmp_path_factory.mktemp("toy")
-    write_toy_dataset(folder, train=2, validation=2, resolution=RESOLUTION)
-    return str(folder)
-
-
-@pytest.fixture(scope="module")
-def lpips(tmp_path_factory: pytest.TempPathFactory) -> str:
-    """A folder of files like the published ones, with few channels."""
-    folder = tmp_path_factory.mktemp("lpips")
-    for name, weights in zip((VGG16_FILE, LINEAR_FILE), small_weights(), strict=True):
-        torch.save(weights, folder / name)
-    return str(folder)
-
-
 @pytest.mark.slow("gpu")  # a process and a library of its own
-@for_each(("run", "size"), [("pretrain", "smoke"), ("hits", "hits-smoke")])
-def test_each_view_stage_takes_its_step_on_a_card(
-    run: str, size: str, card: ProcessPoolExecutor, data: str, lpips: str, tmp_path: Path
-) -> None:
-    card.submit(train_and_judge, run, size, data, lpips, tmp_path).result()
-
-
-@pytest.mark.slow("gpu")
-def test_a_run_goes_on_and_a_second_one_begins_on_a_card(
-    card: ProcessPoolExecutor, data: str, lpips: str, tmp_path: Path
-) -> None:
-    card.submit(resume, data, lpips, tmp_path).result()
+def test_each_view_stage_takes_its_step_on_a_card_where_a_run_goes_on(tmp_path: Path) -> None:
+    """And a second one begins; LPIPS by files like the published ones, with few channels."""
+    data = str(tmp_path / "data")
+    write_toy_dataset(tmp_path / "data", train=2, validation=2, resolution=RESOLUTION)
+    lpips = str(tmp_path)
+    for name, weights in zip((VGG16_FILE, LINEAR_FILE), small_weights(), strict=True):
+        torch.save(weights, tmp_path / name)
+    with card_process(tmp_path) as card:
+        for run, size in (("pretrain", "smoke"), ("hits", "hits-smoke")):
+            with case(run):
+                card.submit(train_and_judge, run, size, data, lpips, tmp_path / run).result()
+        card.submit(resume, data, lpips, tmp_path).result()
 
 
 RESOLUTION = 64

@@ -30,7 +30,16 @@ from storage.remote import retries
 from tests.command_line import expect_output
 from tests.for_each import for_each
 from tests.http_server import Fault, serve
-from tests.train.kit import TINY_MODEL, Heard, Killed, apart, flip_a_bit, tiny_run, trained
+from tests.train.kit import (
+    TINY_MODEL,
+    Heard,
+    Killed,
+    apart,
+    flip_a_bit,
+    require_same_run,
+    tiny_run,
+    trained,
+)
 from tests.train.toy import write_toy_dataset
 from train.evaluation import validation
 from train.folder import read_rows
@@ -40,9 +49,6 @@ from train.loop.interrupts import SIGNALS, Stopped
 from train.progress import TrainProgress
 from train.run_training import TrainResult
 from train.settings import LossSettings
-
-TIMINGS = {"views_per_s", "data_wait_share", "flops_per_s", "peak_share", "time_s", "memory_mb"}
-
 
 HEARD = Heard()
 """Of the whole run."""
@@ -64,18 +70,6 @@ class SignalAt(TrainProgress):
     def advance(self, *, step: int, **_: Any) -> None:
         if step == self.step:
             os.kill(os.getpid(), self.number)
-
-
-def same_as_uninterrupted(out: Path, whole: TrainResult) -> None:
-    last = f"checkpoints/step-{whole.num_steps:09d}.safetensors"
-    for name in ("model.safetensors", last, "validation_sheet.png"):
-        assert (out / name).read_bytes() == (whole.folder.root / name).read_bytes(), name
-    assert curve(out) == curve(whole.folder.root)
-
-
-def curve(out: Path) -> list[dict]:
-    rows = read_rows(out / "metrics.jsonl")
-    return [{k: v for k, v in row.items() if k not in TIMINGS} for row in rows]
 
 
 class SignalIn:
@@ -115,7 +109,7 @@ def test_a_signal_in_a_validation_or_while_saving_loses_nothing(
         left = [row["step"] for row in rows if "validation" in row]
         assert (step in left) == (name == "save_checkpoint"), number
     trained(tiny_run(), dataset, tmp_path, resume=True)
-    same_as_uninterrupted(tmp_path, whole)
+    require_same_run(tmp_path, whole.folder.root)
 
 
 def test_the_same_command_begins_begins_again_and_goes_on(
@@ -127,7 +121,7 @@ def test_the_same_command_begins_begins_again_and_goes_on(
         with pytest.raises(Killed):
             trained(tiny_run(), dataset, tmp_path, **again, progress=Heard(killed_at=step))
     trained(tiny_run(), dataset, tmp_path, **again)
-    same_as_uninterrupted(tmp_path, whole)
+    require_same_run(tmp_path, whole.folder.root)
     begun = [row["text"].split(" on ")[0] for row in read_rows(tmp_path / "notes.jsonl")]
     assert [text for text in begun if text in ("began", "went")] == ["began", "began", "went"]
 
@@ -139,7 +133,7 @@ def test_a_finished_run_is_judged_again(
     (tmp_path / "validation_sheet.png").unlink()
     again = trained(tiny_run(), dataset, tmp_path, resume=True)
     assert again.scores == whole.scores
-    same_as_uninterrupted(tmp_path, whole)
+    require_same_run(tmp_path, whole.folder.root)
 
 
 def test_the_folder_holds_everything_and_agrees_with_the_result(whole: TrainResult) -> None:
@@ -324,7 +318,7 @@ def test_stopped_by_each_signal_and_resumed_is_uninterrupted_to_the_bit(
             trained(settings, dataset, out, resume=step > 1, progress=SignalAt(step, number))
         assert [signal.getsignal(number) for number in SIGNALS] == handlers
     trained(settings, dataset, out, resume=True)
-    same_as_uninterrupted(out, whole)
+    require_same_run(out, whole.folder.root)
 
 
 def test_muon_goes_on_in_another_precision_on_another_processor(

@@ -21,6 +21,7 @@ from storage.seeds import rng_for
 from tests.command_line import run_program
 from tests.conftest import ROOT
 from tests.infra.slurm.test_jobs import commands_in
+from tests.train.kit import require_same_run
 from train.folder import read_rows
 
 SMALL = {
@@ -41,9 +42,6 @@ SMALL = {
     "augmentation.rotation": "uniform",
 }
 """In this order, since each change must fit to those before it."""
-
-CURVE = ("step", "loss", "l1", "grad_norm", "learning_rate", "validation", "layers", "spike")
-"""What a row of the log says of the training itself."""
 
 
 def command(dataset: Dataset, out: Path, processes: int, *rest: str, **changes: object) -> list:
@@ -97,12 +95,6 @@ def same_to_rounding(ours: Path, theirs: Path) -> None:
     np.testing.assert_allclose(first, second, rtol=1e-4)
 
 
-def curve(out: Path) -> list[dict]:
-    """Return the log without what clocks and memory say."""
-    rows = read_rows(out / "metrics.jsonl")
-    return [{name: row[name] for name in CURVE if name in row} for row in rows]
-
-
 def test_several_processes_and_passes_that_add_up_train_as_one_batch_of_one(
     dataset: Dataset, tmp_path: Path
 ) -> None:
@@ -127,13 +119,6 @@ def undisturbed(
     return functools.cache(
         lambda processes: run(dataset, tmp_path_factory.mktemp("whole"), processes, **LONGER)
     )
-
-
-def same_to_the_bit(out: Path, whole: Path) -> None:
-    names = ("model.safetensors", "checkpoints/step-000000060.safetensors", "validation_sheet.png")
-    for name in names:
-        assert (out / name).read_bytes() == (whole / name).read_bytes(), name
-    assert curve(out) == curve(whole)
 
 
 def started(words: list, **variables: str) -> "subprocess.Popen[str]":
@@ -171,7 +156,7 @@ def test_several_processes_that_are_stopped_go_on_to_the_bit(
     assert 0 < stopped < 60
     assert f"stopped at step {stopped} by a signal" in errors
     run(dataset, out, processes, "--resume", **LONGER)
-    same_to_the_bit(out, undisturbed(processes))
+    require_same_run(out, undisturbed(processes))
 
 
 @pytest.mark.slow("training")
@@ -189,7 +174,7 @@ def test_processes_that_are_killed_at_random_are_restarted_to_the_bit(
     os.kill(children(torchrun.pid)[rng.integers(2)], signal.SIGKILL)
     _, errors = torchrun.communicate()
     assert torchrun.returncode == 0, errors
-    same_to_the_bit(out, undisturbed(2))
+    require_same_run(out, undisturbed(2))
     texts = [row["text"] for row in read_rows(out / "notes.jsonl")]
     assert len([text for text in texts if text.endswith("on cpu, 2 processes")]) == 2
 
@@ -217,4 +202,4 @@ def test_a_job_of_slurm_whose_time_is_up_goes_on_to_the_bit(
     _, errors = job.communicate()
     assert job.returncode == 0, errors
     assert "by a signal, nothing is lost" in errors
-    same_to_the_bit(tmp_path / "job", undisturbed(2))
+    require_same_run(tmp_path / "job", undisturbed(2))
