@@ -141,24 +141,19 @@ def test_extremes_give_finite_pictures() -> None:
 
 
 def test_more_triangles_than_trained_are_rendered_with_a_warning(tmp_path: Path) -> None:
-    path, scene = tmp_path / "model.safetensors", tiny_scene()
-    for most, told in ((2, 1), (3, 0), (None, 0)):
-        known = None if most is None else TrainedRange(max_triangles=most)
-        path.write_bytes(encode_weights(network(), known))
+    """What it was trained on goes round through metadata."""
+    model, path, scene = network(), tmp_path / "model.safetensors", tiny_scene()
+    enough, unsaid = TrainedRange(max_triangles=3), TrainedRange(resolution=8)
+    for known, told in ((TrainedRange(max_triangles=2), 1), (enough, 0), (unsaid, 0), (None, 0)):
+        path.write_bytes(encode_weights(model, known))
         renderer = NeuralRenderer.load(tmp_path, device="cpu")  # a folder will do
+        assert renderer.trained == find_network(path).trained == (known or TrainedRange())
         with warnings.catch_warnings(record=True) as heard:
             warnings.simplefilter("always")
             assert renderer.render(scene, 8).shape == (2, 8, 8, 3)
         texts = [str(each.message) for each in heard]
         assert len(texts) == told
         assert all("3 triangles, and the network was trained on at most 2" in t for t in texts)
-
-
-def test_what_it_was_trained_on_goes_round_through_metadata(tmp_path: Path) -> None:
-    model, path = network(), tmp_path / "model.safetensors"
-    for known in (TrainedRange(max_triangles=1536), TrainedRange(resolution=64), None):
-        path.write_bytes(encode_weights(model, known))
-        assert find_network(path).trained == (known or TrainedRange())
     lies = ("", "[]", '{"max_triangles": "many"}', '{"resolution": Infinity}', "[" * 100_000)
     for text in lies:
         metadata = {CONFIG_KEY: encode_config(model.config), RANGE_KEY: text}

@@ -164,7 +164,9 @@ def test_the_folder_holds_everything_and_agrees_with_the_result(whole: TrainResu
     assert HEARD.progress == ["begin 0/12", *steps]
 
 
-def test_mistakes_are_named(dataset: Dataset, whole: TrainResult, tmp_path: Path) -> None:
+def test_mistakes_are_named(
+    dataset: Dataset, whole: TrainResult, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     with pytest.raises(TrilightError, match="resolution 24: expected a divisor of 32"):
         trained(tiny_run(resolution=24), dataset, tmp_path / "b")
     with pytest.raises(TrilightError, match="views_per_scene is 3, .* have 2 views"):
@@ -174,6 +176,12 @@ def test_mistakes_are_named(dataset: Dataset, whole: TrainResult, tmp_path: Path
     empty = write_toy_dataset(tmp_path / "data", resolution=8, train=0, validation=1)
     with pytest.raises(TrilightError, match="the train split holds no scene"):
         trained(tiny_run(resolution=8), empty, tmp_path / "d")
+    monkeypatch.delenv("TRILIGHT_LPIPS", raising=False)
+    with pytest.raises(TrilightError, match="--set loss.perceptual=ms_ssim or none"):
+        trained(tiny_run(loss=LossSettings(perceptual="lpips")), dataset, tmp_path / "e")
+    assert not list(tmp_path.glob("e/*"))
+    other = tiny_run(loss=LossSettings(perceptual="ms_ssim"), num_steps=3)
+    trained(other, dataset, tmp_path / "e")
 
 
 def test_data_without_a_validation_split_trains_and_says_so(
@@ -254,17 +262,6 @@ def test_a_second_stage_begins_with_the_first(dataset: Dataset, tmp_path: Path) 
         trained(tiny_run(), dataset, tmp_path / "third", begin_with=place)
     with pytest.raises(TrilightError, match="no such file or folder"):
         trained(second, dataset, tmp_path / "third", begin_with=f"{place}/no")
-
-
-def test_a_run_without_the_weights_it_asks_for_does_not_begin(
-    dataset: Dataset, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.delenv("TRILIGHT_LPIPS", raising=False)
-    with pytest.raises(TrilightError, match="--set loss.perceptual=ms_ssim or none"):
-        trained(tiny_run(loss=LossSettings(perceptual="lpips")), dataset, tmp_path)
-    assert not list(tmp_path.iterdir())
-    other = tiny_run(loss=LossSettings(perceptual="ms_ssim"), num_steps=3)
-    trained(other, dataset, tmp_path)
 
 
 def test_a_dead_start_is_said_early_and_once(dataset: Dataset, tmp_path: Path) -> None:

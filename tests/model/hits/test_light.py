@@ -44,7 +44,6 @@ from storage.errors import TrilightError
 from storage.optics.multiscatter import directional_albedo
 from storage.records.environment import Environment, row_solid_angles, texel_means
 from storage.records.lookup import environment_values
-from storage.records.scene import Scene
 from tests.for_each import for_each
 from tests.model.hits.kit import FLOOR, LAMP, corner, direct, lit_scene, traced
 from tests.model.kit import awake, hits_config, render, tiny_config
@@ -330,14 +329,12 @@ def test_a_level_may_be_compiled() -> None:
         torch.testing.assert_close(compiled, plain, rtol=1e-4, atol=1e-6 * float(plain.abs().max()))
 
 
-def _floor(sky: Environment) -> Scene:
-    parts = [quad(FLOOR, material(diffuse=0.5, specular=0.0))]
-    return join(parts, eye=(0, 0.1, 3), target=(0, 0, 0), fov_deg=40, sky=sky)
-
-
 def test_a_plane_below_a_constant_sky_receives_its_radiance() -> None:
     """Irradiance over pi is the radiance: a sky all around, and half of it above."""
-    inputs = traced(_floor(constant((0.5, 1.0, 2.0))), sky_rays=16)
+    floor = [quad(FLOOR, material(diffuse=0.5, specular=0.0))]
+    sky = constant((0.5, 1.0, 2.0))
+    scene = join(floor, eye=(0, 0.1, 3), target=(0, 0, 0), fov_deg=40, sky=sky)
+    inputs = traced(scene, sky_rays=16)
     found = inputs.pixels[..., Channel.DIRECT_DIFFUSE].mean(axis=(0, 1))
     # 1,024 pixels of 16 rays, half of them by the cosine, the others even: 0.3 %.
     assert found == pytest.approx(np.array([0.5, 1.0, 2.0]), rel=0.01)
