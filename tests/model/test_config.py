@@ -394,14 +394,11 @@ def test_batches_are_padded_with_zeros_to_the_longest_and_no_further() -> None:
             assert torch.all(padded[length:] == 0)
     equal = batch_of(4, 4)
     assert equal.is_triangle_BT is None and equal.num_triangles is None, "no mask is needed"
-
-
-def test_a_black_sky_is_none() -> None:
     for height, radiance, is_there in ((2, 1.0, True), (2, 0.0, False), (1, 0.0, False)):
         texels = np.full((height, 2 * height, 3), radiance, np.float32)
-        scene = dataclasses.replace(toy_scene(0), environment=Environment(radiance_rgb=texels))
-        batch = batch_scenes([scene_tensors(scene)])
-        assert (batch.skies is not None) == is_there
+        below = dataclasses.replace(toy_scene(0), environment=Environment(radiance_rgb=texels))
+        batch = batch_scenes([scene_tensors(below)])
+        assert (batch.skies is not None) == is_there, "a black sky is none"
 
 
 @for_each("family", FAMILIES)

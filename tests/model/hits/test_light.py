@@ -154,15 +154,12 @@ def test_light_gathered_beside_a_bright_wall_is_that_of_its_view() -> None:
     assert inputs.gathered.mean() == pytest.approx(float(seen[0]) / np.pi, rel=0.03)
 
 
-def test_more_rays_less_noise_the_same_mean() -> None:
+def test_more_rays_less_noise_the_same_mean_and_nothing_where_nothing_is_met() -> None:
     few = [traced(corner(), gather_rays=8, seed=seed).gathered for seed in range(12)]
     many = [traced(corner(), gather_rays=128, seed=seed).gathered for seed in range(4)]
     error = np.std([x.mean() for x in few], ddof=1) / np.sqrt(len(few))
     assert abs(np.mean(few) - np.mean(many)) < 5 * error + 1e-3 * np.mean(many)
     assert np.std(many, axis=0).mean() < 0.6 * np.std(few, axis=0).mean()
-
-
-def test_where_nothing_is_met_nothing_is_gathered() -> None:
     inputs = traced(corner(), 32)
     met = inputs.pixels.reshape(-1, inputs.pixels.shape[-1])[inputs.anchor, Channel.COVERAGE]
     assert not inputs.gathered[met[:, 0] == 0].any()

@@ -139,15 +139,6 @@ def test_it_goes_on_anywhere_with_any_ranks_and_threads(
         assert sorted(got) == sorted(wanted)
 
 
-def test_first_samples_come_from_every_dataset(data: TrainingData) -> None:
-    shards = data.split("train")
-    shown = [
-        sample.radiance_rgb.shape[1] for sample in first_samples(shards, 5, BadSampleCounter(0))
-    ]
-    assert shown == [16, 16, 16, 32, 32]
-    assert len(list(first_samples(data.split("validation"), 99, BadSampleCounter(0)))) == 3
-
-
 def test_a_dataset_that_is_known_goes_on_where_it_was(roots: list[str], data: TrainingData) -> None:
     """One alone, then two, then other weights, then the second alone."""
     run = tiny_run(scenes_per_step=BATCH)
@@ -169,7 +160,12 @@ def test_a_dataset_that_is_known_goes_on_where_it_was(roots: list[str], data: Tr
     assert second is not None and second.before == (6,) and second.counts_before(44) == (10,)
 
 
-def test_mistakes_about_several_datasets(roots: list[str], data: TrainingData) -> None:
+def test_first_samples_come_from_every_dataset_and_mistakes_are_named(
+    roots: list[str], data: TrainingData
+) -> None:
+    first = first_samples(data.split("train"), 5, BadSampleCounter(0))
+    assert [sample.radiance_rgb.shape[1] for sample in first] == [16, 16, 16, 32, 32]
+    assert len(list(first_samples(data.split("validation"), 99, BadSampleCounter(0)))) == 3
     with pytest.raises(TrilightError, match="holds the same dataset as .*data_weights says"):
         open_mixture([roots[0], roots[1], roots[0]])
     with pytest.raises(TrilightError, match="2 places of which 1 are shards"):
