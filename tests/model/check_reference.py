@@ -15,6 +15,7 @@ import torch
 from torch import Tensor
 from torch.nn.functional import elu
 
+from model.config import ModelConfig
 from model.published import NORMAL, decode_published_config, load_published_weights
 from model.renderformer import ELU_ALPHA
 from model.scene_tensors import SceneTensors, batch_scenes
@@ -47,13 +48,7 @@ def differences(path: Path) -> dict[str, float]:
         raise TrilightError(
             f"{path}: no {', '.join(missing)}; expected a file of reference outputs."
         )
-    parameters = {
-        name.removeprefix(_PARAMETER): tensor
-        for name, tensor in tensors.items()
-        if name.startswith(_PARAMETER)
-    }
-    config = decode_published_config(json.loads(metadata["config"]))
-    model = load_published_weights(parameters, config)
+    model = load_published_weights(*published_network(tensors, metadata))
     expected_BVRR3 = tensors[_OUTPUT].float().movedim(2, -1)
 
     def difference(scenes: Sequence[SceneTensors], expected: Tensor) -> Tensor:
@@ -67,6 +62,15 @@ def differences(path: Path) -> dict[str, float]:
         "unpadded": torch.stack(alone).max().item(),
         "std": expected_BVRR3.std().item(),
     }
+
+
+def published_network(
+    tensors: Mapping[str, Tensor], metadata: Mapping[str, str]
+) -> tuple[dict[str, Tensor], tuple[ModelConfig, int]]:
+    """Return the published weights of a file, and their configuration and texture patch."""
+    stored = {name: tensor for name, tensor in tensors.items() if name.startswith(_PARAMETER)}
+    weights = {name.removeprefix(_PARAMETER): tensor for name, tensor in stored.items()}
+    return weights, decode_published_config(json.loads(metadata["config"]))
 
 
 def _scenes(tensors: Mapping[str, Tensor]) -> list[SceneTensors]:

@@ -24,7 +24,7 @@ from model.hits.tracing import with_traced
 from model.inference import LightGroup, NeuralRenderer, light_groups
 from model.open import find_network
 from model.renderformer import RenderFormer, radiance
-from model.scene_tensors import SceneTensors, scene_tensors
+from model.scene_tensors import scene_tensors
 from model.view_decoder import BilinearUpsample, Fusion, compose_radiance
 from model.weights import CONFIG_KEY, RANGE_KEY, TrainedRange, encode_config, encode_weights
 from storage.conventions import look_at_c2w
@@ -70,13 +70,18 @@ def network(config: ModelConfig | None = None, bias: float = 0.3) -> RenderForme
     return model
 
 
-def test_three_lines_are_enough(tmp_path: Path) -> None:
+def test_three_lines_are_enough_and_equal_networks_have_equal_digests(tmp_path: Path) -> None:
     (tmp_path / "model.safetensors").write_bytes(encode_weights(network()))
     renderer = NeuralRenderer.load(tmp_path / "model.safetensors", device="cpu")
     picture = renderer.render(tiny_scene(), resolution=16)
     assert (picture.shape, picture.dtype) == ((2, 16, 16, 3), np.float32)
     assert 0 <= picture.min() < picture.max()
     assert len(np.unique(picture)) > 100
+    other = network()
+    assert NeuralRenderer(other).digest == renderer.digest
+    with torch.no_grad():
+        other.encoder.registers_NW[0, 0] += 1
+    assert NeuralRenderer(other).digest != renderer.digest
 
 
 def test_few_lights_are_the_networks_own_picture() -> None:
@@ -136,24 +141,19 @@ def test_extremes_give_finite_pictures() -> None:
 
 
 def test_more_triangles_than_trained_are_rendered_with_a_warning(tmp_path: Path) -> None:
-    path, scene = tmp_path / "model.safetensors", tiny_scene()
-    for most, told in ((2, 1), (3, 0), (None, 0)):
-        known = None if most is None else TrainedRange(max_triangles=most)
-        path.write_bytes(encode_weights(network(), known))
+    """What it was trained on goes round through metadata."""
+    model, path, scene = network(), tmp_path / "model.safetensors", tiny_scene()
+    enough, unsaid = TrainedRange(max_triangles=3), TrainedRange(resolution=8)
+    for known, told in ((TrainedRange(max_triangles=2), 1), (enough, 0), (unsaid, 0), (None, 0)):
+        path.write_bytes(encode_weights(model, known))
         renderer = NeuralRenderer.load(tmp_path, device="cpu")  # a folder will do
+        assert renderer.trained == find_network(path).trained == (known or TrainedRange())
         with warnings.catch_warnings(record=True) as heard:
             warnings.simplefilter("always")
             assert renderer.render(scene, 8).shape == (2, 8, 8, 3)
         texts = [str(each.message) for each in heard]
         assert len(texts) == told
         assert all("3 triangles, and the network was trained on at most 2" in t for t in texts)
-
-
-def test_what_it_was_trained_on_goes_round_through_metadata(tmp_path: Path) -> None:
-    model, path = network(), tmp_path / "model.safetensors"
-    for known in (TrainedRange(max_triangles=1536), TrainedRange(resolution=64), None):
-        path.write_bytes(encode_weights(model, known))
-        assert find_network(path).trained == (known or TrainedRange())
     lies = ("", "[]", '{"max_triangles": "many"}', '{"resolution": Infinity}', "[" * 100_000)
     for text in lies:
         metadata = {CONFIG_KEY: encode_config(model.config), RANGE_KEY: text}
@@ -162,39 +162,28 @@ def test_what_it_was_trained_on_goes_round_through_metadata(tmp_path: Path) -> N
             find_network(path)
 
 
-@for_each("resolution", [0, -8, 12])
-def test_a_resolution_between_bundles_is_one_line(resolution: int) -> None:
-    renderer = NeuralRenderer(network())
-    expected = f"resolution is {resolution}; expected a positive multiple of 8"
-    with pytest.raises(TrilightError, match=expected):
-        renderer.render(tiny_scene(), resolution)
-    with pytest.raises(TrilightError, match=expected):
-        renderer.view(renderer.prepare(tiny_scene()), tiny_scene().c2w[0], 40.0, resolution)
-
-
-def test_equal_networks_have_equal_digests() -> None:
-    assert NeuralRenderer(network()).digest == NeuralRenderer(network()).digest
-    other = network()
-    with torch.no_grad():
-        other.encoder.registers_NW[0, 0] += 1
-    assert NeuralRenderer(other).digest != NeuralRenderer(network()).digest
-
-
-def test_what_memory_cannot_hold_is_refused(monkeypatch: pytest.MonkeyPatch) -> None:
-    renderer = NeuralRenderer(network())
+def test_a_resolution_between_bundles_or_beyond_memory_is_one_line(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    """By default it is that of the training."""
+    renderer, scene = NeuralRenderer(network()), tiny_scene()
+    prepared = renderer.prepare(scene)
+    for resolution in (0, -8, 12):
+        expected = f"resolution is {resolution}; expected a positive multiple of 8"
+        with pytest.raises(TrilightError, match=expected):
+            renderer.render(scene, resolution)
+        with pytest.raises(TrilightError, match=expected):
+            renderer.view(prepared, scene.c2w[0], 40.0, resolution)
+    known = NeuralRenderer(network(), TrainedRange(max_triangles=None, resolution=16))
+    assert known.render(scene).shape == (2, 16, 16, 3)
+    with pytest.raises(TrilightError, match="resolution is None, and the network does not say"):
+        renderer.render(scene)
     # as control groups leave it, whatever the machine has
     monkeypatch.setattr(inference, "free_memory", lambda: 1000)
     with pytest.raises(TrilightError, match="3 triangles need more than 0.0 GB of memory"):
-        renderer.prepare(tiny_scene())
+        renderer.prepare(scene)
     monkeypatch.setattr(inference, "free_memory", lambda: None)
-    renderer.prepare(tiny_scene())
-
-
-def test_pictures_are_as_wide_as_those_that_it_was_trained_on() -> None:
-    known = NeuralRenderer(network(), TrainedRange(max_triangles=None, resolution=16))
-    assert known.render(tiny_scene()).shape == (2, 16, 16, 3)
-    with pytest.raises(TrilightError, match="resolution is None, and the network does not say"):
-        NeuralRenderer(network()).render(tiny_scene())
+    renderer.prepare(scene)
 
 
 def emission_of(scene: Scene) -> dict[bytes, NDArray[np.float32]]:
@@ -206,13 +195,6 @@ def emission_of(scene: Scene) -> dict[bytes, NDArray[np.float32]]:
 
 def counts(groups: list[LightGroup]) -> list[int]:
     return [int(scene.triangle_emits.sum()) for scene, _ in groups]
-
-
-@for_each("count", [1, 8])
-def test_a_scene_within_limits_is_rendered_as_it_is(count: int) -> None:
-    scene = join([FLOOR, CUBE, *row_of_lamps(count)])
-    ((alone, fraction),) = light_groups(scene, 8)
-    assert alone is scene and fraction == 1
 
 
 @given(count=st.integers(9, 64), most=st.integers(1, 8))
@@ -235,6 +217,10 @@ def test_the_light_of_the_groups_is_that_of_the_scene(count: int, most: int) -> 
 
 
 def test_a_group_is_as_bright_as_the_scene_and_otherwise_the_same() -> None:
+    for count in (1, 8):
+        few = join([FLOOR, CUBE, *row_of_lamps(count)])
+        ((alone, fraction),) = light_groups(few, 8)
+        assert alone is few and fraction == 1, "within limits it is rendered as it is"
     scene = join([FLOOR, CUBE, *row_of_lamps(20)])
     reflects = ~scene.triangle_emits
     for alone, _ in light_groups(scene, 8):
@@ -248,22 +234,6 @@ def test_a_group_is_as_bright_as_the_scene_and_otherwise_the_same() -> None:
     assert scene.materials[:, EMISSION].max() < 200  # the scene itself stays as it was
 
 
-def test_triangles_that_touch_are_one_lamp() -> None:
-    bulb = box([0, 0, 2], 0.1, material(emission=50.0), kind="emitter")
-    scene = join([FLOOR, *row_of_lamps(3), bulb])
-    assert counts(light_groups(scene, 8)) == [3, 12]
-    apart = [flat(bulb.triangles[at : at + 1], bulb.material, "emitter") for at in range(12)]
-    assert counts(light_groups(join([FLOOR, *row_of_lamps(3), *apart]), 8)) == [3, 12]
-
-
-def test_lamps_within_objects_are_not_mixed_with_others() -> None:
-    within = lamp((0.05, 0, 0.2))
-    assert counts(light_groups(join([FLOOR, CUBE, lamp((0, 0, 2)), within]), 8)) == [1, 1]
-    assert counts(light_groups(join([FLOOR, CUBE, within]), 8)) == [1]
-    # a shell is around every light of a room, and says nothing
-    assert counts(light_groups(join([FLOOR, lamp((0, 0, 0)), lamp((0, 0, 2))]), 8)) == [2]
-
-
 def without_area(scene: Scene, *lamps: int) -> Scene:
     """Return a scene whose emitting triangles of these numbers are points."""
     positions = scene.vertex_positions.copy()
@@ -272,7 +242,18 @@ def without_area(scene: Scene, *lamps: int) -> Scene:
     return dataclasses.replace(scene, vertex_positions=positions)
 
 
-def test_lamps_without_area_give_no_light() -> None:
+def test_triangles_that_touch_are_one_lamp_apart_from_those_within_objects() -> None:
+    """And lamps without area give no light."""
+    bulb = box([0, 0, 2], 0.1, material(emission=50.0), kind="emitter")
+    scene = join([FLOOR, *row_of_lamps(3), bulb])
+    assert counts(light_groups(scene, 8)) == [3, 12]
+    apart = [flat(bulb.triangles[at : at + 1], bulb.material, "emitter") for at in range(12)]
+    assert counts(light_groups(join([FLOOR, *row_of_lamps(3), *apart]), 8)) == [3, 12]
+    within = lamp((0.05, 0, 0.2))
+    assert counts(light_groups(join([FLOOR, CUBE, lamp((0, 0, 2)), within]), 8)) == [1, 1]
+    assert counts(light_groups(join([FLOOR, CUBE, within]), 8)) == [1]
+    # a shell is around every light of a room, and says nothing
+    assert counts(light_groups(join([FLOOR, lamp((0, 0, 0)), lamp((0, 0, 2))]), 8)) == [2]
     scene = join([FLOOR, *row_of_lamps(3)])
     assert counts(light_groups(without_area(scene, 1), 1)) == [1, 1]
     ((_, fraction),) = light_groups(without_area(scene, 0, 1, 2), 1)
@@ -364,11 +345,9 @@ def test_albedo_that_a_loader_brings_gives_the_picture_that_the_network_asks_for
     model = awake(config)
     scenes = [random_scene(7, seed=1), random_scene(15, seed=2)]
 
-    def brought(scene: SceneTensors) -> SceneTensors:
-        return with_traced(scene, RESOLUTION, config)
-
-    asked, given = render(model, *scenes), render(model, *map(brought, scenes))
-    assert torch.equal(asked, given)
+    asked = render(model, *scenes)
+    given = (with_traced(scene, RESOLUTION, config) for scene in scenes)
+    assert torch.equal(asked, render(model, *given))
     for index, scene in enumerate(scenes):
         # float64 sums in another order
         torch.testing.assert_close(render(model, scene)[0], asked[index], rtol=0, atol=1e-11)

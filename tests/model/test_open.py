@@ -53,7 +53,7 @@ from storage.digests import sha256_hex
 from storage.errors import LAST_COMMIT, TrilightError
 from storage.records.safe_read import safetensors_header
 from tests.for_each import case, for_each
-from tests.model.check_reference import TOLERANCE, differences, main
+from tests.model.check_reference import TOLERANCE, differences, main, published_network
 from tests.model.kit import awake, publishable, tiny_config
 from tests.scenes_by_hand import tiny_scene
 
@@ -65,21 +65,19 @@ def reopened(data: bytes, folder: Path) -> RenderFormer:
     return open_network(path)
 
 
+def same(a: RenderFormer, b: RenderFormer) -> bool:
+    pairs = zip(a.state_dict().items(), b.state_dict().items(), strict=True)
+    return a.config == b.config and all(n == m and torch.equal(x, y) for (n, x), (m, y) in pairs)
+
+
 @for_each("head", ["linear", "dpt"])
 def test_round_trip_is_exact_and_reproducible(head: str, tmp_path: Path) -> None:
     model = awake(tiny_config(head), torch.float32)
     data = encode_weights(model)
     again = reopened(data, tmp_path)
-    assert again.config == model.config
-    assert not again.training
-    for (name, a), b in zip(model.named_parameters(), again.parameters(), strict=True):
-        assert torch.equal(a, b), name
+    assert same(again, model) and not again.training
     assert encode_weights(again) == data
-
-
-def test_equal_networks_give_equal_bytes_in_any_process() -> None:
-    """Ten writings: the library shuffles two entries of metadata, half of the times."""
-    model = awake(tiny_config("linear"), torch.float32)
+    # ten writings: the library shuffles two entries of metadata, half of the times
     files = {encode_weights(model, TrainedRange(max_triangles=7)) for _ in range(10)}
     assert len(files) == 1
     header = safetensors_header(files.pop())["__metadata__"]
@@ -123,11 +121,6 @@ def published(tmp_path: Path) -> Path:
     return tmp_path / "hub"
 
 
-def same(a: RenderFormer, b: RenderFormer) -> bool:
-    pairs = zip(a.state_dict().items(), b.state_dict().items(), strict=True)
-    return a.config == b.config and all(n == m and torch.equal(x, y) for (n, x), (m, y) in pairs)
-
-
 def test_a_network_opens_as_file_and_as_folder(ours: Path, published: Path) -> None:
     for folder, config in ((ours, tiny_config()), (published, publishable("swin"))):
         for source in (folder, folder / WEIGHTS_NAME):
@@ -162,15 +155,14 @@ def _no_route(*words: Any, **named: Any) -> None:
     raise ConnectionError("no route to host\nand a page of advice")
 
 
-def test_a_name_that_is_plainly_a_path_asks_no_hub(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_hub_or_library_that_does_not_answer_is_one_line(monkeypatch: pytest.MonkeyPatch) -> None:
+    """And a name that is plainly a path asks none."""
     _stand_in_hub(monkeypatch, pytest.fail, pytest.fail)
     for name in ("runs/nosuch", "mine/model.safetensors", "/nowhere", "weights.pt"):
         said = rf"checkpoint {name}: no such file or folder; expected one, default \("
         with pytest.raises(TrilightError, match=said):
             find_network(name)
 
-
-def test_a_hub_or_library_that_does_not_answer_is_one_line(monkeypatch: pytest.MonkeyPatch) -> None:
     def download(repo_id: str, filename: str, local_files_only: bool) -> str:
         assert local_files_only  # else the library tries for half a minute, line by line
         raise OSError("not in the cache")
@@ -195,15 +187,15 @@ def test_pickled_code_is_refused_unread(tmp_path: Path, name: str) -> None:
             open_network(str(tmp_path))
 
 
-def test_a_config_that_an_editor_saved_with_a_byte_order_mark_opens(published: Path) -> None:
+def test_a_config_with_a_byte_order_mark_opens_and_what_is_none_is_refused(
+    published: Path,
+) -> None:
+    """An editor may have saved it."""
     text = (published / CONFIG_NAME).read_text()
     for encoding in ("utf-8-sig", "utf-16"):
         (published / CONFIG_NAME).write_text(text, encoding)
         with case(encoding):
             assert open_network(str(published)).config == publishable("swin")
-
-
-def test_a_config_that_is_none_is_refused(published: Path) -> None:
     for text in ("", "[1]", "{", "[" * 50_000):
         (published / CONFIG_NAME).write_text(text)
         with case(text[:9]), pytest.raises(TrilightError, match="config.json"):
@@ -293,10 +285,7 @@ def test_export_and_import_give_the_same_network(family: str, patch: int) -> Non
         decode_published_config(json.loads(json.dumps(encode_published_config(config)))) == config
     )
     model = awake(config[0], torch.float32)
-    again = load_published_weights(export_published_weights(model, patch), config)
-    assert again.state_dict().keys() == model.state_dict().keys()
-    for name, tensor in again.state_dict().items():
-        assert torch.equal(tensor, model.state_dict()[name]), name
+    assert same(load_published_weights(export_published_weights(model, patch), config), model)
 
 
 def test_frequencies_differ_by_their_rounding_alone() -> None:
@@ -414,20 +403,13 @@ def reference(request: pytest.FixtureRequest, shared: Path) -> Path:
 
 def test_export_gives_back_what_was_published(reference: Path) -> None:
     """All but the texture encoder bit by bit; that one as a function, by the test above."""
-    tensors, metadata = load_file(reference), read_tensors(reference)[1]
-    config = decode_published_config(json.loads(metadata["config"]))
-    published = {
-        key.removeprefix("param."): tensor.float()
-        for key, tensor in tensors.items()
-        if key.startswith("param.")
-    }
-    network = load_published_weights(published, config)
-    exported = export_published_weights(network, config[1])
+    published, config = published_network(*read_tensors(reference))
+    exported = export_published_weights(load_published_weights(published, config), config[1])
     assert exported.keys() == published.keys()
     for key, tensor in exported.items():
         assert tensor.shape == published[key].shape, key
         if not key.startswith("texture_encoder."):
-            assert torch.equal(tensor, published[key]), key
+            assert torch.equal(tensor, published[key].float()), key
 
 
 def changed(reference: Path, folder: Path, name: str, change: Tensor) -> str:

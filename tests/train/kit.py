@@ -8,9 +8,10 @@ from pathlib import Path
 from typing import Any
 
 import torch
+from torch import Tensor
 
 from model.config import ModelConfig
-from model.open import path_of_step
+from model.open import path_of_step, saved_steps
 from model.renderformer import RenderFormer
 from model.scene_tensors import SceneTensors
 from storage.dataset.dataset import Dataset
@@ -22,8 +23,9 @@ from train.data.loader import load_batches
 from train.data.order import RankSlice
 from train.data.scenes import TrainingScene, training_scene
 from train.evaluation.evaluate import EvalConfig
+from train.folder import read_rows
 from train.loop.distributed import DistributedContext
-from train.loop.step import Stepper
+from train.loop.step import Stepper, StepReport
 from train.loop.train_state import TrainState, new_state
 from train.loss.training_loss import TrainingLoss
 from train.progress import TrainProgress
@@ -76,35 +78,62 @@ class Killed(BaseException):
 
 
 class Heard(TrainProgress):
-    """Keeps the notes of a run, and ends it at a step as a power cut would."""
+    """Keeps what a run says, and ends it at a step as a power cut would."""
 
     def __init__(self, *, killed_at: int | None = None) -> None:
         self.killed_at = killed_at
         self.notes: list[str] = []
+        self.progress: list[str] = []
 
     def note(self, text: str) -> None:
         self.notes.append(text)
 
+    def begin(self, *, step: int, num_steps: int, **_: Any) -> None:
+        self.progress.append(f"begin {step}/{num_steps}")
+
     def advance(self, *, step: int, **_: Any) -> None:
+        self.progress.append(f"step {step}")
         if step == self.killed_at:
             raise Killed
 
+    def report_validation(self, *, step: int, **_: Any) -> None:
+        self.progress.append(f"validated {step}")
+
 
 def trained(
-    settings: TrainSettings,
-    data: Dataset | Sequence[str],
-    out: Path,
-    *,
-    resume: bool = False,
-    start: StartOptions | None = None,
-    **rest: Any,
+    settings: TrainSettings, data: Dataset | Sequence[str], out: Path, **rest: Any
 ) -> TrainResult:
-    """Run to the end in this process."""
+    """Run to the end in this process; `rest` is of `StartOptions` or `run_training`."""
     places = [str(data.folder.root)] if isinstance(data, Dataset) else data
-    begun = start or StartOptions(resume=resume)
-    result = run_training(settings, data=places, out=out, start=begun, **rest)
+    options = {field.name for field in dataclasses.fields(StartOptions)} & rest.keys()
+    start = StartOptions(**{name: rest.pop(name) for name in options})
+    result = run_training(settings, data=places, out=out, start=start, **rest)
     assert result is not None
     return result
+
+
+TIMINGS = {"views_per_s", "data_wait_share", "flops_per_s", "peak_share", "time_s", "memory_mb"}
+TIMINGS |= {"own_s"}
+
+
+def require_same_run(out: Path, whole: Path) -> None:
+    """Compare what two finished runs of one training have written, but for clocks and memory."""
+    last = path_of_step(Path("checkpoints"), saved_steps(whole / "checkpoints")[-1])
+    for name in ("model.safetensors", last, "validation_sheet.png"):
+        assert (out / name).read_bytes() == (whole / name).read_bytes(), name
+    ours, theirs = (
+        [
+            {name: value for name, value in row.items() if name not in TIMINGS}
+            for row in read_rows(folder / "metrics.jsonl")
+        ]
+        for folder in (out, whole)
+    )
+    assert ours == theirs
+
+
+def apart(one: dict[str, Tensor], other: dict[str, Tensor]) -> float:
+    """Return how far the weights of two networks are apart, root of the sum of squares."""
+    return sum(float((one[name] - other[name]).square().sum()) for name in one) ** 0.5
 
 
 def require_resumed_to_the_bit(
@@ -152,17 +181,22 @@ def stepper(state: TrainState) -> Stepper:
     return Stepper(state, TrainingLoss(state.settings.loss, None), ALONE)
 
 
-def take(
+def take_step(state: TrainState, batches: list[TrainingBatch], rate: float = 3e-3) -> StepReport:
+    report = stepper(state).step(batches, rate)
+    state.step += 1
+    return report
+
+
+def stream(
     data: TrainingData | Dataset,
     settings: TrainSettings,
-    count: int,
     *,
     first: int = 0,
     rank: int = 0,
     world_size: int = 1,
     **changes: Any,
-) -> list[list[TrainingScene]]:
-    """Return the batches first, first + 1, ... of the training split."""
+) -> closing[Any]:
+    """Return the batches first, first + 1, ... of the training split, to be closed."""
     opened = open_training_data([str(data.folder.root)]) if isinstance(data, Dataset) else data
     batches = load_batches(
         opened.split("train"),
@@ -171,7 +205,13 @@ def take(
         rank_slice=RankSlice(rank=rank, world_size=world_size),
         **{"workers": 1, "unusable": BadSampleCounter(0), **changes},
     )
-    with closing(batches):
+    return closing(batches)
+
+
+def take(
+    data: TrainingData | Dataset, settings: TrainSettings, count: int, **changes: Any
+) -> list[list[TrainingScene]]:
+    with stream(data, settings, **changes) as batches:
         return list(itertools.islice(batches, count))
 
 

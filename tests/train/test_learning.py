@@ -11,9 +11,8 @@ in a process of their own.
 
 import dataclasses
 import json
-from collections.abc import Iterator
-from concurrent.futures import ProcessPoolExecutor
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -31,15 +30,15 @@ from storage.metrics import psnr_log_db
 from storage.records.retextured import with_textures
 from storage.records.scene import Scene
 from storage.records.texture import Texture
-from tests.for_each import for_each
+from tests.for_each import case
 from tests.model.kit import hits_config, tiny_config
 from tests.sky_maps import smooth
 from tests.train.fake_card import CARD, card_process, fake_card
 from tests.train.kit import (
     eval_config,
     require_resumed_to_the_bit,
-    stepper,
     take,
+    take_step,
     tiny_run,
     trained,
 )
@@ -59,8 +58,6 @@ from train.loop.distributed import DistributedContext
 from train.loop.train_state import TrainState, new_state
 from train.loss.training_loss import LINEAR_FILE, VGG16_FILE, load_lpips
 from train.presets import override_training_preset
-from train.resume import StartOptions
-from train.run_training import run_training
 from train.settings import AugmentationSettings, TrainSettings, learning_rate
 
 SMALL = dataclasses.replace(
@@ -79,11 +76,9 @@ def memorised(scenes: list[TrainingScene], model: ModelConfig, steps: int) -> Tr
         augmentation=AugmentationSettings(),
     )
     state = new_state(settings)
-    memorising = stepper(state)
     batches = [collate_batch([scene]) for scene in scenes]
-    for step in range(steps):
-        memorising.step(batches, learning_rate(step, settings))
-        state.step += 1
+    for number in range(steps):
+        take_step(state, batches, learning_rate(number, settings))
     return state
 
 
@@ -145,24 +140,20 @@ HITS_AUGMENTATION = AugmentationSettings(
 )
 
 
-def hits_run(**changes: object) -> TrainSettings:
-    run = tiny_run(model=hits_config(), run="tiny-hits", augmentation=HITS_AUGMENTATION)
-    return dataclasses.replace(run, **changes)  # type: ignore[arg-type]
+HITS_RUN = tiny_run(model=hits_config(), run="tiny-hits", augmentation=HITS_AUGMENTATION)
 
 
-def test_what_is_traced_depends_on_no_thread_and_no_rank(dataset: Dataset) -> None:
-    alone = {scene.key: scene.tensors.traced for scene in take(dataset, hits_run(), 1, first=3)[0]}
+def test_views_are_traced_after_the_symmetries_and_lack_inputs_by_chance(dataset: Dataset) -> None:
+    """Whatever the thread and the rank."""
+    scenes = take(dataset, HITS_RUN, 1, first=3)[0]
+    alone = {scene.key: scene.tensors.traced for scene in scenes}
     for rank in range(3):
         part = {"workers": 3, "rank": rank, "world_size": 3}
-        ((other,),) = take(dataset, hits_run(), 1, first=3, **part)
+        ((other,),) = take(dataset, HITS_RUN, 1, first=3, **part)
         a, b = alone.pop(other.key), other.tensors.traced
         assert a is not None and b is not None
         for name, value in vars(a).items():
             assert torch.equal(value, getattr(b, name)), name
-
-
-def test_views_are_traced_after_the_symmetries_and_lack_inputs_by_chance(dataset: Dataset) -> None:
-    scenes = take(dataset, hits_run(), 1, first=3)[0]
     given = torch.cat([s.tensors.traced.given_VI for s in scenes if s.tensors.traced])
     assert given.shape == (6, len(INPUTS))
     assert 0 < given.mean() < 1
@@ -172,9 +163,6 @@ def test_views_are_traced_after_the_symmetries_and_lack_inputs_by_chance(dataset
         # each pixel that is lit in the picture, mirrored as it is, is one that meets something
         lit = scene.target_VRR3.amax(dim=-1) > 0.01
         assert (traced.pixels_VRRC[..., 0] > 0)[lit].float().mean() > 0.95
-
-
-MAPS_AUGMENTATION = dataclasses.replace(HITS_AUGMENTATION, light_scale=2.0)
 
 
 def _scene_of_maps(index: int) -> Scene:
@@ -192,69 +180,40 @@ def _scene_of_maps(index: int) -> Scene:
     return scene
 
 
-def maps_run() -> TrainSettings:
-    run = tiny_run(model=hits_config(sky_rays=2), run="tiny-maps", augmentation=MAPS_AUGMENTATION)
-    return dataclasses.replace(run, num_steps=4, validate_every=4, checkpoint_every=2)
-
-
-@pytest.fixture(scope="module")
-def with_maps(tmp_path_factory: pytest.TempPathFactory) -> Dataset:
-    """With steps in which no scene has a sky, or a texture."""
-    folder = tmp_path_factory.mktemp("maps")
-    return write_toy_dataset(folder, train=6, validation=2, per_shard=3, scene_of=_scene_of_maps)
-
-
-def test_a_run_that_is_told_hits_below_skies_resumes_to_the_bit(
-    with_maps: Dataset, tmp_path: Path
+def test_a_run_that_is_told_hits_below_skies_resumes_to_the_bit_and_one_that_is_not_is_refused(
+    tmp_path: Path,
 ) -> None:
-    require_resumed_to_the_bit(maps_run(), with_maps, tmp_path)
-
-
-def test_a_run_that_knows_no_sky_is_refused_before_its_first_step(
-    with_maps: Dataset, tmp_path: Path
-) -> None:
-    run = dataclasses.replace(maps_run(), model=tiny_config())
+    """With steps in which no scene has a sky, or a texture; refused before the first step."""
+    few: dict[str, Any] = {"train": 6, "validation": 2, "per_shard": 3}
+    with_maps = write_toy_dataset(tmp_path / "data", **few, scene_of=_scene_of_maps)
+    run = dataclasses.replace(
+        HITS_RUN,
+        model=hits_config(sky_rays=2),
+        run="tiny-maps",
+        augmentation=dataclasses.replace(HITS_AUGMENTATION, light_scale=2.0),
+        num_steps=4,
+        checkpoint_every=2,
+    )
+    require_resumed_to_the_bit(run, with_maps, tmp_path / "out")
+    run = dataclasses.replace(run, model=tiny_config())
     with pytest.raises(TrilightError, match=r"does not know its light.*model.sky_rays=16"):
         trained(run, with_maps, tmp_path / "run")
     assert not list((tmp_path / "run").glob("checkpoints/*"))
 
 
-@pytest.fixture(scope="module")
-def card(tmp_path_factory: pytest.TempPathFactory) -> Iterator[ProcessPoolExecutor]:
-    """A process with a card that is not there."""
-    with card_process(tmp_path_factory.mktemp("card")) as process:
-        yield process
-
-
-@pytest.fixture(scope="module")
-def data(tmp_path_factory: pytest.TempPathFactory) -> str:
-    folder = tmp_path_factory.mktemp("toy")
-    write_toy_dataset(folder, train=2, validation=2, resolution=RESOLUTION)
-    return str(folder)
-
-
-@pytest.fixture(scope="module")
-def lpips(tmp_path_factory: pytest.TempPathFactory) -> str:
-    """A folder of files like the published ones, with few channels."""
-    folder = tmp_path_factory.mktemp("lpips")
-    for name, weights in zip((VGG16_FILE, LINEAR_FILE), small_weights(), strict=True):
-        torch.save(weights, folder / name)
-    return str(folder)
-
-
 @pytest.mark.slow("gpu")  # a process and a library of its own
-@for_each(("run", "size"), [("pretrain", "smoke"), ("hits", "hits-smoke")])
-def test_each_view_stage_takes_its_step_on_a_card(
-    run: str, size: str, card: ProcessPoolExecutor, data: str, lpips: str, tmp_path: Path
-) -> None:
-    card.submit(train_and_judge, run, size, data, lpips, tmp_path).result()
-
-
-@pytest.mark.slow("gpu")
-def test_a_run_goes_on_and_a_second_one_begins_on_a_card(
-    card: ProcessPoolExecutor, data: str, lpips: str, tmp_path: Path
-) -> None:
-    card.submit(resume, data, lpips, tmp_path).result()
+def test_each_view_stage_takes_its_step_on_a_card_where_a_run_goes_on(tmp_path: Path) -> None:
+    """And a second one begins; LPIPS by files like the published ones, with few channels."""
+    data = str(tmp_path / "data")
+    write_toy_dataset(tmp_path / "data", train=2, validation=2, resolution=RESOLUTION)
+    lpips = str(tmp_path)
+    for name, weights in zip((VGG16_FILE, LINEAR_FILE), small_weights(), strict=True):
+        torch.save(weights, tmp_path / name)
+    with card_process(tmp_path) as card:
+        for run, size in (("pretrain", "smoke"), ("hits", "hits-smoke")):
+            with case(run):
+                card.submit(train_and_judge, run, size, data, lpips, tmp_path / run).result()
+        card.submit(resume, data, lpips, tmp_path).result()
 
 
 RESOLUTION = 64
@@ -284,9 +243,8 @@ def train_and_judge(run: str, size: str, data: str, lpips: str, out: Path) -> No
     """Train by run_training, evaluate and render."""
     settings = one_step_of(run, size)
     with fake_card():
-        start, crew = StartOptions(lpips=lpips), DistributedContext(device=CARD)
-        result = run_training(settings, data=[data], out=out, start=start, dist_context=crew)
-        assert result is not None and result.skipped_steps == 0
+        crew = DistributedContext(device=CARD)
+        assert trained(settings, [data], out, lpips=lpips, dist_context=crew).skipped_steps == 0
         network = RenderFormer(settings.model).to(CARD)
         distance = load_lpips(lpips)
         assert distance is not None
@@ -307,18 +265,12 @@ def resume(data: str, lpips: str, out: Path) -> None:
     with pytest.MonkeyPatch.context() as patch, fake_card():
         patch.setattr(torch.cpu, "_is_avx512_bf16_supported", lambda: False)
         crew = DistributedContext(device=CARD)
-        run_training(first, data=[data], out=out / "first", dist_context=crew)
+        trained(first, [data], out / "first", dist_context=crew)
         checkpoint = out / "first" / "checkpoints" / "step-000000002.safetensors"
         checkpoint.unlink()
-        run_training(
-            first,
-            data=[data],
-            out=out / "first",
-            start=StartOptions(resume=True),
-            dist_context=crew,
-        )
-        start = StartOptions(begin_with=str(checkpoint), lpips=lpips)
-        run_training(second, data=[data], out=out / "second", start=start, dist_context=crew)
+        trained(first, [data], out / "first", resume=True, dist_context=crew)
+        begin: dict[str, Any] = {"begin_with": str(checkpoint), "lpips": lpips}
+        trained(second, [data], out / "second", **begin, dist_context=crew)
     for name in ("first", "second"):
         record = json.loads((out / name / "settings.json").read_text())
         assert record["muon_precision"] == "bfloat16"

@@ -18,7 +18,6 @@ from numpy.typing import NDArray
 from torch import Tensor, nn
 from torch.utils._python_dispatch import TorchDispatchMode
 
-from model.config import ModelConfig
 from model.hits import decoder
 from model.hits.decoder import _around
 from model.hits.device_arrays import DeviceArray, DevicePlace
@@ -50,8 +49,8 @@ def network(**changes: Any) -> RenderFormer:
     return awake(hits_config(**changes), torch.float32)
 
 
-def tensors(scene: Scene, config: ModelConfig | None = None) -> SceneTensors:
-    return with_traced(scene_tensors(scene), PX, config or hits_config(), 0)
+def tensors(scene: Scene) -> SceneTensors:
+    return with_traced(scene_tensors(scene), PX, hits_config(), 0)
 
 
 def in_double(batch: SceneBatch) -> SceneBatch:

@@ -23,7 +23,7 @@ from storage.records.material import EMISSION
 from storage.records.scene import Scene
 from tests.for_each import for_each
 from tests.model.hits.kit import FLOOR, LAMP, corner, direct, textured, traced
-from tests.model.kit import awake, hits_config
+from tests.model.kit import awake, hits_config, render
 from tests.pipeline.renders.scene_kit import box, join, light, material, quad, sphere
 from tests.scenes_by_hand import moved
 
@@ -92,21 +92,18 @@ def test_surfaces_are_those_that_the_passes_know() -> None:
     np.testing.assert_allclose(places, np.stack([columns, rows], axis=1) + 0.5, atol=1e-3)
 
 
-def test_shadows_only_take_light_away() -> None:
-    pixels = traced(corner()).pixels
+def test_shadows_only_take_light_away_and_equal_arguments_give_equal_numbers() -> None:
+    one, again, other = traced(corner()), traced(corner()), traced(corner(), seed=1)
+    assert np.array_equal(one.pixels, again.pixels)
+    assert np.array_equal(one.gathered, again.gathered)
+    assert not np.array_equal(one.pixels, other.pixels), "another seed, another noise"
+    pixels = one.pixels
     for shadowed, open_light in (
         (Channel.DIRECT_DIFFUSE, Channel.OPEN_DIFFUSE),
         (Channel.DIRECT_SPECULAR, Channel.OPEN_SPECULAR),
     ):
         assert (pixels[..., shadowed] <= pixels[..., open_light] * (1 + 1e-5)).all()
     assert (pixels[..., Channel.DIRECT_DIFFUSE] < 0.5 * pixels[..., Channel.OPEN_DIFFUSE]).any()
-
-
-def test_equal_arguments_equal_numbers_and_another_seed_another_noise() -> None:
-    one, again, other = traced(corner()), traced(corner()), traced(corner(), seed=1)
-    assert np.array_equal(one.pixels, again.pixels)
-    assert np.array_equal(one.gathered, again.gathered)
-    assert not np.array_equal(one.pixels, other.pixels)
 
 
 @pytest.mark.parametrize(
@@ -295,13 +292,11 @@ def test_wide_pictures_are_denoised_wherever_their_light_is_traced() -> None:
     cameras = tensors.c2w_V44[:1], tensors.fov_deg_V[:1]
     (lit,) = lit_scenes(batch_scenes([tensors]))
     noisy = traced_views(lit, *cameras, WIDE_PX, config)
-    wide = with_traced(tensors, WIDE_PX, config).traced
+    given = with_traced(tensors, WIDE_PX, config)
+    wide = given.traced
     assert wide is not None
     assert torch.equal(wide.pixels_VRRC, _denoise(noisy.pixels_VRRC, noisy.unit_3))
     model = awake(config, torch.float32)
-    with torch.no_grad():
-        trained = radiance(
-            model(batch_scenes([with_traced(tensors, WIDE_PX, config)]), WIDE_PX)[0, 0]
-        )
+    trained = radiance(render(model, given, resolution=WIDE_PX)[0, 0])
     shown = NeuralRenderer(model).render(scene, WIDE_PX)[0]
     np.testing.assert_allclose(shown, trained.numpy(), rtol=1e-4, atol=1e-6)

@@ -84,14 +84,6 @@ def whole(data: Dataset) -> list[list[TrainingScene]]:
     return take(data, SETTINGS, WHOLE)
 
 
-@for_each("first", range(WHOLE))
-def test_resuming_after_every_batch_is_uninterrupted(
-    data: Dataset, whole: list[list[TrainingScene]], first: int
-) -> None:
-    resumed = take(data, SETTINGS, WHOLE - first, first=first)
-    assert identities(resumed) == identities(whole[first:])
-
-
 @for_each("world_size", [2, 3, 6])
 @for_each("first", range(0, WHOLE, 3))
 def test_any_number_of_ranks_may_go_on(
@@ -108,13 +100,17 @@ def test_any_number_of_ranks_may_go_on(
         assert sorted(got) == sorted(wanted)
 
 
-@for_each("workers", [0, 2, 5])
-def test_the_number_of_threads_changes_nothing(
-    data: Dataset, whole: list[list[TrainingScene]], workers: int
+def test_resuming_after_every_batch_and_any_number_of_threads_change_nothing(
+    data: Dataset, whole: list[list[TrainingScene]]
 ) -> None:
-    before = threading.active_count()
-    assert identities(take(data, SETTINGS, WHOLE, workers=workers)) == identities(whole)
-    assert threading.active_count() <= before, "closing the stream ends its threads"
+    for first in range(WHOLE):
+        resumed = take(data, SETTINGS, WHOLE - first, first=first)
+        assert identities(resumed) == identities(whole[first:]), first
+    for workers in (0, 2, 5):
+        before = threading.active_count()
+        with case(workers):
+            assert identities(take(data, SETTINGS, WHOLE, workers=workers)) == identities(whole)
+            assert threading.active_count() <= before, "closing the stream ends its threads"
 
 
 def test_epochs_show_every_scene_and_differ(whole: list[list[TrainingScene]]) -> None:
@@ -419,19 +415,11 @@ SHARDS, PER_SHARD, NOISY_PX = 30, 8, 128
 
 CHILD = """
 import itertools, json, resource, sys
-from contextlib import closing
 from storage.dataset.training_data import open_training_data
-from train.data.order import RankSlice
-from tests.train.kit import plain_run
-from train.data.loader import load_batches
-from train.data.bad_samples import BadSampleCounter
+from tests.train.kit import plain_run, stream
 settings = plain_run(seed=0, shuffle_shards=2, scenes_per_step=8, resolution=16, views_per_scene=2)
-data = open_training_data([sys.argv[1]]).split("train")
-batches = load_batches(
-    data, settings, 0, rank_slice=RankSlice(), workers=2, unusable=BadSampleCounter(0)
-)
 count = peak = 0
-with closing(batches):
+with stream(open_training_data([sys.argv[1]]), settings, workers=2) as batches:
     for batch in itertools.islice(batches, int(sys.argv[2])):
         count += len(batch)
         pages = int(open("/proc/self/statm").read().split()[1])

@@ -1,5 +1,7 @@
 """Laws of a stream of several datasets: shares, each one's own order, and going on anywhere.
 
+Damaged or malformed data: the first ends the run, or it is named, replaced and bounded.
+
 The way to the network: how many threads decode, and what arrives on the device. The same batches
 on every device, and on a card beside its kernels.
 """
@@ -12,41 +14,48 @@ from collections.abc import Iterator
 from contextlib import closing
 from pathlib import Path
 from typing import Any
+from unittest import mock
 
 import numpy as np
 import pytest
+import safetensors.numpy
 import torch
 from torch import Tensor
 
 from model.open import path_of_step
 from storage.conventions import log10_radiance
 from storage.dataset.dataset import Dataset
+<<<<<<< HEAD
 from storage.dataset.training_data import TrainingData, open_training_data
+=======
+from storage.dataset.shard import ShardReader, write_shard
+from storage.dataset.shard_set import ShardSet
+from storage.dataset.training_data import TrainingData, open_mixture, open_training_data
+>>>>>>> t3
 from storage.errors import TrilightError
+from storage.records.sample import encode_sample
 from tests.for_each import for_each
+from tests.storage.dataset.test_verify import replace_shard
 from tests.train.data.test_loader import identities
 from tests.train.fake_card import CARD, fake_card
 from tests.train.kit import (
     CPU,
+    flip_a_bit,
     keys_of,
     plain_run,
     require_resumed_to_the_bit,
+    stream,
     take,
     tiny_run,
+    trained,
 )
-from tests.train.toy import write_toy_dataset
+from tests.train.toy import toy_sample, write_toy_dataset
 from train.data.bad_samples import BadSampleCounter, first_samples
 from train.data.buckets import CopyStream, StepScenes, step_scenes
-from train.data.loader import (
-    MAX_THREADS,
-    choose_workers,
-    load_batches,
-)
-from train.data.order import RECORD, Mixture, RankSlice, plan_mixture
+from train.data.loader import MAX_THREADS, choose_workers
+from train.data.order import RECORD, Mixture, plan_mixture
 from train.data.scenes import TrainingScene, stored_levels
 from train.loop.checkpoints import read_checkpoint
-from train.resume import StartOptions
-from train.run_training import run_training
 from train.settings import AugmentationSettings
 
 BATCH = 4
@@ -69,15 +78,14 @@ def data(roots: list[str]) -> TrainingData:
     return open_training_data(roots, may_mix=True)
 
 
-def mixture(*weights: float, **changes: object) -> Mixture:
-    few = Mixture(
+def mixture(*weights: float) -> Mixture:
+    return Mixture(
         digests=tuple(f"{row}" for row in range(len(weights))),
         names=tuple("abc"[: len(weights)]),
         weights=weights,
         before=(0,) * len(weights),
         scenes_per_step=BATCH,
     )
-    return dataclasses.replace(few, **changes)  # type: ignore[arg-type]
 
 
 @for_each("weights", [(1.0,), (3.0, 1.0), (0.1, 0.2, 0.7), (1e-3, 5.0), (7.0, 3e5)])
@@ -137,15 +145,6 @@ def test_it_goes_on_anywhere_with_any_ranks_and_threads(
         assert sorted(got) == sorted(wanted)
 
 
-def test_first_samples_come_from_every_dataset(data: TrainingData) -> None:
-    shards = data.split("train")
-    shown = [
-        sample.radiance_rgb.shape[1] for sample in first_samples(shards, 5, BadSampleCounter(0))
-    ]
-    assert shown == [16, 16, 16, 32, 32]
-    assert len(list(first_samples(data.split("validation"), 99, BadSampleCounter(0)))) == 3
-
-
 def test_a_dataset_that_is_known_goes_on_where_it_was(roots: list[str], data: TrainingData) -> None:
     """One alone, then two, then other weights, then the second alone."""
     run = tiny_run(scenes_per_step=BATCH)
@@ -167,7 +166,12 @@ def test_a_dataset_that_is_known_goes_on_where_it_was(roots: list[str], data: Tr
     assert second is not None and second.before == (6,) and second.counts_before(44) == (10,)
 
 
-def test_mistakes_about_several_datasets(roots: list[str], data: TrainingData) -> None:
+def test_first_samples_come_from_every_dataset_and_mistakes_are_named(
+    roots: list[str], data: TrainingData
+) -> None:
+    first = first_samples(data.split("train"), 5, BadSampleCounter(0))
+    assert [sample.radiance_rgb.shape[1] for sample in first] == [16, 16, 16, 32, 32]
+    assert len(list(first_samples(data.split("validation"), 99, BadSampleCounter(0)))) == 3
     with pytest.raises(TrilightError, match="holds the same dataset as .*data_weights says"):
         open_training_data([roots[0], roots[1], roots[0]], may_mix=True)
     with pytest.raises(TrilightError, match="2 places of which 1 are shards"):
@@ -211,16 +215,14 @@ def test_a_run_of_two_datasets_resumes_to_the_bit_and_takes_up_a_third(
     three = [*roots, str(tmp_path / "third")]
     digest = open_training_data(three, may_mix=True).digest
     with pytest.raises(TrilightError, match=r"--change data=mix:[0-9a-f]{12}"):
-        run_training(settings, data=three, out=out, start=StartOptions(resume=True))
+        trained(settings, three, out, resume=True)
     decided = {"data": digest[:16], "data_weights": (1.0, 2.0, 1.0), "num_steps": 10}
-    run_training(settings, data=three, out=out, start=StartOptions(resume=True, decisions=decided))
+    trained(settings, three, out, resume=True, decisions=decided)
     header = read_checkpoint(path_of_step(out / "checkpoints", 10)).header
     assert header[RECORD]["first"] == 24 and header[RECORD]["before"] == [8, 16, 0]
 
 
 GIB = 1 << 30
-
-
 FREE = "MemFree: 1 kB\nMemAvailable: {} kB\n"
 
 
@@ -287,19 +289,11 @@ def dataset(tmp_path_factory: pytest.TempPathFactory) -> Dataset:
 
 
 @contextlib.contextmanager
-def steps(
-    dataset: Dataset, device: torch.device = CPU, **changes: Any
-) -> Iterator[Iterator[StepScenes]]:
-    settings = dataclasses.replace(LIT_SETTINGS, **changes)
-    batches = load_batches(
-        open_training_data([str(dataset.folder.root)]).split("train"),
-        settings,
-        0,
-        rank_slice=RankSlice(),
-        workers=2,
-        unusable=BadSampleCounter(0),
-    )
-    with closing(batches), closing(step_scenes(batches, float, 3, device)) as found:
+def steps(dataset: Dataset, device: torch.device = CPU) -> Iterator[Iterator[StepScenes]]:
+    with (
+        stream(dataset, LIT_SETTINGS, workers=2) as batches,
+        closing(step_scenes(batches, float, 3, device)) as found,
+    ):
         yield found
 
 
@@ -380,3 +374,160 @@ def test_a_card_gets_copies_beside_its_kernels(
 def test_rows_of_targets_are_the_logarithms_of_all_half_floats() -> None:
     halves = np.arange(0x7C00, dtype=np.uint16).view(np.float16).astype(np.float32)
     assert np.array_equal(stored_levels(), log10_radiance(halves).astype(np.float32))
+
+
+EIGHT_RUN = dataclasses.replace(SETTINGS, seed=0, resolution=8)
+BAD_KEY = "000000002"
+
+
+def keys(
+    data: TrainingData | Dataset, unusable: BadSampleCounter, *, count: int = 4, **ranks: Any
+) -> list[list[str]]:
+    return keys_of(take(data, EIGHT_RUN, count, workers=2, unusable=unusable, **ranks))
+
+
+@pytest.fixture
+def eight(tmp_path: Path) -> Dataset:
+    return write_toy_dataset(tmp_path, train=8, validation=1, per_shard=2, resolution=8)
+
+
+def spoil_sample(eight: Dataset, suffixes: tuple[str, ...] = ("0.exr", "1.exr")) -> None:
+    """Make pictures of a sample unreadable whose shard has the hash of the manifest."""
+    samples = [
+        (sample.key, encode_sample(sample))
+        for sample in (toy_sample(i, resolution=8) for i in (2, 3))
+    ]
+    samples[0][1].update(dict.fromkeys(suffixes, b"no picture"))
+    replace_shard(eight, "train-000001.tar", samples)
+
+
+def test_the_first_damage_ends_the_run_or_the_next_of_its_shard_replaces_it(
+    eight: Dataset,
+) -> None:
+    """Whatever the ranks."""
+    whole = keys(eight, BadSampleCounter(0))
+    spoil_sample(eight)
+    with pytest.raises(TrilightError, match=rf"train-000001\.tar: sample {BAD_KEY}: .*OpenEXR"):
+        keys(eight, BadSampleCounter(0))
+    unusable = BadSampleCounter(1)
+    found = keys(eight, unusable)
+    assert found == [[key.replace(BAD_KEY, "000000003") for key in batch] for batch in whole]
+    assert len(unusable.messages) == 1 and BAD_KEY in unusable.messages[0]
+    shares = [keys(eight, BadSampleCounter(1), rank=r, world_size=2) for r in range(2)]
+    for batch, first, second in zip(found, *shares, strict=True):
+        assert sorted(batch) == sorted([*first, *second])
+
+
+def test_damage_costs_only_the_visits_that_draw_its_view(eight: Dataset) -> None:
+    whole = keys(eight, BadSampleCounter(0))
+    visits = [(batch, row) for batch in range(4) for row in range(4)]
+    replaced = list[set[tuple[int, int]]]()
+    for suffix in ("0.exr", "1.exr"):
+        spoil_sample(eight, (suffix,))
+        found = keys(eight, BadSampleCounter(1))
+        replaced.append({at for at in visits if found[at[0]][at[1]] != whole[at[0]][at[1]]})
+    drawn = {at for at in visits if whole[at[0]][at[1]] == BAD_KEY}
+    assert replaced[0] | replaced[1] == drawn and not replaced[0] & replaced[1]
+
+
+def test_a_shard_is_replaced_and_counts_with_its_samples(eight: Dataset) -> None:
+    whole = keys(eight, BadSampleCounter(0))
+    flip_a_bit(eight.folder.shard("train-000001.tar"))
+    unusable = BadSampleCounter(2)
+    found = keys(eight, unusable)
+    assert [len(batch) for batch in found] == [4, 4, 4, 4]
+    kept = [k for batch in whole for k in batch]
+    for before, after in zip(kept, itertools.chain(*found), strict=True):
+        lost = before in ("000000002", "000000003")
+        assert after not in ("000000002", "000000003")
+        assert lost or after == before
+    assert "train-000001.tar" in unusable.messages[0] and "sha256" in unusable.messages[0]
+    with pytest.raises(TrilightError, match="2 samples are unusable; expected at most 1"):
+        keys(eight, BadSampleCounter(1))
+
+
+def test_a_list_with_an_unreadable_shard_goes_on_without_it(eight: Dataset) -> None:
+    (eight.folder.root / "train-000001.tar").write_bytes(b"no shard at all")
+    data = open_training_data([f"{eight.folder.root}/train-{{000000..000003}}.tar"])
+    unusable = BadSampleCounter(1)
+    found = keys(data, unusable, count=3)
+    assert {key for batch in found for key in batch} == {
+        f"00000000{index}" for index in (0, 1, 4, 5, 6, 7)
+    }
+    assert len(unusable.messages) == 1
+
+
+def test_a_shard_that_ends_the_run_was_fetched_once_and_all_unusable_end_it(
+    eight: Dataset,
+) -> None:
+    for path in eight.folder.root.glob("train-*.tar"):
+        path.write_bytes(b"no shard at all")
+    data = open_training_data([f"{eight.folder.root}/train-000000.tar"])
+    fetch = mock.patch.object(ShardSet, "open", autospec=True, side_effect=ShardSet.open)
+    with fetch as fetched, pytest.raises(TrilightError, match="train-000000"):
+        keys(data, BadSampleCounter(0))
+    assert fetched.call_count == 1
+    with pytest.raises(
+        TrilightError, match="no sample of 4 shards is usable. The last that was tried: "
+    ):
+        keys(eight, BadSampleCounter(10**9))
+
+
+BOTH_VIEWS = dataclasses.replace(EIGHT_RUN, scenes_per_step=2, views_per_scene=2)
+BAD, GOOD = "bad-000000.tar", "good-000000.tar"
+Members = dict[str, bytes]
+
+
+def lose_a_place(members: Members) -> None:
+    """Put what is no number into the positions of a sample."""
+    stored = safetensors.numpy.load(members["scene.safetensors"])
+    arrays = {key: values.copy() for key, values in stored.items()}
+    arrays["vertex_positions"][0, 1] = np.nan
+    members["scene.safetensors"] = safetensors.numpy.save(arrays)
+
+
+def write_shards(folder: Path, bad_samples: int) -> list[str]:
+    """Write a shard whose first samples are spoilt and one without fault; return their paths."""
+    for name, first, count in ((BAD, 0, 3), (GOOD, 3, 2)):
+        samples = []
+        for index in range(first, first + count):
+            sample = toy_sample(index, resolution=8, views=2)
+            members = encode_sample(sample)
+            if index < bad_samples:
+                lose_a_place(members)
+            samples.append((sample.key, members))
+        write_shard(folder / name, samples)
+    return [f"{folder}/{BAD}", f"{folder}/{GOOD}"]
+
+
+def spoilt_keys(paths: list[str], unusable: BadSampleCounter, count: int = 5) -> set[str]:
+    found = take(open_training_data(paths), BOTH_VIEWS, count, unusable=unusable)
+    return set(itertools.chain(*keys_of(found)))
+
+
+def test_a_shard_that_is_all_bad_is_given_up_once(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    paths = write_shards(tmp_path, bad_samples=3)
+    decode = ShardReader.stored_sample
+    read: Any = mock.create_autospec(decode, side_effect=decode)
+    monkeypatch.setattr(ShardReader, "stored_sample", read)
+    unusable = BadSampleCounter(3)
+    found = spoilt_keys(paths, unusable, count=10)
+    assert found == {"000000003", "000000004"}
+    assert len(unusable.messages) == 3
+    for row, message in enumerate(unusable.messages):
+        assert message.isprintable() and f"/{BAD}: sample 00000000{row}: " in message
+        assert "vertex_positions[0, 1] is nan" in message
+    bad = [each.args[1] for each in read.call_args_list if BAD in each.args[0].name]
+    assert len(bad) == len(set(bad)) == 3
+
+
+def test_a_scene_with_fewer_views_than_are_drawn_is_replaced(tmp_path: Path) -> None:
+    paths = write_shards(tmp_path, bad_samples=0)
+    (tmp_path / GOOD).unlink()
+    few = toy_sample(3, resolution=8, views=1)
+    write_shard(tmp_path / GOOD, [(few.key, encode_sample(few))])
+    unusable = BadSampleCounter(1)
+    assert few.key not in spoilt_keys(paths, unusable)
+    assert "1 views; the run draws 2 of each scene" in unusable.messages[0]

@@ -24,7 +24,7 @@ from storage.errors import TrilightError
 from storage.metrics import psnr_log_db
 from storage.records.material import ROUGHNESS
 from storage.seeds import rng_for
-from tests.command_line import trilight
+from tests.command_line import expect_mistake, expect_output
 from tests.model.kit import awake, tiny_config
 from tests.pipeline.renders.scene_kit import join, light, material, quad
 from tests.train.kit import eval_config, tiny_run
@@ -132,9 +132,6 @@ def test_every_view_is_judged_beside_its_rivals(dataset: Dataset) -> None:
         judge_views(dataclasses.replace(contest(dataset), resolution=24), lambda: None)
 
 
-SCORES = dict.fromkeys(METRICS, 31.0) | {"lpips": None, "log_l1": 0.1}
-
-
 def row(number: int, **changes: object) -> JudgedView:
     scores = {name: 30.0 + number for name in METRICS} | {"lpips": None, "log_l1": 0.1}
     base = JudgedView(
@@ -151,7 +148,8 @@ def row(number: int, **changes: object) -> JudgedView:
     return dataclasses.replace(base, **changes)  # type: ignore[arg-type]
 
 
-def test_parts_are_ordered_and_hold_every_view() -> None:
+def test_parts_are_ordered_and_a_summary_shows_the_bad_ones_and_the_noise() -> None:
+    """Parts hold every view."""
     rows = [
         row(0, num_triangles=5000, num_lights=9, roughness=0.01),
         row(1, num_triangles=256, template="wall"),
@@ -171,9 +169,6 @@ def test_parts_are_ordered_and_hold_every_view() -> None:
         "box": 3,
         "wall": 1,
     }
-
-
-def test_a_summary_shows_the_bad_ones_and_the_noise() -> None:
     rows = [row(number) for number in range(11)]
     found = summarize_views(rows)
     assert found["psnr_log_db"]["median"] == 35.0
@@ -207,6 +202,14 @@ def test_another_scenes_triangles_and_what_swapping_costs_are_told(dataset: Data
 
 
 def test_worst_median_and_excursions_are_found_and_plotted(tmp_path: Path) -> None:
+    """Facts come from the scene."""
+    sample = toy_sample(0)
+    provenance = {"template": "toy", "excursion": {"axis": "lights", "value": 16}}
+    scene = sample.scene.with_provenance(provenance)
+    facts = scene_facts(dataclasses.replace(sample, scene=scene))
+    assert facts["excursion"] == ("lights", 16.0) and facts["template"] == "toy"
+    *surfaces, _lamp = scene.materials[:, ROUGHNESS].tolist()
+    assert (facts["num_lights"], facts["roughness"]) == (1, min(surfaces))
     rows = [row(number, excursion=("lights", 16.0 + number % 3)) for number in range(30)]
     rows.append(row(40, excursion=("fov_deg", 90.0)))
     chosen = rows_of_sheets(rows)
@@ -250,7 +253,8 @@ def test_many_lights_are_judged_in_one_pass_and_in_groups(dataset: Dataset) -> N
         for alone, fraction in light_groups(many, 8)
     )
     np.testing.assert_allclose(grouped, expected, rtol=1e-5, atol=1e-6)
-    alone, both = row(0), row(1, scores={NETWORK: SCORES, GROUPED: SCORES | {"ssim": 0.5}})
+    alone, scores = row(0), row(1).scores[NETWORK]
+    both = row(1, scores={NETWORK: scores, GROUPED: scores | {"ssim": 0.5}})
     assert record([alone], {})["light passes"] is None
     found = record([alone, both], {})
     assert list(found["contestants"]) == [NETWORK], "a column is of all views"
@@ -294,26 +298,15 @@ def test_no_report_takes_the_place_of_another_networks(
     assert EvaluationOptions(checkpoint="builtin:", data=("d",)).report_folder == Path("evaluation")
 
 
-def test_facts_come_from_the_scene() -> None:
-    sample = toy_sample(0)
-    provenance = {"template": "toy", "excursion": {"axis": "lights", "value": 16}}
-    scene = sample.scene.with_provenance(provenance)
-    facts = scene_facts(dataclasses.replace(sample, scene=scene))
-    assert facts["excursion"] == ("lights", 16.0) and facts["template"] == "toy"
-    *surfaces, _lamp = scene.materials[:, ROUGHNESS].tolist()
-    assert (facts["num_lights"], facts["roughness"]) == (1, min(surfaces))
-
-
 def test_the_command_writes_report_and_sheets(
     dataset: Dataset, weights: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     out = tmp_path / "out"
     data = ["--data", str(dataset.folder.root)]
     command = ["evaluate", weights, *data, "--split", "validation", "--out", str(out)]
-    done = trilight([*command, "--json", "--resolution", "16", "--tracer-views", "0"])
-    assert done.exit_code == 0, done.output
+    printed = expect_output(*command, "--json", "--resolution", "16", "--tracer-views", "0")
     found = json.loads((out / "evaluation.json").read_text())
-    assert found["contestants"] == json.loads(done.output[done.output.index("{") :])["contestants"]
+    assert found["contestants"] == json.loads(printed[printed.index("{") :])["contestants"]
     assert len(found["views"]) == 6
     assert "## By template" in (out / "evaluation.md").read_text()
     for name in ("worst.png", "median.png"):
@@ -321,16 +314,14 @@ def test_the_command_writes_report_and_sheets(
             assert min(sheet.size) > 200
     monkeypatch.setenv("TRILIGHT_VARIANT", "none_such")
     few = [*command, "--most-scenes", "1", "--tracer-views", "1"]
-    shown = trilight(few, env={"COLUMNS": "160"}).output
+    shown = expect_output(*few, COLUMNS="160")
     (scores,) = [line.split() for line in shown.splitlines() if "psnr_log_db" in line.split()[:1]]
     assert len(scores) == 1 + len(found["contestants"])  # a column for each
     assert "The path tracer in that time is not shown: TRILIGHT_VARIANT is" in shown
     assert "is not shown: TRILIGHT" in (out / "evaluation.md").read_text()
-    missing = trilight(["evaluate", str(tmp_path / "no"), *data])
-    assert isinstance(missing.exception, TrilightError)
-    assert "no such file or folder" in str(missing.exception)
-    empty = trilight(["evaluate", weights, *data])
-    assert "the test split holds no scene" in str(empty.exception)
+    missing = expect_mistake("evaluate", tmp_path / "no", *data)
+    assert "no such file or folder" in missing
+    assert "the test split holds no scene" in expect_mistake("evaluate", weights, *data)
 
 
 @pytest.mark.slow("references")
@@ -339,7 +330,7 @@ def test_the_command_shows_the_path_tracer_in_the_networks_time(
 ) -> None:
     out = tmp_path / "out"
     data = ["--data", str(dataset.folder.root), "--split", "validation"]
-    told = trilight(["evaluate", weights, *data, "--out", str(out)]).output
+    told = expect_output("evaluate", weights, *data, "--out", out)
     found = json.loads((out / "evaluation.json").read_text())
     assert TRACER in found["contestants"] and found["path tracer"]["views"] == 6
     assert found["path tracer"]["network_further_s"] > 0 and "and the path tracer" in told

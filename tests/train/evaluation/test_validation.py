@@ -31,7 +31,6 @@ from train.data.scenes import training_scene
 from train.evaluation.evaluate import (
     CAPTION,
     TRACER,
-    EvalConfig,
     Filter,
     Level,
     Price,
@@ -48,7 +47,6 @@ from train.evaluation.metrics import (
     METRICS,
     NETWORK,
     VALIDATED,
-    JudgedView,
     Scores,
     fraction_better,
     lead,
@@ -198,16 +196,12 @@ class StoredTargets(RendererHere):
         return SceneHere(render_image=show)
 
 
-@pytest.fixture(scope="module")
-def judging(tmp_path_factory: pytest.TempPathFactory) -> tuple[EvalConfig, list[JudgedView]]:
-    dataset = write_toy_dataset(tmp_path_factory.mktemp("toy"), train=1, validation=3)
+def test_both_are_judged_on_the_same_views_and_shown(tmp_path: Path) -> None:
+    """What takes longer and what is missing is said; sheets show it beside the prediction."""
+    dataset = write_toy_dataset(tmp_path, train=1, validation=3)
     contest = eval_config(dataset, resolution=32, tracer_views=3)
     contest = dataclasses.replace(contest, tracer=StoredTargets(list(contest.samples())))
-    return contest, judge_views(contest, lambda: None)
-
-
-def test_both_are_judged_on_the_same_views(judging: tuple[EvalConfig, list[JudgedView]]) -> None:
-    _, views = judging
+    views = judge_views(contest, lambda: None)
     assert [TRACER in view.scores for view in views] == [True, False] * 3
     found = equal_time(views, TIMES, "the first view of each scene")
     assert found["views"] == 3
@@ -221,12 +215,6 @@ def test_both_are_judged_on_the_same_views(judging: tuple[EvalConfig, list[Judge
     assert "takes 0.022 (0.025) with 4 samples a pixel and its fast filter." in page
     assert "takes the network 0.06 CPU seconds, the first of a scene 0.12" in page
     assert list(record(views, {}, found)["contestants"]) == [NETWORK], "a column is of all views"
-
-
-def test_what_takes_longer_and_what_is_missing_is_said(
-    judging: tuple[EvalConfig, list[JudgedView]],
-) -> None:
-    _, views = judging
     dearest = {"samples": 1, "denoiser": "fast", "first_s": 0.1, "further_s": 0.07, "note": "slow"}
     dear = TIMES | {"preview": dearest}
     told = " ".join(sentences(equal_time(views, dear, "all")))
@@ -238,12 +226,6 @@ def test_what_takes_longer_and_what_is_missing_is_said(
     page = evaluation_page(record(views, {}, equal_time(views, lacking, "all")))
     assert own in page and "is not shown: no tracer here." in page
     assert "own time" not in evaluation_page(record(views, {}))
-
-
-def test_sheets_show_it_beside_the_prediction(
-    judging: tuple[EvalConfig, list[JudgedView]], tmp_path: Path
-) -> None:
-    contest, views = judging
     alone = draw_sheet(sheet_views(dataclasses.replace(contest, tracer=None), views), ("title",))
     shown = sheet_views(contest, views)
     # the target went through float32 logarithms

@@ -8,7 +8,6 @@ import errno
 import json
 import os
 import signal
-import subprocess
 import sys
 import threading
 from collections.abc import Callable, Iterator
@@ -28,11 +27,10 @@ from storage.digests import seal_of
 from storage.errors import TrilightError
 from storage.records.safe_read import read_safetensors
 from storage.settings.described import from_record, settings_record
-from tests.conftest import ROOT
+from tests.command_line import run_program
 from tests.extensions_kit import EXAMPLES, loaded, written
-from tests.for_each import for_each
-from tests.train.kit import ALONE, TINY_MODEL, flip_a_bit, stepper, tiny_run, toy_batch, trained
-from train.data.buckets import TrainingBatch
+from tests.for_each import case, for_each
+from tests.train.kit import ALONE, TINY_MODEL, flip_a_bit, take_step, tiny_run, toy_batch, trained
 from train.folder import RunFolder
 from train.loop import checkpoints, interrupts
 from train.loop.checkpoints import (
@@ -50,7 +48,8 @@ from train.progress import TrainProgress
 from train.resume import plan_resume
 from train.settings import TrainSettings, known_settings
 
-CASES = [("fsync", "before"), ("replace", "before"), ("replace", "after"), ("unlink", "before")]
+KILLED_AT = {"fsync before": 1, "replace before": 1, "replace after": 2, "unlink before": 2}
+"""The newest whole step of two, by the call at which a process is killed that saves the second."""
 
 CHILD = """
 import json, os, signal, sys
@@ -91,16 +90,6 @@ for case in sys.argv[3:]:
 """
 
 
-@pytest.fixture(scope="module")
-def killed(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """Return a folder with one of each case, which a killed process has left."""
-    folder, cases = tmp_path_factory.mktemp("killed"), [" ".join(case) for case in CASES]
-    settings = json.dumps(settings_record(tiny_run()))
-    command = [sys.executable, "-c", CHILD, str(folder), settings, *cases]
-    subprocess.run(command, cwd=ROOT, check=True)
-    return folder
-
-
 def test_the_newest_and_the_milestones_stay(tmp_path: Path) -> None:
     keep(tmp_path, 4, 8, 10, 12, 16, 20, 24, checkpoints_kept=2, keep_every=10)
     assert saved_steps(tmp_path) == [10, 20, 24]
@@ -112,14 +101,18 @@ def test_the_newest_and_the_milestones_stay(tmp_path: Path) -> None:
     assert saved_steps(tmp_path / "wsd") == [20, 24]
 
 
-@for_each(("call", "when"), CASES)
-def test_killed_while_saving_leaves_a_whole_one(killed: Path, call: str, when: str) -> None:
-    folder = killed / f"{call} {when}"
-    newest = newest_checkpoint(folder, ALONE, pytest.fail)
-    step = restore_state(newest, plan_resume(newest.header, tiny_run(), "", {})).step
-    assert step == (1 if (call, when) in (("fsync", "before"), ("replace", "before")) else 2)
-    keep(folder, 3)
-    assert not list(folder.glob("*.part")), "what the killed one left is cleared away"
+def test_killed_while_saving_leaves_a_whole_one(tmp_path: Path) -> None:
+    """A process leaves a folder for each call before or after which it is killed."""
+    settings = json.dumps(settings_record(tiny_run()))
+    run_program([sys.executable, "-c", CHILD, str(tmp_path), settings, *KILLED_AT])
+    for name, left in KILLED_AT.items():
+        with case(name):
+            newest = newest_checkpoint(tmp_path / name, ALONE, pytest.fail)
+            going = plan_resume(newest.header, tiny_run(), "", {})
+            assert restore_state(newest, going).step == left
+            keep(tmp_path / name, 3)
+            left_over = list((tmp_path / name).glob("*.part"))
+            assert not left_over, "what the killed one left is cleared away"
 
 
 def keep(folder: Path, *steps: int, **changes: Any) -> None:
@@ -249,20 +242,9 @@ DIGEST = "d" * 64
 
 def stepped(steps: int = 3) -> TrainState:
     state = new_state(tiny_run())
-    batch = toy_batch(0)
     for _ in range(steps):
-        one_step(state, batch)
+        take_step(state, [toy_batch(0)], 1e-3)
     return state
-
-
-def one_step(state: TrainState, batch: TrainingBatch) -> None:
-    stepper(state).step([batch], 1e-3)
-    state.step += 1
-
-
-def equal_weights(one: TrainState, other: TrainState) -> bool:
-    ours, theirs = one.model.state_dict(), other.model.state_dict()
-    return all(torch.equal(ours[key], theirs[key]) for key in ours)
 
 
 def save(folder: Path, state: TrainState) -> Path:
@@ -283,11 +265,11 @@ def test_equal_states_give_equal_bytes_and_skipped_steps_are_no_updates(tmp_path
     state = stepped(2)
     state.step, state.skipped_steps = 5, 3
     loaded = load(save(tmp_path / "c", state))
-    batch = toy_batch(1)
-    one_step(loaded, batch)
-    one_step(state, batch)
+    for each in (loaded, state):
+        take_step(each, [toy_batch(1)], 1e-3)
     # AdamW's steps are the longer the fewer it believes to have done
-    assert equal_weights(loaded, state)
+    ours, theirs = loaded.model.state_dict(), state.model.state_dict()
+    assert all(torch.equal(ours[key], theirs[key]) for key in ours)
 
 
 def test_nothing_may_be_missing_and_no_bit_may_flip(tmp_path: Path) -> None:

@@ -5,7 +5,6 @@ in float32. A rate rises once and falls once; its constant part knows nothing of
 formula of the work agrees with torch's counter.
 """
 
-import copy
 import dataclasses
 import math
 from collections.abc import Sequence
@@ -19,14 +18,14 @@ from torch import Tensor
 from torch.nn.attention import SDPBackend, sdpa_kernel
 from torch.utils.flop_counter import FlopCounterMode
 
-from model.config import BaseWidths, ModelConfig
+from model.config import BaseWidths
 from model.costs import Workload, training_flops
 from model.renderformer import RenderFormer
 from model.width_scales import width_scales
 from tests.for_each import for_each
 from tests.train.kit import TINY_MODEL, tiny_run
 from tests.train.toy import toy_sample
-from train.data.buckets import TrainingBatch, collate_batch
+from train.data.buckets import collate_batch
 from train.data.scenes import TrainingScene, training_scene
 from train.loop import optimizer as muon_file
 from train.loop.distributed import DistributedContext
@@ -71,10 +70,7 @@ def moved(model: RenderFormer, optimizer: Optimizer) -> dict[str, torch.Tensor]:
 
 
 def test_without_muon_it_is_torchs_adamw() -> None:
-    model = with_gradients()
-    twin = copy.deepcopy(model)
-    for ours, theirs in zip(model.parameters(), twin.parameters(), strict=True):
-        theirs.grad = None if ours.grad is None else ours.grad.clone()
+    model, twin = with_gradients(), with_gradients()
     settings = tiny_run(weight_decay=0.1)
     optimizer = Optimizer(model, settings, "float32")
     assert optimizer.muon_precision is None
@@ -128,12 +124,8 @@ def test_what_is_said_not_to_decay_does_not() -> None:
 
 
 def test_muon_leaves_inputs_tokens_and_the_head_and_takes_queries_keys_and_values_apart() -> None:
-    model = with_gradients()
+    model, twin = with_gradients(), with_gradients()
     settings = tiny_run(muon_rate=3.0, weight_decay=0, muon_takes="hidden")
-    twin = copy.deepcopy(model)
-    for ours, theirs in zip(twin.parameters(), model.parameters(), strict=True):
-        assert theirs.grad is not None
-        ours.grad = theirs.grad.clone()
     without = moved(twin, Optimizer(twin, tiny_run(weight_decay=0), "float32"))
     steps = moved(model, Optimizer(model, settings, "float32"))
     for name, step in steps.items():
@@ -186,18 +178,6 @@ RESOLUTION = 16
 DEEPER = dataclasses.replace(TINY_MODEL, encoder_layers=2, decoder_layers=2)
 
 
-def counted(config: ModelConfig, batch: TrainingBatch) -> int:
-    """Count a real forward and backward pass; the plain attention is the one that counts all."""
-    with sdpa_kernel(SDPBackend.MATH), FlopCounterMode(display=False) as counter:
-        RenderFormer(config)(batch.scenes, RESOLUTION).sum().backward()
-    return int(counter.get_total_flops())
-
-
-def flops(num_triangles: int) -> int:
-    workload = Workload(triangles=num_triangles, views=2, resolution=RESOLUTION)
-    return training_flops(DEEPER, workload)
-
-
 def with_triangles(count: int) -> TrainingScene:
     scene = training_scene(toy_sample(0), RESOLUTION)
     old = scene.tensors
@@ -213,9 +193,14 @@ def with_triangles(count: int) -> TrainingScene:
 
 @for_each("boxes", [1, 5])
 def test_the_formula_says_what_any_scene_needs(boxes: int) -> None:
-    found = counted(DEEPER, collate_batch([with_triangles(12 * boxes)]))
+    """By a real forward and backward pass; the plain attention is the one that counts all."""
+    batch = collate_batch([with_triangles(12 * boxes)])
+    with sdpa_kernel(SDPBackend.MATH), FlopCounterMode(display=False) as counter:
+        RenderFormer(DEEPER)(batch.scenes, RESOLUTION).sum().backward()
+    workload = Workload(triangles=12 * boxes, views=2, resolution=RESOLUTION)
     # a first layer needs no gradient of its inputs, which our factor of 3 counts: below 10 %
-    assert flops(12 * boxes) == pytest.approx(found, rel=0.1)
+    expected = pytest.approx(int(counter.get_total_flops()), rel=0.1)
+    assert training_flops(DEEPER, workload) == expected
 
 
 JORDAN = (3.4445, -4.7750, 2.0315)

@@ -21,6 +21,7 @@ from storage.seeds import rng_for
 from tests.command_line import run_program
 from tests.conftest import ROOT
 from tests.infra.slurm.test_jobs import commands_in
+from tests.train.kit import require_same_run
 from train.folder import read_rows
 
 SMALL = {
@@ -41,9 +42,6 @@ SMALL = {
     "augmentation.rotation": "uniform",
 }
 """In this order, since each change must fit to those before it."""
-
-CURVE = ("step", "loss", "l1", "grad_norm", "learning_rate", "validation", "layers", "spike")
-"""What a row of the log says of the training itself."""
 
 
 def command(dataset: Dataset, out: Path, processes: int, *rest: str, **changes: object) -> list:
@@ -78,17 +76,8 @@ def run(dataset: Dataset, out: Path, processes: int, *rest: str, **changes: obje
     return out
 
 
-def weights(out: Path) -> dict[str, np.ndarray]:
-    return load_file(out / "checkpoints/step-000000008.safetensors")
-
-
-@pytest.fixture(scope="module")
-def alone(dataset: Dataset, tmp_path_factory: pytest.TempPathFactory) -> Path:
-    return run(dataset, tmp_path_factory.mktemp("alone"), 1)
-
-
 def same_to_rounding(ours: Path, theirs: Path) -> None:
-    a, b = weights(ours), weights(theirs)
+    a, b = (load_file(out / "checkpoints/step-000000008.safetensors") for out in (ours, theirs))
     assert a.keys() == b.keys()
     one = np.concatenate([a[name].ravel() for name in sorted(a)])
     other = np.concatenate([b[name].ravel() for name in sorted(a)])
@@ -106,25 +95,17 @@ def same_to_rounding(ours: Path, theirs: Path) -> None:
     np.testing.assert_allclose(first, second, rtol=1e-4)
 
 
-def curve(out: Path) -> list[dict]:
-    """Return the log without what clocks and memory say."""
-    rows = read_rows(out / "metrics.jsonl")
-    return [{name: row[name] for name in CURVE if name in row} for row in rows]
-
-
-def test_several_processes_train_as_one(dataset: Dataset, alone: Path, tmp_path: Path) -> None:
+def test_several_processes_and_passes_that_add_up_train_as_one_batch_of_one(
+    dataset: Dataset, tmp_path: Path
+) -> None:
+    alone = run(dataset, tmp_path / "alone", 1)
+    same_to_rounding(run(dataset, tmp_path / "passes", 1, scenes_per_pass=1), alone)
     several = run(dataset, tmp_path / "several", 2)
     same_to_rounding(several, alone)
     settings = json.loads((several / "settings.json").read_text())
     assert settings["processes"] == 2
     rows = [row["step"] for row in read_rows(several / "metrics.jsonl") if "loss" in row]
     assert rows == [2, 4, 6, 8], "one process writes"
-
-
-def test_passes_that_add_up_train_as_one_batch(
-    dataset: Dataset, alone: Path, tmp_path: Path
-) -> None:
-    same_to_rounding(run(dataset, tmp_path / "passes", 1, scenes_per_pass=1), alone)
 
 
 LONGER = {"num_steps": 60, "validate_every": 20, "checkpoint_every": 20, "muon_rate": 3.0}
@@ -138,13 +119,6 @@ def undisturbed(
     return functools.cache(
         lambda processes: run(dataset, tmp_path_factory.mktemp("whole"), processes, **LONGER)
     )
-
-
-def same_to_the_bit(out: Path, whole: Path) -> None:
-    names = ("model.safetensors", "checkpoints/step-000000060.safetensors", "validation_sheet.png")
-    for name in names:
-        assert (out / name).read_bytes() == (whole / name).read_bytes(), name
-    assert curve(out) == curve(whole)
 
 
 def started(words: list, **variables: str) -> "subprocess.Popen[str]":
@@ -182,7 +156,7 @@ def test_several_processes_that_are_stopped_go_on_to_the_bit(
     assert 0 < stopped < 60
     assert f"stopped at step {stopped} by a signal" in errors
     run(dataset, out, processes, "--resume", **LONGER)
-    same_to_the_bit(out, undisturbed(processes))
+    require_same_run(out, undisturbed(processes))
 
 
 @pytest.mark.slow("training")
@@ -200,7 +174,7 @@ def test_processes_that_are_killed_at_random_are_restarted_to_the_bit(
     os.kill(children(torchrun.pid)[rng.integers(2)], signal.SIGKILL)
     _, errors = torchrun.communicate()
     assert torchrun.returncode == 0, errors
-    same_to_the_bit(out, undisturbed(2))
+    require_same_run(out, undisturbed(2))
     texts = [row["text"] for row in read_rows(out / "notes.jsonl")]
     assert len([text for text in texts if text.endswith("on cpu, 2 processes")]) == 2
 
@@ -228,4 +202,4 @@ def test_a_job_of_slurm_whose_time_is_up_goes_on_to_the_bit(
     _, errors = job.communicate()
     assert job.returncode == 0, errors
     assert "by a signal, nothing is lost" in errors
-    same_to_the_bit(tmp_path / "job", undisturbed(2))
+    require_same_run(tmp_path / "job", undisturbed(2))

@@ -26,7 +26,7 @@ from model.view_decoder import Fusion
 from storage.errors import TrilightError
 from tests.for_each import for_each
 from tests.model.kit import awake, picture_and_gradients, random_scene, tiny_config
-from tests.train.kit import CPU, stepper, tiny_run, toy_batch, trained
+from tests.train.kit import CPU, stepper, take_step, tiny_run, toy_batch, trained
 from tests.train.loop.test_optimizer import with_gradients
 from tests.train.toy import toy_sample, write_toy_dataset
 from train.data.buckets import TrainingBatch, bucket_scenes, collate_batch
@@ -36,7 +36,7 @@ from train.loop import optimizer
 from train.loop import step as step_module
 from train.loop.checkpoints import read_checkpoint
 from train.loop.optimizer import Decision, Optimizer, move_along, move_towards
-from train.loop.step import Stepper, StepReport, compile_parts, compiled_parts, predict_log10
+from train.loop.step import Stepper, compile_parts, compiled_parts, predict_log10
 from train.loop.train_state import TrainState, ema_step, new_state
 from train.loss.training_loss import TrainingLoss
 from train.settings import Compile, LossSettings, Precision
@@ -44,15 +44,9 @@ from train.settings import Compile, LossSettings, Precision
 RESOLUTION = 16
 
 
-def step(state: TrainState, batches: list[TrainingBatch]) -> StepReport:
-    report = stepper(state).step(batches, 3e-3)
-    state.step += 1
-    return report
-
-
 def gradients(batches: list[TrainingBatch]) -> tuple[float, list[Tensor]]:
     state = new_state(tiny_run(grad_clip=1e9))
-    report = step(state, batches)
+    report = take_step(state, batches)
     return report.loss, [w.grad.clone() for w in state.model.parameters() if w.grad is not None]
 
 
@@ -90,10 +84,10 @@ def test_a_step_that_is_not_finite_changes_nothing(
 ) -> None:
     state = new_state(tiny_run(ema_decay=0.5, muon_rate=muon_rate), muon_precision=precision)
     batch = toy_batch(0, 1)
-    assert step(state, [batch]).applied
+    assert take_step(state, [batch]).applied
     ruin(state, batch)
     before = copy.deepcopy(tensors(state))
-    assert not step(state, [batch]).applied
+    assert not take_step(state, [batch]).applied
     for name, each in tensors(state).items():
         torch.testing.assert_close(each, before[name], rtol=0, atol=0, equal_nan=True, msg=name)
 
@@ -105,8 +99,7 @@ def test_the_mean_follows_the_weights_faster_at_first() -> None:
     batch = toy_batch(0, 1)
     by_hand = state.model.decoder.rays.weight.detach().clone()
     for updates in range(12):
-        stepper(state).step([batch], 3e-3)
-        state.step += 1
+        take_step(state, [batch])
         decay = min(0.5, (1 + updates) / (10 + updates))
         by_hand = decay * by_hand + (1 - decay) * state.model.decoder.rays.weight.detach()
     # float32, 12 updates
@@ -150,7 +143,7 @@ def test_a_step_asks_no_generator() -> None:
     """What does not exist need not be saved: a resumed run is the same whatever the state here."""
     state = new_state(tiny_run())
     before = torch.get_rng_state(), np.random.get_state(legacy=True)[1].copy()  # type: ignore[index] # noqa: NPY002
-    step(state, [toy_batch(0, 1)])
+    take_step(state, [toy_batch(0, 1)])
     assert torch.equal(torch.get_rng_state(), before[0])
     assert np.array_equal(np.random.get_state(legacy=True)[1], before[1])  # type: ignore[index] # noqa: NPY002
 
@@ -158,7 +151,7 @@ def test_a_step_asks_no_generator() -> None:
 def test_the_report_says_how_bright_and_how_long_before_clipping() -> None:
     batch = toy_batch(0, 1)
     state = new_state(tiny_run())
-    report = step(state, [batch])
+    report = take_step(state, [batch])
     mean = batch.target_BVRR3.mean().item()
     assert report.l1 == report.loss == pytest.approx(mean, rel=1e-4), "a black start"
     assert report.brightness == 0
@@ -167,11 +160,11 @@ def test_the_report_says_how_bright_and_how_long_before_clipping() -> None:
         last.load_state_dict(
             {"weight": torch.zeros_like(last.weight), "bias": torch.full((192,), mean / 2)}
         )
-    assert step(state, [batch]).brightness == pytest.approx(0.5, rel=1e-4)  # float32 sums
+    assert take_step(state, [batch]).brightness == pytest.approx(0.5, rel=1e-4)  # float32 sums
     lengths = []
     for clip in (1e-3, 1e9):
         state = new_state(tiny_run(grad_clip=clip))
-        report = step(state, [batch])
+        report = take_step(state, [batch])
         grads = [w.grad.flatten() for w in state.model.parameters() if w.grad is not None]
         lengths.append((report.grad_norm, torch.cat(grads).norm().item()))
     (free, shortened), (free_again, unclipped) = lengths
@@ -373,10 +366,10 @@ def test_no_way_back_of_the_head_is_a_scatter() -> None:
     """Sums by atomics were 17 of 195 ms of a step of Base on an H100, and in any order."""
     fusion = Fusion(4, deepest=True)
 
-    def step() -> None:
+    def forth_and_back() -> None:
         torch.compile(fusion)(None, torch.randn(1, 4, 4, 4), (8, 8)).sum().backward()
 
-    _, codes = run_and_get_code(step)
+    _, codes = run_and_get_code(forth_and_back)
     assert any("mm(" in code for code in codes), "the products are among what is looked through"
     assert not any("index_put" in code for code in codes)
 
@@ -424,8 +417,7 @@ def _uncompilable(monkeypatch: pytest.MonkeyPatch, compile: Compile) -> Stepper:
     """Return a stepper on the processor whose compiler, as on some card, fails."""
     monkeypatch.setattr(step_module, "_is_worthwhile", lambda _: True)
     _compile_by(monkeypatch, _fails_to_compile)
-    run = tiny_run(compile=compile)
-    return stepper(new_state(run))
+    return stepper(new_state(tiny_run(compile=compile)))
 
 
 def test_what_cannot_be_compiled_is_trained_all_the_same(monkeypatch: pytest.MonkeyPatch) -> None:
