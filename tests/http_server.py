@@ -226,11 +226,12 @@ class _SiteHandler(Handler):
         body = data[first:][:stop]
         step, pause_s = fault.trickle or (max(len(body), 1), 0.0)
         for start in range(0, len(body), step):
-            self.wfile.write(body[start : start + step])
+            piece = body[start : start + step]
+            with self.site.lock:  # counted first: who asked may look as soon as he has the last one
+                self.site.sent += len(piece)
+            self.wfile.write(piece)
             if self.site.closing.wait(pause_s):
                 break
-        with self.site.lock:
-            self.site.sent += len(body)
         if fault.stall_after is not None:
             self.site.closing.wait(20)
 

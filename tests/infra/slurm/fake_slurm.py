@@ -66,7 +66,7 @@ def sbatch(words: list[str]) -> int:
                 time.sleep(POLL_S)
                 if _taken("time-is-up"):
                     shell.send_signal(signal.Signals[f"SIG{name}"])
-                if _taken("cancel"):
+                if (PLACE / "steps").exists() and _taken("cancel"):
                     for pid in (PLACE / "steps").read_text().split():
                         os.kill(int(pid), signal.SIGTERM)
         starts += 1
@@ -122,7 +122,9 @@ def srun(words: list[str]) -> int:
         named = {name: str(number) for name, number in ranks.items()}
         environment = own | named | {"SLURMD_NODENAME": "localhost"}
         tasks.append(subprocess.Popen(command, env=environment, start_new_session=True))
-    (PLACE / "steps").write_text(" ".join(str(task.pid) for task in tasks))
+    begun = PLACE / "steps.part"
+    begun.write_text(" ".join(str(task.pid) for task in tasks))
+    begun.rename(PLACE / "steps")  # whole, since who cancels may look at any time
     for late in early:
         pass_on(late)
     return max(task.wait() % 256 for task in tasks)

@@ -36,8 +36,8 @@ from tests.conftest import ROOT
 from tests.for_each import for_each
 from tests.pipeline.isolation import called
 
-LIMITS = ChildLimits(memory_bytes=2 << 30, wall_s=2, calls_per_child=3)
-PATIENT = dataclasses.replace(LIMITS, wall_s=60, calls_per_child=9)
+LIMITS = ChildLimits(memory_bytes=2 << 30, wall_s=60, calls_per_child=3)
+LASTING = dataclasses.replace(LIMITS, calls_per_child=9)
 
 
 @pytest.fixture
@@ -135,7 +135,7 @@ def test_closing_frees_a_waiting_caller(child: IsolatedChild) -> None:
 @pytest.mark.slow("kills")
 def test_processor_seconds_are_for_one_call_each() -> None:
     """A call that uses them up ends its child; several that stay below do not add up."""
-    with closing(IsolatedChild(limits=dataclasses.replace(PATIENT, cpu_s=1))) as child:
+    with closing(IsolatedChild(limits=dataclasses.replace(LASTING, cpu_s=1))) as child:
         assert len({child.call(called.burn, 0.6) for _ in range(3)}) == 1
         with pytest.raises(ChildFailed, match="timeout_cpu: used its 1 processor seconds"):
             child.call(called.burn, 30.0)
@@ -144,7 +144,7 @@ def test_processor_seconds_are_for_one_call_each() -> None:
 
 def test_waiting_uses_no_processor_seconds() -> None:
     """It uses the time of its call, and costs no more than that."""
-    limits = dataclasses.replace(PATIENT, wall_s=1.5, cpu_s=1)
+    limits = dataclasses.replace(LASTING, wall_s=3, cpu_s=1)
     with closing(IsolatedChild(limits=limits)) as child:
         with pytest.raises(ChildFailed, match="timeout_wall"):
             child.call(called.hang)
@@ -166,7 +166,7 @@ def watched(monkeypatch: pytest.MonkeyPatch) -> Iterator[IsolatedChild]:
     monkeypatch.setattr(answers, "LOOK_S", 0.05)
     monkeypatch.setattr(answers, "LOOKS_BEFORE_KILL", 15)
     monkeypatch.setattr(call_failures, "_PAUSE_S", 0.0)
-    with closing(IsolatedChild(limits=PATIENT)) as watched:
+    with closing(IsolatedChild(limits=LASTING)) as watched:
         yield watched
 
 
