@@ -27,6 +27,7 @@ from tests.command_line import trilight
 from tests.for_each import for_each
 from tests.foreign_packages import nerfstudio_pictures
 from tests.pipeline.documents.dataset_by_hand import furnished, locked, sample, write_dataset
+from tests.pipeline.scenes.small_pool import ray_distances
 from tests.sky_maps import constant
 from tests.train.toy import VIEWS, toy_sample, write_toy_dataset
 
@@ -60,22 +61,6 @@ def rays_as_published(pose: NDArray, fov_deg: float, pixels: int) -> tuple[NDArr
     local = np.stack([(x - pixels / 2) / focal, -(y - pixels / 2) / focal, -np.ones_like(x)], -1)
     directions = (local[..., None, :] * pose[:3, :3]).sum(-1)
     return pose[:3, 3], directions / np.linalg.norm(directions, axis=-1, keepdims=True)
-
-
-def first_triangle(eye: NDArray, rays: NDArray, triangles: NDArray) -> NDArray[np.intp]:
-    """Row of the nearest triangle along each ray, -1 where there is none; by Moeller, Trumbore."""
-    a, b, c = np.moveaxis(triangles, 1, 0)
-    ab, ac = b - a, c - a
-    across = np.cross(rays[:, :, None], ac)
-    with np.errstate(divide="ignore", invalid="ignore"):
-        scale = 1 / (across * ab).sum(-1)
-        u = scale * ((eye - a) * across).sum(-1)
-        turned = np.cross(eye - a, ab)
-        v = scale * (rays @ turned.T)
-        depth = scale * (turned * ac).sum(-1)
-        met = (u >= 0) & (v >= 0) & (u + v <= 1) & (depth > 1e-6)
-    depth = np.where(met, depth, np.inf)
-    return np.where(met.any(-1), depth.argmin(-1), -1)
 
 
 @pytest.mark.parametrize("key", KEYS)
@@ -113,7 +98,10 @@ def test_published_rays_meet_the_triangles_of_our_pictures(benchmark: Path, key:
     for view in range(VIEWS):
         pose = found["c2w"][view].astype(np.float64)
         eye, rays = rays_as_published(pose, float(found["fov"][view]), PX)
-        met = first_triangle(eye, rays, solid.astype(np.float64))
+        flat = rays.reshape(-1, 3)
+        depth = ray_distances(np.broadcast_to(eye, flat.shape), flat, solid.astype(np.float64))
+        nearest = np.where(np.isfinite(depth).any(-1), depth.argmin(-1), -1)
+        met = nearest.reshape(PX, PX)
         expected = sample.view_passes(["triangle"], view=view)["triangle"]
         assert (met == expected).mean() > 0.99, "edges aside, which two triangles share"
         assert len(np.unique(met)) > 3
