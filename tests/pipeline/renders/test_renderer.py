@@ -135,16 +135,23 @@ def test_views_do_not_depend_on_the_views_before_them() -> None:
     assert digest(renderer.render_view(scene.c2w[0], 40.0, seed=7)) != first[0]
 
 
-def test_sampling_stops_at_the_target_or_at_the_cap() -> None:
-    scene = simple_scene()
-    easy = render_view(scene, dataclasses.replace(GROWING, noise_floor_db=10.0))
+def test_sampling_stops_at_the_targets_or_at_the_cap() -> None:
+    scene, most = simple_scene(), dataclasses.replace(GROWING, noise_floor_db=10.0, max_spp=4096)
+    easy = render_view(scene, most)
     assert easy.spp == 64 and not easy.at_cap
     hard = render_view(scene, dataclasses.replace(GROWING, noise_floor_db=95.0))
     assert hard.spp == 256 and hard.at_cap
     between = easy.noise_floor_db + 2
-    wanted = render_view(scene, dataclasses.replace(GROWING, noise_floor_db=between, max_spp=4096))
+    wanted = render_view(scene, dataclasses.replace(most, noise_floor_db=between))
     assert wanted.noise_floor_db >= between and not wanted.at_cap
     assert 64 < wanted.spp < 4096 and wanted.spp % 32 == 0
+    # a linear target goes on where the log one is reached
+    linear_db = easy.noise_floor_linear_db + 1
+    both = render_view(scene, dataclasses.replace(most, noise_floor_linear_db=linear_db))
+    assert both.spp > easy.spp
+    assert both.noise_floor_linear_db >= linear_db and not both.at_cap
+    alone = dataclasses.replace(most, noise_floor_db=None, noise_floor_linear_db=linear_db)
+    assert digest(render_view(scene, alone)) == digest(both)
 
 
 def test_a_view_says_how_far_it_is() -> None:
@@ -171,17 +178,6 @@ def test_halves_of_many_samples_have_the_best_filter(monkeypatch: pytest.MonkeyP
     denoise.reset_mock()
     render_view(simple_scene(), dataclasses.replace(settings, denoiser="fast"))
     assert [call.args[2] for call in denoise.call_args_list] == ["fast"] * 5
-
-
-def test_a_linear_target_goes_on_where_the_log_one_is_reached() -> None:
-    easy = dataclasses.replace(GROWING, noise_floor_db=10.0, max_spp=4096)
-    first = render_view(simple_scene(), easy)
-    wanted = first.noise_floor_linear_db + 1
-    both = render_view(simple_scene(), dataclasses.replace(easy, noise_floor_linear_db=wanted))
-    assert both.spp > first.spp == 64
-    assert both.noise_floor_linear_db >= wanted and not both.at_cap
-    alone = dataclasses.replace(easy, noise_floor_db=None, noise_floor_linear_db=wanted)
-    assert digest(render_view(simple_scene(), alone)) == digest(both)
 
 
 def test_every_target_counts_at_the_cap() -> None:

@@ -235,7 +235,7 @@ LAMP = np.array([[-0.5, -1.5, 2], [0.5, -1.5, 2], [0, -1, 2.4]])
 
 
 @pytest.mark.parametrize(("kind", "max_spp"), [*zip(KINDS, (32, 32, 1024), strict=True)])
-def test_the_stored_picture_is_the_sum_of_its_parts(kind: dict[str, bool], max_spp: int) -> None:
+def test_the_stored_picture_is_the_sum_of_its_parts(kind: dict[str, Any], max_spp: int) -> None:
     """To the last bit, with pictures that the denoiser made and some whose glints are kept."""
     settings = dataclasses.replace(SETTINGS, max_spp=max_spp, noise_floor_db=90.0, **kind)
     view = render_view(mirrors(), settings)
