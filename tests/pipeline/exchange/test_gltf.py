@@ -21,7 +21,6 @@ from storage.errors import TrilightError
 from storage.records.asset import Level
 from storage.records.lookup import environment_values
 from storage.records.material import DIFFUSE, EMISSION, ROUGHNESS, SPECULAR
-from storage.records.scene import Scene
 from tests import textured_by_hand as textured
 from tests.for_each import for_each
 from tests.pipeline.assets.meshes_by_hand import geometry, prepare, write_glb
@@ -185,17 +184,13 @@ def test_coordinates_that_are_not_finite_are_refused(tmp_path: Path) -> None:
         read(tmp_path, uv=broken)
 
 
-def there_and_back(folder: Path, scene: Scene) -> Scene:
-    write_scene(folder / "a.glb", scene)
-    return read_gltf(folder / "a.glb").scene
-
-
 @for_each("specular", [(0.2, 0.2, 0.2), (0, 0, 0), (0.4, 0.1, 0.3), (0.9, 0.5, 0.1)])
 def test_a_scene_comes_back(tmp_path: Path, specular: tuple[float, float, float]) -> None:
     materials = tiny_scene().materials.copy()
     materials[FLOOR, DIFFUSE], materials[FLOOR, SPECULAR] = (0.1, 0.05, 0.3), specular
     scene = tiny_scene(materials=materials)
-    found = there_and_back(tmp_path, scene)
+    write_scene(tmp_path / "a.glb", scene)
+    found = read_gltf(tmp_path / "a.glb").scene
     assert found.num_triangles == scene.num_triangles
     for name in ("c2w", "fov_deg"):
         np.testing.assert_allclose(getattr(found, name), getattr(scene, name), atol=1e-6)
@@ -230,7 +225,8 @@ def test_two_textured_albedos_of_different_widths_are_one_grid(tmp_path: Path) -
     index = np.full((2, 3), -1, np.int32)
     index[FLOOR] = [0, 1, 2]
     scene = textured.textured_scene(0, wide, glossy, rough, material_textures=index)
-    found = there_and_back(tmp_path, scene)
+    write_scene(tmp_path / "a.glb", scene)
+    found = read_gltf(tmp_path / "a.glb").scene
     row = found.material_index[0]
     kept = scene.materials[FLOOR]
     assert found.materials[row, ROUGHNESS] == pytest.approx(rough.mean[0], abs=0.01)

@@ -6,7 +6,6 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
-import trimesh
 from numpy.typing import ArrayLike, NDArray
 
 from storage.conventions import look_at_c2w
@@ -85,9 +84,17 @@ def box(
     kind: ObjectKind = "object",
 ) -> Part:
     """Return a flat cube of 12 triangles, turned about z by `turn` radians."""
-    mesh = trimesh.creation.box(extents=(size, size, size))
-    mesh.apply_transform(trimesh.transformations.rotation_matrix(turn, [0, 0, 1]))
-    return flat(mesh.triangles + np.asarray(centre, np.float64), material_row, kind)
+    corners = []
+    for axis in range(3):
+        for sign in (-1.0, 1.0):
+            normal, u, v = (np.eye(3)[(axis + step) % 3] for step in range(3))
+            normal, u = normal * sign, u * sign
+            ring = np.array([normal - u - v, normal + u - v, normal + u + v, normal - u + v])
+            corners.append(quad(ring * size / 2, material_row).triangles)
+    cos, sin = np.cos(turn), np.sin(turn)
+    rotation = np.array([[cos, -sin, 0], [sin, cos, 0], [0, 0, 1]])
+    placed = np.concatenate(corners) @ rotation.T + np.asarray(centre, np.float64)
+    return flat(placed, material_row, kind)
 
 
 def furnace(radiance: float = 1.0) -> Part:

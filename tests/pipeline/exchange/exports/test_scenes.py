@@ -181,16 +181,12 @@ def exported(dataset: Path, form: str, *words: str) -> Path:
     return out
 
 
-def samples(dataset: Path, split: str) -> list[Sample]:
-    return list(open_dataset(str(dataset)).samples(split))
-
-
 def test_nerfstudio(dataset: Path) -> None:
     """The form that its documentation states; the next test opens it there."""
     out = exported(dataset, "nerfstudio", "--scene", "1")
     assert [path.name for path in out.iterdir() if path.is_dir()] == ["000000001"]
     folder = out / "000000001"
-    _, made = samples(dataset, "train")
+    _, made = open_dataset(str(dataset)).samples("train")
     transforms: dict[str, Any] = json.loads((folder / "transforms.json").read_text())
     assert transforms["camera_model"] == "OPENCV"
     seen = made.view_passes(["position_m", "hit"], view=1)
@@ -216,7 +212,7 @@ def test_nerfstudio(dataset: Path) -> None:
 def test_its_rays_and_our_depth_lead_to_our_points(dataset: Path, foreign: None) -> None:
     """Opened by nerfstudio itself."""
     folder = exported(dataset, "nerfstudio", "--scene", "1") / "000000001"
-    _, made = samples(dataset, "train")
+    _, made = open_dataset(str(dataset)).samples("train")
     assert set(nerfstudio_pictures(folder, made)) == {0, 1}
 
 
@@ -232,7 +228,7 @@ def test_coco(dataset: Path) -> None:
     found = 0
     for image in coco.loadImgs(coco.getImgIds()):
         key, view, _ = image["file_name"].split(".")
-        (made,) = (each for each in samples(dataset, "train") if each.key == key)
+        (made,) = (each for each in open_dataset(str(dataset)).samples("train") if each.key == key)
         picture = np.asarray(Image.open(out / "train" / image["file_name"]))
         np.testing.assert_array_equal(picture, preview_srgb8(made.radiance_rgb[int(view)]))
         ids = made.view_passes(["object"], view=int(view))["object"]
@@ -259,7 +255,7 @@ def test_huggingface(dataset: Path, tmp_path: Path) -> None:
     out = exported(dataset, "huggingface")
     loaded = load_dataset(str(out), cache_dir=str(tmp_path / "cache"))
     assert {split: rows.num_rows for split, rows in loaded.items()} == {"train": 4, "test": 2}
-    made = {each.key: each for each in samples(dataset, "train")}
+    made = {each.key: each for each in open_dataset(str(dataset)).samples("train")}
     for row in loaded["train"]:
         one, view = made[row["scene"]], row["view"]
         picture = preview_srgb8(one.radiance_rgb[view])
@@ -277,7 +273,7 @@ def test_huggingface(dataset: Path, tmp_path: Path) -> None:
 def test_hypersim(dataset: Path) -> None:
     """As its README states it: https://github.com/apple/ml-hypersim."""
     out = exported(dataset, "hypersim", "--scene", "1") / "000000001"
-    _, made = samples(dataset, "train")
+    _, made = open_dataset(str(dataset)).samples("train")
     assert made.parts_rgb is not None
 
     def read(name: str) -> Any:
