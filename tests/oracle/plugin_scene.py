@@ -33,33 +33,21 @@ from numpy.typing import NDArray
 
 from pipeline.renders.light_tables import lamp_power, sky_share
 from pipeline.renders.tracer import split_triangles
-<<<<<<< HEAD
-from storage.optics import Lobes, Smith, bsdf_lobes, scattered_again
-from storage.records.lights import shining_sky
-from storage.records.material import EMISSION
-from storage.records.scene import Scene
-from tests.oracle.plugin_textures import (
-    PLUGIN,
-    normal_mapped,
-    plugin_sky,
-    register_textures,
-    textured_slots,
-=======
-from storage.optics import MIN_ALPHA, Lobes, bsdf_lobes
 from storage.optics import (
+    MIN_ALPHA,
     ROUGHNESS_STEPS,
     X_STEPS,
+    Lobes,
     Smith,
     albedo_table,
+    bsdf_lobes,
     mean_albedo,
     scattered_again,
->>>>>>> t3
 )
-from storage.records.texture import Environment
 from storage.records.lights import shining_sky
 from storage.records.material import EMISSION, laid_out
 from storage.records.scene import Scene
-from storage.records.texture import CONSTANT, TEXTURED
+from storage.records.texture import CONSTANT, TEXTURED, Environment
 
 PLUGIN = "compensated_specular"
 """Name in scene dictionaries; it has the textures specular, again (Fms) and alpha."""

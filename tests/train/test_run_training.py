@@ -352,22 +352,9 @@ def test_a_server_and_a_list_give_the_weights_of_the_folder(
     """
     pytest.importorskip("aiohttp", reason="http needs the package aiohttp")
     monkeypatch.setenv("NO_PROXY", "127.0.0.1")
-<<<<<<< HEAD
     monkeypatch.setattr(transfers, "PAUSE_S", 0.0)
-    with serve(dataset.folder.root) as running:
-        yield running
-
-
-def test_a_run_begun_in_a_folder_goes_on_from_a_server(
-    dataset: Dataset, expected: bytes, server: Site, tmp_path: Path
-) -> None:
-    """In the middle of an epoch, over a bad line, with another number of threads."""
-    out = tmp_path / "out"
-=======
-    monkeypatch.setattr(retries, "PAUSE_S", 0.0)
     expected = trained(RUN, dataset, tmp_path / "whole").folder.weights.read_bytes()
     out, listed, listener = tmp_path / "out", tmp_path / "listed", Heard()
->>>>>>> t3
     with pytest.raises(Killed):
         trained(RUN, dataset, out, progress=Heard(killed_at=5))
     faults = [Fault(status=503), Fault(cut_after=5000), Fault(flip=True)]

@@ -36,18 +36,14 @@ from model.hits.lit_scene import (
 from model.hits.radiosity import BOUNCES, scene_light
 from model.hits.vectors import dot, unit
 from model.hits.view_inputs import Channel
-<<<<<<< HEAD:tests/model/hits/test_reflectance.py
-from storage.optics import directional_albedo
-=======
 from model.inference import NeuralRenderer
 from model.renderformer import radiance
 from model.scene_tensors import scene_tensors
 from scene_templates.rotations import uniform_rotation
 from storage.errors import TrilightError
 from storage.optics import directional_albedo
-from storage.records.texture import Environment, row_solid_angles, texel_means
 from storage.records.lookup import environment_values
->>>>>>> t3:tests/model/hits/test_light.py
+from storage.records.texture import Environment, row_solid_angles, texel_means
 from tests.for_each import for_each
 from tests.model.hits.kit import FLOOR, LAMP, corner, direct, lit_scene, traced
 from tests.model.kit import awake, hits_config, render, tiny_config

@@ -31,7 +31,6 @@ from tests.for_each import for_each
 from tests.pipeline.assets import meshes_by_hand as meshes
 from tests.pipeline.programs import printed_by
 
-SETTINGS = AssetSettings()
 SMALL = meshes.knot(segments=80)
 
 
@@ -43,7 +42,7 @@ def asset(tmp_path_factory: pytest.TempPathFactory) -> Asset:
 
 def test_every_budget_is_kept_and_used_and_the_error_holds_on_other_points(asset: Asset) -> None:
     meshes.check_levels(asset)
-    assert [level.record.budget for level in asset.levels] == list(SETTINGS.budgets)
+    assert [level.record.budget for level in asset.levels] == list(AssetSettings().budgets)
     source, _ = orient_outward(meshes.cleaned(SMALL))
     surface = Surface(source, np.random.default_rng(99).random((8192, 3)))
     for level in asset.levels:

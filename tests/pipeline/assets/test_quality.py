@@ -261,17 +261,14 @@ def test_normals_of_a_corrugated_sheet_are_off_by_its_slope(slope_deg: float) ->
     assert quality.area_ratio == pytest.approx(np.cos(np.radians(slope_deg)), rel=1e-5)
 
 
-SETTINGS = AssetSettings()
-
-
 def test_remeshing_needs_some_area(tmp_path: Path) -> None:
     line = TriangleMesh(
         positions=np.outer(np.arange(6.0), [1.0, 2.0, 3.0]), faces=np.array([[0, 1, 2], [3, 4, 5]])
     )
-    path = write_obj(tmp_path / "line.obj", line)
-    assert len(load_mesh_file(path, "line", "line", SETTINGS, "MIT").faces) == 2
+    asked = (write_obj(tmp_path / "line.obj", line), "line", "line", AssetSettings(), "MIT")
+    assert len(load_mesh_file(*asked).faces) == 2
     with pytest.raises(TrilightError, match="line: remesh_failed"):
-        load_mesh_file(path, "line", "line", SETTINGS, "MIT", 100)
+        load_mesh_file(*asked, 100)
 
 
 def same(a: TriangleMesh, b: TriangleMesh) -> bool:
@@ -279,6 +276,7 @@ def same(a: TriangleMesh, b: TriangleMesh) -> bool:
 
 
 def test_cleaning_centres_fits_float32_forgets_order_size_and_place_and_twice_is_once() -> None:
+    """And a quarter turn turns the result."""
     mesh, rng = knot(), np.random.default_rng(1)
     result = cleaned(mesh)
     low, high = result.positions.min(axis=0), result.positions.max(axis=0)
@@ -294,14 +292,10 @@ def test_cleaning_centres_fits_float32_forgets_order_size_and_place_and_twice_is
         assert same(cleaned(moved(mesh, scale, offset * scale)), result), (scale, offset)
     once = cleaned(sphere())
     assert same(cleaned(once), once)
-
-
-def test_a_quarter_turn_turns_the_result() -> None:
-    turn = np.array([[0.0, -1, 0], [1, 0, 0], [0, 0, 1]])
-    straight, mesh = cleaned(knot()), knot()
-    turned = cleaned(TriangleMesh(positions=mesh.positions @ turn.T, faces=mesh.faces))
-    expected = as_rows(straight.positions @ turn.T, straight.faces)
-    assert as_rows(turned.positions, turned.faces) == expected
+    quarter = np.array([[0.0, -1, 0], [1, 0, 0], [0, 0, 1]])
+    other = cleaned(TriangleMesh(positions=mesh.positions @ quarter.T, faces=mesh.faces))
+    expected = as_rows(result.positions @ quarter.T, result.faces)
+    assert as_rows(other.positions, other.faces) == expected
 
 
 def test_soup_is_welded_and_what_is_no_triangle_is_dropped() -> None:

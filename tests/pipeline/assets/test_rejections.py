@@ -299,7 +299,6 @@ def test_instances_count_as_faces_and_buffers_do_not_lead_out(tmp_path: Path) ->
 WATCH = """
 import json, sys
 from pathlib import Path
-from pipeline.assets.settings import AssetSettings, GateSettings
 from tests.pipeline.assets.meshes_by_hand import prepare
 import pipeline.assets.decimation.pymeshlab_filters
 opened = []

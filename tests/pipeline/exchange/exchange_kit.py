@@ -12,7 +12,6 @@ from PIL import Image
 from pxr import Gf, Sdf, Usd, UsdGeom, UsdLux, UsdValidation
 
 from pipeline.assets.settings import AssetSettings
-from pipeline.exchange.renderformer_h5 import read_renderformer_h5, write_renderformer_h5
 from pipeline.exchange.renderformer_json import write_renderformer_json
 from pipeline.exchange.scene_files import build_scene
 from pipeline.exchange.textured_triangles import LoadedScene
@@ -26,6 +25,7 @@ from tests.pipeline.assets.source_materials.textured_kit import (
     connect_texture,
     coordinates,
     material,
+    triangle_at,
 )
 
 
@@ -51,11 +51,6 @@ def json_and_back(scene: Scene, folder: Path) -> tuple[Scene, tuple[str, ...]]:
     """Return the scene that our reader makes of its RenderFormer files, and what was lost."""
     lost = write_renderformer_json(folder / "again.json", scene)
     return build_json(folder, "again.json"), lost
-
-
-def h5_and_back(scene: Scene, folder: Path) -> Scene:
-    write_renderformer_h5(folder / "again.h5", scene)
-    return read_renderformer_h5(folder / "again.h5").scene
 
 
 def edited_layer(folder: Path, scene: Scene, edit: Callable[[Any], object]) -> LoadedScene:
@@ -103,15 +98,10 @@ def assert_h5_keeps_light(back: Scene, scene: Scene) -> None:
 
 def row_at(scene: Scene, x: float, y: float) -> np.ndarray:
     """Return the material row at a place of a flat scene, found by its barycentric coordinates."""
-    corners = scene.vertex_positions[scene.faces][:, :, :2].astype(np.float64)
-    for triangle, (a, b, c) in enumerate(corners):
-        one, two = np.linalg.solve(np.stack([b - a, c - a], axis=1), np.array([x, y]) - a)
-        if one >= -1e-9 and two >= -1e-9 and one + two <= 1 + 1e-9:
-            weights = np.array([1 - one - two, one, two])
-            uv = np.zeros(2) if scene.uv is None else weights @ scene.uv.reshape(-1, 3, 2)[triangle]
-            row = scene.material_index[[triangle]]
-            return np.asarray(textured_rows(scene, row, uv[None].astype(np.float64)))[0]
-    raise AssertionError((x, y))
+    triangle, weights = triangle_at(scene.vertex_positions[scene.faces][..., :2], x, y)
+    uv = np.zeros(2) if scene.uv is None else weights @ scene.uv.reshape(-1, 3, 2)[triangle]
+    row = scene.material_index[[triangle]]
+    return np.asarray(textured_rows(scene, row, uv[None].astype(np.float64)))[0]
 
 
 def _sorted_rows(scene: Scene) -> NDArray[np.float32]:

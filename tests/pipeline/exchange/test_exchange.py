@@ -4,7 +4,6 @@ import dataclasses
 import json
 from contextlib import closing
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import pytest
@@ -14,6 +13,7 @@ from infra.bench.workloads.named_scenes import cost_scene
 from pipeline.exchange.convert import convert_scene, within_budget, write_scene
 from pipeline.exchange.formats import FORMATS, list_lost_members
 from pipeline.exchange.reader import SceneSource, load_source, scene_source
+from pipeline.exchange.renderformer_h5 import read_renderformer_h5, write_renderformer_h5
 from pipeline.isolation import ChildLimits, IsolatedChild
 from pipeline.presets.registry import preset_settings
 from pipeline.scenes.triangle_budget import PooledAsset
@@ -41,21 +41,9 @@ FIELDS = {
 """Fields of an object in version 1.0; some of them could be left out for our own reader."""
 
 
-def written(scene: Scene, folder: Path) -> dict[str, Any]:
-    """Return what is written beside the meshes."""
-    write_scene(folder / "a.json", scene)
-    return dict(json.loads((folder / "a.json").read_text()))
-
-
-def converted(scene: Scene, folder: Path, name: str) -> Path:
-    """Return what `trilight convert` writes, by a child."""
-    (folder / "a.safetensors").write_bytes(encode_scene(scene))
-    source = scene_source(str(folder / "a.safetensors"))
-    convert_scene(source, folder / name, budget=None, done=lambda finished, of: None)
-    return folder / name
-
-
-def assert_usable(described: dict[str, Any], scene: Scene, folder: Path) -> None:
+def assert_usable(path: Path, scene: Scene) -> None:
+    """A file with its meshes is what the published converter reads of a scene."""
+    described = json.loads(path.read_text())
     assert set(described) == {"scene_name", "version", "objects", "cameras"}
     assert described["version"] == "1.0"
     assert len(described["cameras"]) == scene.num_views
@@ -68,7 +56,7 @@ def assert_usable(described: dict[str, Any], scene: Scene, folder: Path) -> None
             **{name: set(entry[name]) for name in ("transform", "material")},
         }
         assert len(f"{name}.obj".encode()) <= 255 and Path(f"{name}.obj").name == f"{name}.obj"
-        mesh = trimesh.load(f"{folder}/{entry['mesh_path']}", process=False)
+        mesh = trimesh.load(f"{path.parent}/{entry['mesh_path']}", process=False)
         assert isinstance(mesh, trimesh.Trimesh)
         triangles.append(mesh.triangles.astype(np.float32))
         material = entry["material"]
@@ -90,18 +78,22 @@ def test_published_scenes_come_back_and_are_written_as_the_published_converter_r
     scene = example_scene(shared, name)
     kit.assert_usd_keeps_all(scene, tmp_path, ".usdc")
     if scene.num_triangles < 1000:  # textures of 53 kB a triangle are slow to pack
-        kit.assert_h5_keeps_light(kit.h5_and_back(scene, tmp_path), scene)
+        write_renderformer_h5(tmp_path / "again.h5", scene)
+        kit.assert_h5_keeps_light(read_renderformer_h5(tmp_path / "again.h5").scene, scene)
     back, lost = kit.json_and_back(scene, tmp_path)
     kit.assert_json_keeps_light(back, scene)
     if scene.num_triangles <= 6000:
         again, lost_again = kit.json_and_back(back, tmp_path)
         kit.assert_json_keeps_light(again, back)
         assert len(lost_again) <= len(lost)
-    assert_usable(written(scene, tmp_path), scene, tmp_path)
+    write_scene(tmp_path / "a.json", scene)
+    assert_usable(tmp_path / "a.json", scene)
     if name == "init-template":
-        (tmp_path / "converted").mkdir()
-        described = json.loads(converted(scene, tmp_path / "converted", "a.json").read_text())
-        assert_usable(described, scene, tmp_path / "converted")
+        (child := tmp_path / "by a child").mkdir()  # as `trilight convert` writes
+        (child / "a.safetensors").write_bytes(encode_scene(scene))
+        source = scene_source(str(child / "a.safetensors"))
+        convert_scene(source, child / "a.json", budget=None, done=lambda finished, of: None)
+        assert_usable(child / "a.json", scene)
 
 
 @for_each(
@@ -132,7 +124,8 @@ def test_any_names_become_names_of_files(tmp_path: Path) -> None:
     for folder, (shell, emitter) in with_folders(tmp_path, [*names, ("ü" * 200, "ü" * 100)]):
         light = SceneObject(name=emitter, kind="emitter")
         scene = tiny_scene(objects=(SceneObject(name=shell, kind="shell"), light))
-        assert_usable(written(scene, folder), scene, folder)
+        write_scene(folder / "a.json", scene)
+        assert_usable(folder / "a.json", scene)
 
 
 WARM, SCENES = 50, 200
@@ -250,7 +243,7 @@ def test_what_the_published_forms_lose_is_named(tmp_path: Path) -> None:
 
 
 def test_textures_and_a_sky_are_said_to_be_lost_where_they_are(tmp_path: Path) -> None:
-    """What comes back has the means of the textures, and is whole."""
+    """What comes back is whole, with the means of the textures; a smaller budget says that, too."""
     path = tmp_path / "a.json"
     scene = textured_scene(environment=sky())
     before = set(write_scene(tmp_path / "b.json", tiny_scene()))
@@ -262,6 +255,11 @@ def test_textures_and_a_sky_are_said_to_be_lost_where_they_are(tmp_path: Path) -
     means = [texture.mean for texture in scene.textures]
     row = back.materials[back.material_index[0]]
     assert np.allclose(row[[0, 1, 2, 6]], np.concatenate(means), atol=1e-3)  # H5 holds halves
+    reduced = within_budget(scene, 3)
+    assert not reduced.scene.textures and reduced.scene.environment is scene.environment
+    assert any("textures became their means" in note for note in reduced.notes)
+    plain = within_budget(tiny_scene(), 3)
+    assert not any("textures" in note for note in plain.notes)
 
 
 @pytest.mark.parametrize("form", ["json", "h5", "glb"])
@@ -275,15 +273,6 @@ def test_a_scene_that_only_its_sky_lights_is_not_written_dark(tmp_path: Path, fo
     with pytest.raises(TrilightError, match="only light is its environment.*safetensors"):
         write_scene(tmp_path / f"a.{form}", scene)
     assert list(tmp_path.iterdir()) == []
-
-
-def test_a_smaller_budget_says_that_textures_go() -> None:
-    scene = textured_scene(environment=sky())
-    reduced = within_budget(scene, 3)
-    assert not reduced.scene.textures and reduced.scene.environment is scene.environment
-    assert any("textures became their means" in note for note in reduced.notes)
-    plain = within_budget(tiny_scene(), 3)
-    assert not any("textures" in note for note in plain.notes)
 
 
 def test_the_names_of_members_are_those_of_a_scene() -> None:

@@ -11,7 +11,6 @@ from typing import Any
 import numpy as np
 import pytest
 import trimesh
-from numpy.typing import NDArray
 
 from pipeline.exchange.convert import convert_scene, write_scene
 from pipeline.exchange.gltf import encode_mesh_glb, encode_scene_glb, read_gltf
@@ -20,9 +19,8 @@ from pipeline.exchange.textured_triangles import LoadedScene
 from storage.conventions import linear_from_srgb8
 from storage.errors import TrilightError
 from storage.records.asset import Level
-from storage.records.lookup import environment_values, texture_values
+from storage.records.lookup import environment_values
 from storage.records.material import DIFFUSE, EMISSION, ROUGHNESS, SPECULAR
-from storage.records.scene import Scene
 from tests import textured_by_hand as textured
 from tests.for_each import for_each
 from tests.pipeline.assets.meshes_by_hand import geometry, prepare, write_glb
@@ -63,10 +61,6 @@ def read(folder: Path, *pictures: bytes | str, **changes: Any) -> LoadedScene:
     return saved(folder, *quad(*pictures, **changes))
 
 
-def diffuse_of(srgb: tuple[int, int, int]) -> np.ndarray:
-    return np.asarray(linear_from_srgb8()[list(srgb)] * (1 - kit.F))
-
-
 CODED = 0.005
 """Half a step of 8 sRGB-encoded bits is at most 0.0045 in linear light."""
 
@@ -74,7 +68,7 @@ CODED = 0.005
 def test_textures_stand_upright_and_rights_are_kept(tmp_path: Path) -> None:
     """Objects and scenes are the same: tests/pipeline/foreign/test_mesh_formats.py."""
     scene = read(tmp_path).scene
-    assert row_at(scene, -0.5, 0.5)[:3] == pytest.approx(diffuse_of(RED), abs=CODED)
+    assert row_at(scene, -0.5, 0.5)[:3] == pytest.approx(kit.shown(RED), abs=CODED)
     assert row_at(scene, -0.5, 0.5)[3:7] == pytest.approx([kit.F, kit.F, kit.F, 0.5], abs=1e-6)
     assert scene.vertex_normals == pytest.approx(np.tile([0, 0, 1], (4, 1)), abs=1e-6)
     assert scene.objects[0].attribution == "A. Maker"
@@ -180,7 +174,7 @@ def test_a_mesh_without_coordinates_takes_the_mean_and_one_texel_is_a_constant(
     assert found.scene.materials[0, :3] == pytest.approx(mean, abs=1e-5)
     one = read(tmp_path, kit.picture_bytes(PICTURE[:1, 1:])).scene
     assert not one.textures
-    assert one.materials[0, :3] == pytest.approx(diffuse_of(GREEN), abs=1e-6)
+    assert one.materials[0, :3] == pytest.approx(kit.shown(GREEN), abs=1e-6)
 
 
 def test_coordinates_that_are_not_finite_are_refused(tmp_path: Path) -> None:
@@ -190,17 +184,13 @@ def test_coordinates_that_are_not_finite_are_refused(tmp_path: Path) -> None:
         read(tmp_path, uv=broken)
 
 
-def there_and_back(folder: Path, scene: Scene) -> Scene:
-    write_scene(folder / "a.glb", scene)
-    return read_gltf(folder / "a.glb").scene
-
-
 @for_each("specular", [(0.2, 0.2, 0.2), (0, 0, 0), (0.4, 0.1, 0.3), (0.9, 0.5, 0.1)])
 def test_a_scene_comes_back(tmp_path: Path, specular: tuple[float, float, float]) -> None:
     materials = tiny_scene().materials.copy()
     materials[FLOOR, DIFFUSE], materials[FLOOR, SPECULAR] = (0.1, 0.05, 0.3), specular
     scene = tiny_scene(materials=materials)
-    found = there_and_back(tmp_path, scene)
+    write_scene(tmp_path / "a.glb", scene)
+    found = read_gltf(tmp_path / "a.glb").scene
     assert found.num_triangles == scene.num_triangles
     for name in ("c2w", "fov_deg"):
         np.testing.assert_allclose(getattr(found, name), getattr(scene, name), atol=1e-6)
@@ -214,19 +204,15 @@ def test_a_scene_comes_back(tmp_path: Path, specular: tuple[float, float, float]
     assert [entry.kind for entry in found.objects] == ["object", "emitter"]
 
 
-def _looked_up(scene: Scene, column: int) -> NDArray[np.float64]:
-    """Return what the texture of a column says in the middle of the first triangle."""
-    assert scene.uv is not None and scene.material_textures is not None
-    middle = scene.uv.reshape(-1, 3, 2)[0].mean(axis=0)
-    row = scene.material_textures[scene.material_index[0], column]
-    return texture_values(scene.textures[row], middle)
-
-
-def test_textures_come_back_to_their_eight_bits(tmp_path: Path) -> None:
-    scene = textured.textured_scene(4)
-    found = there_and_back(tmp_path, scene)
-    for column, most in ((0, 0.01), (2, 0.003)):
-        wanted, got = (_looked_up(each, column) for each in (scene, found))
+def test_textures_come_back_to_their_eight_bits_and_what_is_lost_is_said(tmp_path: Path) -> None:
+    scene = textured.textured_scene(4, environment=textured.sky())
+    lost = " ".join(write_scene(tmp_path / "a.glb", scene))
+    for word in ("environment", "8 bits", "floors and walls", "provenance"):
+        assert word in lost
+    found = read_gltf(tmp_path / "a.glb").scene
+    x, y, _ = scene.vertex_positions[scene.faces[0]].mean(axis=0)
+    for columns, most in ((DIFFUSE, 0.01), (ROUGHNESS, 0.003)):
+        wanted, got = (row_at(each, x, y)[columns] for each in (scene, found))
         np.testing.assert_allclose(got, wanted, atol=most)
     assert found.materials[found.material_index[2], EMISSION].tolist() == [100, 100, 100]
 
@@ -239,18 +225,12 @@ def test_two_textured_albedos_of_different_widths_are_one_grid(tmp_path: Path) -
     index = np.full((2, 3), -1, np.int32)
     index[FLOOR] = [0, 1, 2]
     scene = textured.textured_scene(0, wide, glossy, rough, material_textures=index)
-    found = there_and_back(tmp_path, scene)
+    write_scene(tmp_path / "a.glb", scene)
+    found = read_gltf(tmp_path / "a.glb").scene
     row = found.material_index[0]
     kept = scene.materials[FLOOR]
     assert found.materials[row, ROUGHNESS] == pytest.approx(rough.mean[0], abs=0.01)
     assert found.materials[row, SPECULAR] == pytest.approx(glossy.mean, abs=0.01), kept
-
-
-def test_what_a_glb_loses_is_said(tmp_path: Path) -> None:
-    scene = textured.textured_scene(environment=textured.sky())
-    lost = " ".join(write_scene(tmp_path / "a.glb", scene))
-    for word in ("environment", "8 bits", "floors and walls", "provenance"):
-        assert word in lost
 
 
 def test_a_stranger_reads_it(tmp_path: Path) -> None:

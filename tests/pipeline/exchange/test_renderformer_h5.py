@@ -30,11 +30,19 @@ from storage.records.material import EMISSION
 from storage.records.scene import Scene
 from storage.records.texture import Texture
 from tests.conftest import ROOT
-from tests.for_each import for_each, with_folders
+from tests.for_each import case, for_each, with_folders
 from tests.pipeline.exchange.exchange_kit import assert_h5_keeps_light, row_at
 from tests.scenes_by_hand import LIGHT, tiny_sample, tiny_scene
 from tests.sky_maps import COLOURS, POLES, six_poles
 from tests.textured_by_hand import number_texture, textured_scene
+
+
+@pytest.fixture
+def path(tmp_path: Path) -> Path:
+    """The tiny sample, written."""
+    sample = tiny_sample()
+    write_renderformer_h5(tmp_path / "a.h5", sample.scene, sample.radiance_rgb)
+    return tmp_path / "a.h5"
 
 
 def arrays_of(path: Path) -> dict[str, np.ndarray]:
@@ -58,14 +66,12 @@ def awkward_scene() -> Scene:
     )
 
 
-def test_the_layout_and_its_quirks(tmp_path: Path) -> None:
+def test_the_layout_and_its_quirks_and_what_mvp_projects(path: Path) -> None:
     """Types and shapes are what RenderFormer-Studio's `renderformer data validate-h5` asks.
 
     src/renderformer/data/h5/validate.py at a5daa311.
     """
-    sample = tiny_sample()
-    write_renderformer_h5(tmp_path / "a.h5", sample.scene, sample.radiance_rgb)
-    arrays = arrays_of(tmp_path / "a.h5")
+    sample, arrays = tiny_sample(), arrays_of(path)
     assert {name: (array.dtype.name, array.shape) for name, array in arrays.items()} == {
         "triangles": ("float32", (3, 3, 3)),
         "vn": ("float32", (3, 3, 3)),
@@ -84,14 +90,9 @@ def test_the_layout_and_its_quirks(tmp_path: Path) -> None:
     assert light.tolist() == [1, 1, 1, 0, 0, 0, 1, 0.5, 0.5, 1, 100, 100, 100]
     assert (arrays["img"][..., 3] == 1).all()
     assert np.array_equal(arrays["img"][..., :3], sample.radiance_rgb)
-    with h5py.File(tmp_path / "a.h5") as file:
+    with h5py.File(path) as file:
         assert {file[name].compression_opts for name in file} == {9}
-
-
-def test_mvp_projects_what_the_camera_looks_at(tmp_path: Path) -> None:
-    sample = tiny_sample()
-    write_renderformer_h5(tmp_path / "a.h5", sample.scene, sample.radiance_rgb)
-    mvp = arrays_of(tmp_path / "a.h5")["mvp"].astype(np.float64)
+    mvp = arrays["mvp"].astype(np.float64)
     for view, pose in enumerate(sample.scene.c2w.astype(np.float64)):
         half = np.tan(np.radians(float(sample.scene.fov_deg[view])) / 2)
         for distance, depth in ((NEAR, -1.0), (FAR, 1.0)):
@@ -120,9 +121,7 @@ def test_scene_to_file_to_scene_to_file(tmp_path: Path, scene: Scene) -> None:
         assert len(set(index[back.triangle_emits])) == scene.triangle_emits.sum()
 
 
-def test_what_other_tools_write_is_carried_over_or_named(tmp_path: Path) -> None:
-    path = tmp_path / "a.h5"
-    write_renderformer_h5(path, tiny_scene(), tiny_sample().radiance_rgb)
+def test_what_other_tools_write_is_carried_over_or_named(path: Path) -> None:
     with h5py.File(path, "r+") as file:
         file.attrs["export_metadata"] = "{}"
         file["depth"] = np.zeros(3)
@@ -151,10 +150,8 @@ def test_what_other_tools_write_is_carried_over_or_named(tmp_path: Path) -> None
     assert {entry.licence for entry in scene.objects} == {"LicenseRef-unknown"}
 
 
-def test_albedos_that_rounding_took_over_one_are_mended(tmp_path: Path) -> None:
+def test_albedos_that_rounding_took_over_one_are_mended(path: Path) -> None:
     """0.6001 and 0.3999, each rounded up by another tool; a sum that is meant is refused."""
-    path = tmp_path / "a.h5"
-    write_renderformer_h5(path, tiny_scene())
     with h5py.File(path, "r+") as file:
         file["texture"][0, :3], file["texture"][0, 3:6] = 0.6004, 0.4001
     read = read_renderformer_h5(path)
@@ -168,16 +165,14 @@ def test_albedos_that_rounding_took_over_one_are_mended(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("packing", [{}, {"compression": "gzip", "shuffle": True, "chunks": True}])
-def test_other_packings_are_read(tmp_path: Path, packing: dict[str, object]) -> None:
-    plain, other = tmp_path / "a.h5", tmp_path / "b.h5"
-    sample = tiny_sample()
-    write_renderformer_h5(plain, sample.scene, sample.radiance_rgb)
+def test_other_packings_are_read(path: Path, packing: dict[str, object]) -> None:
+    sample, other, again = tiny_sample(), path.with_name("b.h5"), path.with_name("c.h5")
     with h5py.File(other, "w") as file:
-        for name, array in arrays_of(plain).items():
+        for name, array in arrays_of(path).items():
             wide = array.astype(np.float64) if name in ("c2w", "triangles") else array
             file.create_dataset(name, data=wide, **packing)
-    write_renderformer_h5(tmp_path / "c.h5", read_renderformer_h5(other).scene, sample.radiance_rgb)
-    assert (tmp_path / "c.h5").read_bytes() == plain.read_bytes()
+    write_renderformer_h5(again, read_renderformer_h5(other).scene, sample.radiance_rgb)
+    assert again.read_bytes() == path.read_bytes()
     with h5py.File(other, "r+") as file:  # as the public converter writes
         half = file["texture"][()].astype(np.float16)
         del file["texture"]
@@ -188,18 +183,7 @@ def test_other_packings_are_read(tmp_path: Path, packing: dict[str, object]) -> 
     assert after == pytest.approx(before, abs=2**-11)  # one step of a half float below 1
 
 
-def _smooth_scene() -> Scene:
-    """The floor with a texture that changes slowly, looked up from (-0.5, -0.5) to (0.5, 0.5)."""
-    at = (np.arange(64) + 0.5) / 64
-    wave = 0.4 + 0.3 * np.cos(2 * np.pi * at)
-    colour = np.stack(np.broadcast_arrays(wave[None], wave[:, None], np.float64(0.2)), axis=-1)
-    rough = Texture(texels=(0.5 + 0.4 * np.sin(2 * np.pi * at))[:, None, None].astype(np.float32))
-    scene = textured_scene(0, Texture(texels=colour.astype(np.float32)), rough)
-    uv = 0.5 * scene.vertex_positions[scene.faces.ravel(), :2]
-    return dataclasses.replace(scene, uv=uv.astype(np.float32))
-
-
-def test_a_ramp_has_the_means_of_its_cells(tmp_path: Path) -> None:
+def test_a_ramp_has_the_means_of_its_cells() -> None:
     """u is the weight of the first vertex and v that of the second: cell (x, y) is their middle."""
     ramp = (np.arange(256, dtype=np.float32) + 0.5) / 256 / 2
     along = np.broadcast_to(ramp[None, :, None], (256, 256, 3)).astype(np.float32)
@@ -228,8 +212,17 @@ def test_a_fine_checker_is_grey_in_every_cell() -> None:
 
 
 def test_a_smooth_texture_comes_back_as_an_atlas(tmp_path: Path) -> None:
-    """Half a cell at the greatest slope, where look-ups are clamped, and 8 bits: 0.03 + 0.005."""
-    scene = _smooth_scene()
+    """Half a cell at the greatest slope, where look-ups are clamped, and 8 bits: 0.03 + 0.005.
+
+    The texture changes slowly, looked up from (-0.5, -0.5) to (0.5, 0.5).
+    """
+    at = (np.arange(64) + 0.5) / 64
+    wave = 0.4 + 0.3 * np.cos(2 * np.pi * at)
+    colour = np.stack(np.broadcast_arrays(wave[None], wave[:, None], np.float64(0.2)), axis=-1)
+    rough = Texture(texels=(0.5 + 0.4 * np.sin(2 * np.pi * at))[:, None, None].astype(np.float32))
+    scene = textured_scene(0, Texture(texels=colour.astype(np.float32)), rough)
+    uv = 0.5 * scene.vertex_positions[scene.faces.ravel(), :2]
+    scene = dataclasses.replace(scene, uv=uv.astype(np.float32))
     notes = write_scene(tmp_path / "a.h5", scene)
     assert any("2 textured triangles than the means of 32 x 32" in note for note in notes)
     found = read_renderformer_h5(tmp_path / "a.h5")
@@ -320,20 +313,13 @@ def test_a_turned_environment_is_said_and_another_shape_refused(tmp_path: Path) 
 SHAPE, MANY = (3, 3, 3), (1_000_000, 3, 3)
 
 
-@pytest.fixture
-def path(tmp_path: Path) -> Path:
-    sample = tiny_sample()
-    write_renderformer_h5(tmp_path / "a.h5", sample.scene, sample.radiance_rgb)
-    return tmp_path / "a.h5"
-
-
 def _soft_link(file: Any) -> None:
     file["hidden"] = np.ones(SHAPE, "<f4")
     file["triangles"] = h5py.SoftLink("/hidden")
 
 
-def _made(*shape_and_type: Any, **options: Any) -> Callable[[Any], None]:
-    return lambda file: file.create_dataset("triangles", *shape_and_type, **options)
+def _made(*shape_and_type: Any, name: str = "triangles", **options: Any) -> Callable[[Any], None]:
+    return lambda file: file.create_dataset(name, *shape_and_type, **options)
 
 
 def _virtual(file: Any) -> None:
@@ -359,11 +345,8 @@ def _raw_chunk(data: bytes, *, skipped: int = 0) -> Callable[[Any], None]:
     return change
 
 
-def _of(values: Any) -> Callable[[Any], None]:
-    def change(file: Any) -> None:
-        file["triangles"] = values
-
-    return change
+def _of(values: Any, name: str = "triangles") -> Callable[[Any], None]:
+    return lambda file: file.update({name: values})
 
 
 def _not_finite(wrong: float) -> Callable[[Any], None]:
@@ -403,19 +386,6 @@ HOSTILE: dict[str, tuple[Callable[[Any], None], str]] = {
 }
 
 
-def test_hostile_arrays_are_refused(path: Path) -> None:
-    """`other.h5` and `secret.bin` are there, and would be read if they were not refused."""
-    for folder, (change, message) in with_folders(path.parent, HOSTILE.values()):
-        hostile = Path(shutil.copy(path, folder))
-        shutil.copy(path, folder / "other.h5")
-        (folder / "secret.bin").write_bytes(np.ones(27, "<f4").tobytes())
-        with h5py.File(hostile, "r+") as file:
-            del file["triangles"]
-            change(file)
-        with pytest.raises(TrilightError, match=rf"a\.h5: triangles: .*{message}"):
-            read_renderformer_h5(hostile)
-
-
 def _ones_without_light() -> Any:
     texture = np.ones((3, 13, 32, 32), "<f4")
     texture[:2, 10:] = 0
@@ -429,22 +399,25 @@ OTHERS: dict[str, tuple[str, Any, str]] = {
     "angle of zero": ("fov", np.zeros(2, "<f4"), "above 0 and below 180"),
     "albedo over 1": ("texture", _ones_without_light(), "diffuse . specular at most 1"),
     "no light": ("texture", np.zeros((3, 13, 32, 32), "<f4"), "no emission"),
-    "pictures without end": ("img", None, "img: would take"),
     "pictures not finite": ("img", np.full((2, 8, 8, 4), np.inf, "<f2"), "holds inf"),
 }
 
 
-def test_other_arrays_are_checked_too(path: Path) -> None:
-    for folder, (name, values, message) in with_folders(path.parent, OTHERS.values()):
-        other = Path(shutil.copy(path, folder))
-        with h5py.File(other, "r+") as file:
+def test_hostile_arrays_are_refused(path: Path) -> None:
+    """`other.h5` and `secret.bin` are there, and would be read if they were not refused."""
+    rows = [("triangles", change, f"triangles: .*{said}") for change, said in HOSTILE.values()]
+    rows += [(name, _of(values, name), message) for name, values, message in OTHERS.values()]
+    endless = _made((2, 8192, 8192, 4), "<f2", name="img", chunks=(1, 64, 64, 4))
+    rows.append(("img", endless, "img: would take"))
+    for folder, (name, change, message) in with_folders(path.parent, rows):
+        hostile = Path(shutil.copy(path, folder))
+        shutil.copy(path, folder / "other.h5")
+        (folder / "secret.bin").write_bytes(np.ones(27, "<f4").tobytes())
+        with h5py.File(hostile, "r+") as file:
             del file[name]
-            if values is None:
-                file.create_dataset(name, (2, 8192, 8192, 4), "<f2", chunks=(1, 64, 64, 4))
-            else:
-                file[name] = values
-        with pytest.raises(TrilightError, match=message):
-            read_renderformer_h5(other)
+            change(file)
+        with case(message), pytest.raises(TrilightError, match=rf"a\.h5: .*{message}"):
+            read_renderformer_h5(hostile)
 
 
 def test_a_normal_of_a_face_without_area_cannot_be_made(path: Path) -> None:

@@ -133,8 +133,6 @@ def test_any_windows_channels_and_types_give_the_picture_that_is_displayed(
 @for_each("name", [name for name in dir(OpenEXR) if name.endswith("_COMPRESSION")])
 def test_every_compression_and_tiles_are_read(name: str) -> None:
     rgb = np.linspace(0.2, 0.8, 24 * 40 * 3, dtype=np.float32).reshape(24, 40, 3)
-    if name == "NUM_COMPRESSION_METHODS":
-        return
     for more in ({}, {"type": OpenEXR.tiledimage, "tiles": OpenEXR.TileDescription()}):
         data = of_library({"RGB": rgb}, compression=getattr(OpenEXR, name), **more)
         np.testing.assert_allclose(read(data).values, rgb, atol=0.02)  # some lose

@@ -32,13 +32,13 @@ from tests.for_each import for_each
 from tests.pipeline.renders.sampling import camera_of, render_view, view_settings
 from tests.pipeline.renders.scene_kit import (
     join,
+    lamp_over_floor,
     light,
     lit_by_a_mirror,
     material,
     mirrors,
     sampled_like_scene,
     sphere,
-    textured_floor,
 )
 from tests.pipeline.renders.test_renderer import lit_scene
 from tests.storage.test_optics import stretched
@@ -93,11 +93,6 @@ def _render(scene: Scene, settings: RenderSettings = SETTINGS) -> None:
         renderer.render_view(scene.c2w[view], float(scene.fov_deg[view]), seed=view)
 
 
-def _smallest() -> Scene:
-    floor = textured_floor(material(diffuse=0.5))
-    return join([floor, light([[-0.1, -0.1, 2], [0, 0.1, 2], [0.1, -0.1, 2]], 100.0)])
-
-
 def _large() -> Scene:
     balls = [
         sphere([0.1 * i, 0, 0.5], 0.3, material(specular=0.9, roughness=0.1), rings=20)
@@ -113,7 +108,7 @@ def test_one_set_of_kernels_serves_every_scene_and_view() -> None:
 
     A pass of another number of samples would have kernels of its own; there are three such numbers.
     """
-    _render(_smallest())
+    _render(lamp_over_floor(100.0))
     first = _launched()
     assert first
     for scene in (_large(), *(sampled_like_scene(np.random.default_rng(i)) for i in range(3))):
@@ -153,7 +148,7 @@ def test_all_views_and_lights_share_one_load(monkeypatch: pytest.MonkeyPatch) ->
 
 def test_pictures_come_back_only_where_something_is_decided(reads: list[int]) -> None:
     """A pass that is read back makes a graphics card wait for us, and us for it."""
-    _render(_smallest(), dataclasses.replace(SETTINGS, min_spp=512, max_spp=512))
+    _render(lamp_over_floor(100.0), dataclasses.replace(SETTINGS, min_spp=512, max_spp=512))
     # Both halves, of four arrays, at the first look for black and at the floor; albedo, normals and
     # hits once.
     assert len(reads) == 2 * 4 + 2 * 4 + 3

@@ -52,6 +52,7 @@ from tests.pipeline.renders.scene_kit import (
     Part,
     box,
     join,
+    lamp_over_floor,
     light,
     lit_by_a_mirror,
     material,
@@ -64,8 +65,6 @@ from tests.pipeline.renders.test_renderer import lit_scene
 from tests.sky_maps import smooth
 
 pytestmark = pytest.mark.usefixtures("llvm")
-_ALMOST_ALL = 2.0**30
-"""Light paths for each camera path, of which weights leave a millionth to the other strategies."""
 
 
 class CameraPathsOnly(VectorTracer):
@@ -78,9 +77,9 @@ class CameraPathsOnly(VectorTracer):
 
 
 class CameraPathsLeft(CameraPathsOnly):
-    """What weights leave to camera paths beside light paths without number."""
+    """What weights leave to camera paths beside light paths without number: a millionth."""
 
-    _light_paths = _ALMOST_ALL
+    _light_paths = 2.0**30
 
 
 def _tracer(
@@ -95,14 +94,6 @@ mean_picture = functools.partial(render_blocks, block=32, passes=12)
 LAMP = [[0.8, 0.3, 1.6], [1.1, 0.3, 1.6], [0.9, 0.6, 1.7]]
 WIDE = [[-2, -2, 0], [2, -2, 0], [2, 2, 0], [-2, 2, 0]]
 WALL = [[-2, 1, 0], [2, 1, 0], [2, 1, 2], [-2, 1, 2]]
-
-
-def _leaning() -> Scene:
-    """A large light shines on a wall that a wrong shading normal turns upwards by 30 degrees."""
-    wall = quad(WALL, material(specular=0.9, roughness=0.8))
-    turned = np.broadcast_to([0, -np.sqrt(0.75), 0.5], wall.normals.shape)
-    floor = quad(WIDE, material(diffuse=0.6))
-    return _by_a_large_light([floor, dataclasses.replace(wall, normals=turned)])
 
 
 def _by_a_large_light(parts: list[Part]) -> Scene:
@@ -140,8 +131,14 @@ def test_together_they_show_what_the_path_tracer_shows(scene: Scene, max_depth: 
 
 
 def test_any_number_of_light_paths_gives_the_same_light(monkeypatch: pytest.MonkeyPatch) -> None:
-    """However the weights are shared out."""
-    scene = _leaning()
+    """However the weights are shared out.
+
+    A large light shines on a wall that a wrong shading normal turns upwards by 30 degrees.
+    """
+    wall = quad(WALL, material(specular=0.9, roughness=0.8))
+    turned = np.broadcast_to([0, -np.sqrt(0.75), 0.5], wall.normals.shape)
+    leaning = dataclasses.replace(wall, normals=turned)
+    scene = _by_a_large_light([quad(WIDE, material(diffuse=0.6)), leaning])
     alone = mean_picture(scene, tracer=_tracer(scene, CameraPathsOnly))
     for light_paths in (1e-3, 4.0):
         monkeypatch.setattr(vector_tracer, "LIGHT_PATHS", light_paths)
@@ -265,23 +262,15 @@ def test_lamps_apart_share_the_light_paths_of_a_scene() -> None:
     assert psnr_log_db(lamps.radiance_rgb, whole.radiance_rgb) > whole.noise_floor_db
 
 
-_LAMP = [[-0.1, -0.1, 3], [0, 0.1, 3], [0.1, -0.1, 3]]
-
-
-def _scene(radiance: float = 5.0) -> Scene:
-    floor = textured_floor(material(diffuse=0.5))
-    return join([floor, light(_LAMP, radiance)], eye=(0, -2, 1))
-
-
 def _splatted(resolution: int, values: Any, pixels: Any, active: bool = True) -> NDArray:
     """Return the picture [R^2, 3] of values [3, N] that are added to pixels."""
-    splats = Splats(resolution, SplatUnit(_scene()))
+    splats = Splats(resolution, SplatUnit(lamp_over_floor()))
     color = mi.Color3f(*(np.asarray(channel, np.float32) for channel in values))
     splats.add(color, mi.UInt32(np.asarray(pixels, np.uint32)), mi.Bool(active))
     return read_back(splats.picture()).reshape(-1, 3)
 
 
-def test_splats_add_up_in_any_order_to_the_nearest_unit() -> None:
+def test_splats_add_up_in_any_order_to_the_nearest_unit_and_what_no_sum_can_hold_shows() -> None:
     rng = np.random.default_rng(1)
     values = rng.exponential(size=(3, 5000)) * 10.0 ** rng.uniform(-6, 3, 5000)
     pixels, order = rng.integers(0, 16, 5000), rng.permutation(5000)
@@ -292,29 +281,26 @@ def test_splats_add_up_in_any_order_to_the_nearest_unit() -> None:
     # Float32 values are off by a half of 2^-24 of themselves, units by 5 / 2^33 for each splat.
     np.testing.assert_allclose(found, expected, rtol=1e-6, atol=1e-5)
     # Cut off instead, dim light would be lost: 0.75 of a unit would be none, a thousand times.
-    unit = SplatUnit(_scene()).value
+    unit = SplatUnit(lamp_over_floor()).value
     for units, counted in ((0.25, 0.0), (0.75, 1000.0)):
         dim = _splatted(1, np.full((3, 1000), units * unit), np.zeros(1000))
         np.testing.assert_array_equal(dim / unit, counted)
-
-
-def test_a_splat_that_no_sum_can_hold_shows() -> None:
     for value in (np.inf, np.nan, 1e9):
         for channel in range(3):
-            values = np.full((3, 2), 0.25)
-            values[channel, 1] = value
-            broken = np.isnan(_splatted(2, values, [0, 1]))
+            two = np.full((3, 2), 0.25)
+            two[channel, 1] = value
+            broken = np.isnan(_splatted(2, two, [0, 1]))
             np.testing.assert_array_equal(broken.all(axis=1), [False, True, False, False])
         assert not _splatted(1, np.full((3, 1), value), [0], active=False).any()
 
 
 def test_a_unit_is_a_power_of_two_that_goes_with_the_light() -> None:
     for radiance in (1e-30, 1e-3, 1.0, 4095.0, 1e12):
-        unit = SplatUnit(_scene(radiance)).value
+        unit = SplatUnit(lamp_over_floor(radiance)).value
         assert np.frexp(unit)[0] == 0.5
         if radiance > 1e-27:  # dimmer ones are coarse: nothing that half floats show
             assert 2**33 <= np.float32(radiance) / unit < 2**34
-            assert SplatUnit(_scene(2 * radiance)).value == 2 * unit
+            assert SplatUnit(lamp_over_floor(2 * radiance)).value == 2 * unit
         assert np.isfinite(np.float32(1 / unit))
 
 
@@ -331,7 +317,7 @@ def test_light_starts_are_even_and_their_shift_goes_with_the_seed() -> None:
 
 
 def test_a_point_shows_in_the_pixel_whose_ray_meets_it() -> None:
-    scene, resolution = _scene(), 24
+    scene, resolution = lamp_over_floor(), 24
     film = Film(camera_of(scene, resolution))
     origin, directions = camera_rays(scene.c2w[0], float(scene.fov_deg[0]), resolution)
     for reach in (0.1, 3.0):
@@ -447,10 +433,6 @@ def _table(peaks: NDArray[np.int64]) -> Any:
     return GuideTable(cells, rows, apportion_entries(shares))
 
 
-def _guidance(peaks: NDArray[np.int64]) -> Guidance:
-    return Guidance(row=dr.opaque(mi.UInt32, 1), share=mi.Float(0.5), table=_table(peaks))
-
-
 def _twin(directions: NDArray[np.float64], peaks: NDArray[np.int64]) -> NDArray[np.float64]:
     """Return the density by the textbook: share of the bin over its part of the square, d^-3."""
     length = np.abs(directions).sum(axis=1)
@@ -468,7 +450,7 @@ def test_directions_are_drawn_by_the_density_which_is_that_of_a_slow_twin() -> N
     rng = np.random.default_rng(2)
     peaks, count = rng.integers(0, 1024, 256), 1 << 18
     u = mi.Point2f(*(rng.random((2, count)).astype(np.float32)))
-    guidance = _guidance(peaks)
+    guidance = Guidance(row=dr.opaque(mi.UInt32, 1), share=mi.Float(0.5), table=_table(peaks))
     uniform = rng.normal(size=(count, 3))
     uniform /= np.linalg.norm(uniform, axis=1, keepdims=True)
     rounded = uniform.astype(np.float32)

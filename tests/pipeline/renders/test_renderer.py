@@ -1,14 +1,16 @@
-"""The stage: stop rule, rejections, the same bits whatever runs beside it; other pictures."""
+"""The stage: stop rule, rejections, the same bits whatever runs beside it; previews and others."""
 
 import dataclasses
 import hashlib
+from collections import Counter
+from collections.abc import Callable, Iterator
 from typing import Any
 from unittest.mock import Mock
 
 import numpy as np
 import pytest
 import trimesh
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 
 from infra.bench.experiments.calibration import FIGURES, record_looks, unreachable
 from infra.bench.experiments.meshes import picture_db
@@ -20,16 +22,25 @@ from infra.bench.workloads.traced_pictures import (
 )
 from infra.render.raw_references import raw_reference
 from pipeline.foreign.mesh import TriangleMesh
-from pipeline.renders import pictures
+from pipeline.renders import pictures, preview
 from pipeline.renders.pictures import NUMPY, means, read_sums
-from pipeline.renders.renderer import RenderedView, SceneRenderer, set_threads
+from pipeline.renders.preview import (
+    FIRST_LOOKS_SPP,
+    PreviewSettings,
+    all_parts,
+    load_preview,
+    preview_parts,
+    timed_parts,
+    usual_filter,
+)
+from pipeline.renders.renderer import RenderedView, SceneRenderer, run_to_end, set_threads
 from pipeline.renders.samples import DualBuffer
-from pipeline.renders.settings import RenderSettings
-from pipeline.renders.tracer import choose_tracing_scale, load_tracer
+from pipeline.renders.settings import Filtered, RenderSettings
+from pipeline.renders.tracer import PixelCamera, choose_tracing_scale, load_tracer
 from pipeline.renders.view_pictures import with_mean_of
 from storage.conventions import look_at_c2w
-from storage.denoiser import denoise
-from storage.errors import Rejected
+from storage.denoiser import Features, denoise
+from storage.errors import Rejected, TrilightError
 from storage.metrics import psnr_log_db
 from storage.records.lights import (
     light_rows,
@@ -38,10 +49,18 @@ from storage.records.lights import (
     sum_of_lights,
 )
 from storage.records.scene import Scene, SceneObject
+from storage.renderer import Image, Sampling
 from storage.settings.overrides import apply_overrides
 from tests.for_each import for_each
 from tests.pipeline.programs import printed_by
-from tests.pipeline.renders.sampling import camera_of, render_view
+from tests.pipeline.renders.sampling import (
+    Estimate,
+    assert_agree,
+    blocks_of,
+    camera_of,
+    render_view,
+    view_settings,
+)
 from tests.pipeline.renders.scene_kit import (
     join,
     light,
@@ -110,16 +129,23 @@ def test_views_do_not_depend_on_the_views_before_them() -> None:
     assert digest(renderer.render_view(scene.c2w[0], 40.0, seed=7)) != first[0]
 
 
-def test_sampling_stops_at_the_target_or_at_the_cap() -> None:
-    scene = simple_scene()
-    easy = render_view(scene, dataclasses.replace(GROWING, noise_floor_db=10.0))
+def test_sampling_stops_at_the_targets_or_at_the_cap() -> None:
+    scene, most = simple_scene(), dataclasses.replace(GROWING, noise_floor_db=10.0, max_spp=4096)
+    easy = render_view(scene, most)
     assert easy.spp == 64 and not easy.at_cap
     hard = render_view(scene, dataclasses.replace(GROWING, noise_floor_db=95.0))
     assert hard.spp == 256 and hard.at_cap
     between = easy.noise_floor_db + 2
-    wanted = render_view(scene, dataclasses.replace(GROWING, noise_floor_db=between, max_spp=4096))
+    wanted = render_view(scene, dataclasses.replace(most, noise_floor_db=between))
     assert wanted.noise_floor_db >= between and not wanted.at_cap
     assert 64 < wanted.spp < 4096 and wanted.spp % 32 == 0
+    # a linear target goes on where the log one is reached
+    linear_db = easy.noise_floor_linear_db + 1
+    both = render_view(scene, dataclasses.replace(most, noise_floor_linear_db=linear_db))
+    assert both.spp > easy.spp
+    assert both.noise_floor_linear_db >= linear_db and not both.at_cap
+    alone = dataclasses.replace(most, noise_floor_db=None, noise_floor_linear_db=linear_db)
+    assert digest(render_view(scene, alone)) == digest(both)
 
 
 def test_a_view_says_how_far_it_is() -> None:
@@ -146,17 +172,6 @@ def test_halves_of_many_samples_have_the_best_filter(monkeypatch: pytest.MonkeyP
     denoise.reset_mock()
     render_view(simple_scene(), dataclasses.replace(settings, denoiser="fast"))
     assert [call.args[2] for call in denoise.call_args_list] == ["fast"] * 5
-
-
-def test_a_linear_target_goes_on_where_the_log_one_is_reached() -> None:
-    easy = dataclasses.replace(GROWING, noise_floor_db=10.0, max_spp=4096)
-    first = render_view(simple_scene(), easy)
-    wanted = first.noise_floor_linear_db + 1
-    both = render_view(simple_scene(), dataclasses.replace(easy, noise_floor_linear_db=wanted))
-    assert both.spp > first.spp == 64
-    assert both.noise_floor_linear_db >= wanted and not both.at_cap
-    alone = dataclasses.replace(easy, noise_floor_db=None, noise_floor_linear_db=wanted)
-    assert digest(render_view(simple_scene(), alone)) == digest(both)
 
 
 def test_every_target_counts_at_the_cap() -> None:
@@ -384,3 +399,135 @@ def test_a_finer_ball_looks_more_like_its_source() -> None:
     assert same == 100.0  # equal meshes, equal random numbers, equal bits
     # denoised twice with other samples: far from equal, and far from another shape
     assert coarse < other_samples < 100
+
+
+Steps = Callable[[ArrayLike, float, int], Iterator[Sampling | Image]]
+
+
+def loaded(scene: Scene, spp: int, **changes: Any) -> Steps:
+    settings = PreviewSettings(**{"resolution": 32, "spp": spp, "denoiser": "off", **changes})
+    return load_preview(scene, settings)
+
+
+def picture(view_steps: Steps, scene: Scene, seed: int = 0) -> NDArray[np.float32]:
+    steps = view_steps(scene.c2w[0], float(scene.fov_deg[0]), seed)
+    *told, found = steps
+    assert isinstance(found, Image) and found.stated_error_db is None
+    assert isinstance(told[-1], Sampling) and told[-1].spp == found.samples
+    assert all(isinstance(step, Sampling) and step.missing_db is None for step in told)
+    return found.radiance_rgb
+
+
+@pytest.mark.parametrize("spp", [1, 7, 85])
+def test_any_number_of_samples_is_a_picture(spp: int) -> None:
+    scene = tiny_scene()
+    for denoiser in ("off", "fast", "high"):
+        view_steps = loaded(scene, spp, denoiser=denoiser)
+        found = picture(view_steps, scene)
+        assert found.shape == (32, 32, 3) and found.dtype == np.float32
+        assert np.isfinite(found).all() and (found >= 0).all() and found.max() > 0
+        np.testing.assert_array_equal(found, picture(view_steps, scene))
+        assert not np.array_equal(found, picture(view_steps, scene, seed=1))
+
+
+def test_few_samples_have_the_light_of_many() -> None:
+    """The mean over seeds is that of 1024 samples, in blocks, within five standard errors."""
+    scene = sampled_like_scene(np.random.default_rng(3), num_views=1)
+
+    def blocks(spp: int, seeds: range) -> Estimate:
+        view_steps = loaded(scene, spp, resolution=16)
+        return blocks_of(np.array([picture(view_steps, scene, seed) for seed in seeds]), 4)
+
+    many = blocks(64, range(1000, 1016))
+    for spp in (1, 5):
+        assert_agree(blocks(spp, range(40)), many, name=f"{spp} samples")
+
+
+def test_what_cannot_be_a_preview_is_refused() -> None:
+    with pytest.raises(TrilightError, match="spp is 0; expected a whole number from 1 to 4096"):
+        PreviewSettings(resolution=32, spp=0)
+    with pytest.raises(TrilightError, match="resolution is 36; expected a multiple of 8"):
+        PreviewSettings(resolution=36, spp=1)
+    lamps = tiny_scene().materials.copy()
+    lamps[:, 7:10] = 1.0
+    with pytest.raises(Rejected, match="no_surfaces"):
+        loaded(tiny_scene(materials=lamps), 1)
+    for emission in (1e6, 1e20, 3e35):  # from about 5e36 on the denoiser would return black
+        bright = tiny_scene()
+        bright.materials[:, 7:10] *= emission
+        for denoiser in ("off", "fast"):
+            with pytest.raises(Rejected, match="radiance_overflow|nonfinite_radiance"):
+                picture(loaded(bright, 4, denoiser=denoiser), bright)
+
+
+class CountingTracer:
+    """Makes flat pictures, and remembers by the names of parts what it was asked for."""
+
+    def __init__(self) -> None:
+        self.asked: Counter[str] = Counter()
+
+    def radiance(self, camera: PixelCamera, *, seed: int, spp: int) -> Any:
+        self.asked[f"pass of {spp}"] += 1
+        return np.ones((camera.resolution, camera.resolution, 3), np.float32)
+
+    def features(self, camera: PixelCamera, *, spp: int) -> Features:
+        self.asked[f"guides of {spp}"] += 1
+        flat = np.ones((camera.resolution, camera.resolution, 3), np.float32)
+        return Features(albedo=flat, normal=flat)
+
+
+@pytest.mark.parametrize("denoiser", ["off", "fast", "high"])
+def test_a_preview_is_made_of_its_parts(
+    denoiser: Filtered, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    tracer, scene = CountingTracer(), tiny_scene()
+    monkeypatch.setattr(preview, "load_tracer", lambda scene, **depths: tracer)
+
+    def filtered(picture: Any, features: Features, quality: str) -> Any:
+        tracer.asked[quality] += 1
+        return picture
+
+    monkeypatch.setattr(preview, "denoise", filtered)
+    for spp in (1, 2, 3, 15, 16, 63, 64, 85, 1024, 4096):
+        tracer.asked.clear()
+        settings = PreviewSettings(resolution=8, spp=spp, denoiser=denoiser)
+        run_to_end(load_preview(scene, settings)(scene.c2w[0], 40.0, 0))
+        assert tracer.asked == preview_parts(spp, denoiser), spp
+        assert set(tracer.asked) <= set(all_parts())
+
+
+def test_each_part_is_timed_in_its_order() -> None:
+    """A clock that ticks once a look gives each part one tick, since each is timed between two."""
+    ticks = iter(range(10_000))
+    found = timed_parts(tiny_scene(), 16, lambda: float(next(ticks)))
+    assert set(found) == set(all_parts())
+    assert set(found.values()) == {1.0}
+    parts = preview_parts(8, "fast")  # two passes, guides and the filter
+    assert sum(count * found[name] for name, count in parts.items()) == 4
+
+
+LOOKS = view_settings(16, max_spp=256, min_mean_radiance=0.0)
+
+
+def test_the_first_looks_are_previews_and_the_last_picture_is_the_measured_one() -> None:
+    scene = tiny_scene()
+    view = run_to_end(SceneRenderer(scene, LOOKS).view_steps(scene.c2w[0], 45.0, 7))
+    *steps, last = SceneRenderer(scene, LOOKS, shows_looks=True).view_steps(scene.c2w[0], 45.0, 7)
+    assert isinstance(last, RenderedView) and last.noise_floor_db == view.noise_floor_db
+    np.testing.assert_array_equal(last.radiance_rgb, view.radiance_rgb)
+    assert all(isinstance(step, Sampling) for step in steps)
+    seen = [step.image for step in steps if isinstance(step, Sampling) and step.image]
+    few = len(FIRST_LOOKS_SPP)
+    for look, spp in zip(seen[:few], FIRST_LOOKS_SPP, strict=True):
+        view_steps = loaded(scene, spp, denoiser=usual_filter(spp))
+        alone = run_to_end(view_steps(scene.c2w[0], 45.0, 7))
+        np.testing.assert_array_equal(look.radiance_rgb, alone.radiance_rgb)
+        assert (look.samples, look.stated_error_db) == (spp, None) and (look.cpu_seconds or 0) > 0
+    measured = seen[few:]
+    counts = [look.samples or 0 for look in measured]
+    assert counts and counts == sorted(set(counts))
+    assert all(look.stated_error_db is not None for look in measured)
+    errors_db = [psnr_log_db(look.radiance_rgb, view.radiance_rgb) for look in seen]
+    assert errors_db[few] > errors_db[0] + 3
+    spent = [*(look.cpu_seconds or 0 for look in measured), last.core_s]
+    assert spent == sorted(spent)

@@ -14,7 +14,6 @@ from pipeline.generation.scene_origins import RenderInput
 from pipeline.generation.scene_worker import ViewProgress, render_sample
 from pipeline.presets.registry import preset_settings
 from pipeline.renders.renderer import SceneRenderer
-from pipeline.renders.settings import RenderSettings
 from pipeline.renders.tracer import load_tracer
 from pipeline.renders.vector_tracer import VectorTracer
 from scene_templates.rotations import uniform_rotation
@@ -228,22 +227,17 @@ def test_a_faint_emitter_is_a_surface() -> None:
     assert_agree(emitter, surface, slack=2e-3)  # as above
 
 
-SETTINGS = view_settings(32, noise_floor_db=60.0, aux_spp=16, split=True)
+SETTINGS = view_settings(32, noise_floor_db=60.0, aux_spp=16)
 
 KINDS = [{"split": True}, {"split_lobes": True}, {"split": True, "split_lobes": True}]
 FLOOR = quad([[-2, -2, 0], [2, -2, 0], [2, 2, 0], [-2, 2, 0]], material(diffuse=0.5))
 LAMP = np.array([[-0.5, -1.5, 2], [0.5, -1.5, 2], [0, -1, 2.4]])
 
 
-def _with(settings: RenderSettings, **changes: object) -> RenderSettings:
-    plain = dataclasses.replace(settings, split=False)
-    return dataclasses.replace(plain, **changes)  # type: ignore[arg-type]
-
-
 @pytest.mark.parametrize(("kind", "max_spp"), [*zip(KINDS, (32, 32, 1024), strict=True)])
-def test_the_stored_picture_is_the_sum_of_its_parts(kind: dict[str, bool], max_spp: int) -> None:
+def test_the_stored_picture_is_the_sum_of_its_parts(kind: dict[str, Any], max_spp: int) -> None:
     """To the last bit, with pictures that the denoiser made and some whose glints are kept."""
-    settings = _with(SETTINGS, max_spp=max_spp, noise_floor_db=90.0, **kind)
+    settings = dataclasses.replace(SETTINGS, max_spp=max_spp, noise_floor_db=90.0, **kind)
     view = render_view(mirrors(), settings)
     assert view.parts_rgb is not None and view.part_floors is not None
     assert tuple(view.parts_rgb) == tuple(view.part_floors) == settings.part_names
@@ -255,7 +249,7 @@ def test_the_stored_picture_is_the_sum_of_its_parts(kind: dict[str, bool], max_s
 
 
 def test_lights_apart_are_split_alike() -> None:
-    both = _with(SETTINGS, per_light=True, split=True, split_lobes=True)
+    both = dataclasses.replace(SETTINGS, per_light=True, split=True, split_lobes=True)
     view = render_view(lit_scene(), both)
     assert view.parts_rgb is not None and view.lights_rgb is not None
     assert {part.shape for part in view.parts_rgb.values()} == {(3, 32, 32, 3)}
@@ -270,7 +264,7 @@ def test_lights_apart_are_split_alike() -> None:
 
 def test_light_that_is_not_there_is_exactly_nothing() -> None:
     """Only direct light on a lone floor; behind a screen, lit by a ceiling, none."""
-    settings = _with(SETTINGS, split=True, split_lobes=True)
+    settings = dataclasses.replace(SETTINGS, split=True, split_lobes=True)
     alone = render_view(join([FLOOR, light(LAMP, 20.0)], eye=(0, -3, 2)), settings)
     assert alone.parts_rgb is not None and alone.part_floors is not None
     np.testing.assert_array_equal(alone.parts_rgb["diffuse_direct"], alone.radiance_rgb)
@@ -294,7 +288,9 @@ def test_what_has_no_lobe_shows_none_of_its_light_once_denoised() -> None:
     """A metal ball on a matt floor: only pixels at its rim show both."""
     ball = sphere([0, 0, 0.5], 0.5, material(specular=0.9, roughness=0.3), rings=8)
     scene = join([FLOOR, ball, light(LAMP, 20.0)], eye=(0, -3, 2), target=(0, 0, 0.4))
-    found = render_view(scene, _with(SETTINGS, split=True, split_lobes=True)).parts_rgb
+    found = render_view(
+        scene, dataclasses.replace(SETTINGS, split=True, split_lobes=True)
+    ).parts_rgb
     assert found is not None
     diffuse, specular = (
         (found[f"{lobe}_direct"] + found[f"{lobe}_indirect"]).max(axis=-1) > 0
@@ -312,7 +308,7 @@ def test_floors_of_parts_are_honest() -> None:
     Measured: the mean of six is 1.4 to 2.9 dB below the truth, part by part, and one of the 24 is
     2.7 dB above. The truths of 16,384 samples agree to 58 dB and more, 11 dB above every picture.
     """
-    few = _with(SETTINGS, min_spp=128, max_spp=256, split=True, split_lobes=True)
+    few = dataclasses.replace(SETTINGS, min_spp=128, max_spp=256, split=True, split_lobes=True)
     whole = dataclasses.replace(few, max_spp=16_384, min_spp=16_384, denoiser="off")
     truth = render_view(mirrors(), whole, seed=99).parts_rgb
     assert truth is not None
@@ -331,9 +327,9 @@ def test_too_many_pictures_are_rejected() -> None:
     count = MAX_LIGHTS // 2 + 1
     lamps = [light(np.add(LAMP, [0.01 * i, 0, 0]), 1.0) for i in range(count)]
     scene = join([FLOOR, *lamps])
-    SceneRenderer(scene, _with(SETTINGS, per_light=True))
+    SceneRenderer(scene, dataclasses.replace(SETTINGS, per_light=True))
     with pytest.raises(Rejected, match=f"too_many_lights.*{count} lights apart; at most 32"):
-        SceneRenderer(scene, _with(SETTINGS, per_light=True, split=True))
+        SceneRenderer(scene, dataclasses.replace(SETTINGS, per_light=True, split=True))
 
 
 def test_a_build_with_the_setting_stores_what_verify_accepts() -> None:

@@ -2,7 +2,6 @@
 
 import copy
 import json
-from dataclasses import dataclass
 from functools import cache
 from pathlib import Path
 from typing import Any
@@ -49,33 +48,23 @@ def example_scene(shared: Path, name: str) -> Scene:
     return scene
 
 
-@dataclass(frozen=True, kw_only=True)
-class PlainObj:
-    """An OBJ file, read by splitting lines."""
+def plain_obj(path: Path) -> tuple[NDArray[np.float64], NDArray[np.int64]]:
+    """Read an OBJ file by splitting lines: its vertices, and its faces cut into fans.
 
-    points: list[tuple[float, float, float]]
-    """Its vertices, once for every different corner that names them: a seam counts twice."""
-    triangles: list[list[tuple[float, float, float]]]
-    """Its faces, cut into fans."""
-
-
-def plain_obj(path: Path) -> PlainObj:
-    """Read an OBJ file in the most obvious way."""
-    vertices: list[tuple[float, float, float]] = []
-    corners: dict[str, tuple[float, float, float]] = {}
+    A vertex stands once for every different corner that names it: a seam counts twice.
+    """
+    vertices: list[list[float]] = []
+    rows: dict[str, int] = {}
     triangles = []
     for line in path.read_text().splitlines():
         kind, *words = line.split() or [""]
         if kind == "v":
-            x, y, z = words[:3]
-            vertices.append((float(x), float(y), float(z)))
+            vertices.append([float(word) for word in words[:3]])
         elif kind == "f":
-            ring = []
-            for word in words:
-                corners[word] = vertices[int(word.split("/")[0]) - 1]
-                ring.append(corners[word])
+            ring = [rows.setdefault(word, len(rows)) for word in words]
             triangles += [[ring[0], ring[i], ring[i + 1]] for i in range(1, len(ring) - 1)]
-    return PlainObj(points=list(corners.values()), triangles=triangles)
+    points = [vertices[int(word.split("/")[0]) - 1] for word in rows]
+    return np.array(points), np.array(triangles)
 
 
 def corners_of(scene: Scene, row: int) -> NDArray[np.float32]:

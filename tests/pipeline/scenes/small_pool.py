@@ -2,7 +2,6 @@
 
 import dataclasses
 import hashlib
-import json
 from collections.abc import Iterable, Sequence
 
 import numpy as np
@@ -20,7 +19,8 @@ from storage.errors import Rejected
 from storage.records.asset import Asset, Level, LevelQuality, LevelRecord, SourceFacts
 from storage.records.object_index import camp_sizes
 from storage.records.objects import LockedObject
-from storage.records.scene import ARRAY_FIELDS, Scene, SceneObject
+from storage.records.scene import Scene, SceneObject
+from storage.records.scene_file import encode_scene
 from storage.seeds import SceneKey
 from tests.scene_templates.balls import STILL
 
@@ -182,12 +182,7 @@ def first_scene(
 
 def digest(scene: Scene) -> str:
     """Return the sha256 over all that a scene holds."""
-    sha = hashlib.sha256()
-    for name in ARRAY_FIELDS:
-        sha.update(getattr(scene, name).tobytes())
-    sha.update(repr(scene.objects).encode())
-    sha.update(json.dumps(dict(scene.provenance), sort_keys=True).encode())
-    return sha.hexdigest()
+    return hashlib.sha256(encode_scene(scene)).hexdigest()
 
 
 def rows_of(scene: Scene, kind: str) -> list[int]:

@@ -258,7 +258,10 @@ def test_a_wall_without_area_is_called_by_its_name() -> None:
 
 
 def test_what_a_scene_must_be_is_looked_at_last(scenes: list[Scene]) -> None:
-    """Of a scene that is fine, each law by itself."""
+    """Of a scene that is fine, each law by itself.
+
+    An emitter in the box of an object is found, and one beside it is not.
+    """
     settings = preset_settings("smoke").scenes
     scene = next(scene for scene in scenes if scene.num_triangles > 1000)
     require_valid(scene, settings)
@@ -270,13 +273,6 @@ def test_what_a_scene_must_be_is_looked_at_last(scenes: list[Scene]) -> None:
     normals[0] = 0
     with pytest.raises(Rejected, match="^law_broken: .*vertex_normals"):
         require_valid(dataclasses.replace(scene, vertex_normals=normals), settings)
-
-
-def test_an_emitter_in_the_box_of_an_object_is_found_and_one_beside_it_is_not(
-    scenes: list[Scene],
-) -> None:
-    settings = preset_settings("smoke").scenes
-    scene = scenes[0]
     kinds = [entry.kind for entry in scene.objects]
     emitter, body = len(kinds) - 1, kinds.index("object")
     vertices = scene.faces[scene.object_index == emitter].ravel()

@@ -323,7 +323,8 @@ def _by_corner(mesh: ShadedMesh) -> NDArray[np.float32]:
     return mesh.normals[mesh.faces]
 
 
-def test_shading_moves_no_triangle_and_flat_normals_are_the_geometric_ones() -> None:
+def test_shading_moves_no_triangle_turns_with_the_mesh_and_flat_normals_are_geometric() -> None:
+    rotation = rotation_xyz([20, 50, -70])
     for positions, faces in _shapes():
         flat, smooth = flat_shaded(positions, faces), smooth_shaded(positions, faces, 30.0)
         for mesh in (flat, smooth):
@@ -339,6 +340,11 @@ def test_shading_moves_no_triangle_and_flat_normals_are_the_geometric_ones() -> 
         for angle_deg in (30.0, 180.0):  # no corner is turned away from its face
             corners = _by_corner(smooth_shaded(positions, faces, angle_deg))
             assert np.einsum("tci,ti->tc", corners, geometric).min() > 0.1 - ROUNDING
+        turned = (positions @ rotation.T).astype(np.float32)
+        straight = _by_corner(smooth_shaded(positions, faces, 33.0)) @ rotation.T
+        # Positions move by 6e-8 when rounded; the smallest edge is 0.05 long, and a normal turns
+        # by their ratio, a few 1e-6.
+        assert np.abs(_by_corner(smooth_shaded(turned, faces, 33.0)) - straight).max() < 1e-5
 
 
 def test_a_cube_keeps_its_edges_and_a_sphere_becomes_round() -> None:
@@ -370,16 +376,6 @@ def test_groups_agree_with_those_of_trimesh_and_an_edge_of_three_faces_is_sharp(
     faces = np.array([[0, 1, 2], [1, 0, 3], [0, 1, 4]], np.uint32)
     normals = np.tile([0.0, 0.0, 1.0], (3, 1))
     assert len(set(shading_groups(faces, normals, 30.0).tolist())) == 3
-
-
-def test_normals_turn_with_the_mesh() -> None:
-    rotation = rotation_xyz([20, 50, -70])
-    for positions, faces in _shapes():
-        turned = (positions @ rotation.T).astype(np.float32)
-        straight = _by_corner(smooth_shaded(positions, faces, 33.0)) @ rotation.T
-        # Positions move by 6e-8 when rounded; the smallest edge is 0.05 long, and a normal turns
-        # by their ratio, a few 1e-6.
-        assert np.abs(_by_corner(smooth_shaded(turned, faces, 33.0)) - straight).max() < 1e-5
 
 
 def test_normals_do_not_depend_on_how_a_flat_side_is_cut() -> None:
@@ -494,27 +490,21 @@ def test_meshes_inside_and_beside_each_other_and_of_any_size() -> None:
         assert ball.overlaps(_at(0, radius=radius), ball, _at(radius + 0.17, radius=0.2))
 
 
-def _off_centre() -> NDArray[np.float32]:
-    """A level that is not in the middle of its source: half of a ball is gone."""
-    ball = trimesh.creation.icosphere(2)
-    points = level(ball).positions
-    return points[points[:, 0] > 0]
-
-
 def test_the_centre_is_the_mean_of_the_vertices_or_the_middle_of_the_source() -> None:
     for entry in small_pool():
         points = normalize_to_unit_sphere(entry.asset.levels[0].positions, "vertex_mean")
         # Sums of a thousand float64 below 1.
         assert np.abs(points.mean(axis=0)).max() < 1e-12
         assert abs(np.linalg.norm(points, axis=1).max() - 1) < 1e-12
-    moved = normalize_to_unit_sphere(_off_centre() + np.float32(0.3), "vertex_mean")
+    # A level that is not in the middle of its source: half of a ball is gone.
+    half = level(trimesh.creation.icosphere(2)).positions
+    half = half[half[:, 0] > 0]
+    moved = normalize_to_unit_sphere(half + np.float32(0.3), "vertex_mean")
     # Positions are float32 before they are centred: 6e-8 of a number below 1, over a radius of 0.5.
-    assert np.abs(moved - normalize_to_unit_sphere(_off_centre(), "vertex_mean")).max() < TOUCH
+    assert np.abs(moved - normalize_to_unit_sphere(half, "vertex_mean")).max() < TOUCH
     # It is the origin of the asset's unit box, however a level is cut: levels fit each other.
-    points = normalize_to_unit_sphere(_off_centre(), "box")
-    assert np.array_equal(
-        points, _off_centre() / np.linalg.norm(_off_centre().astype(float), axis=1).max()
-    )
+    points = normalize_to_unit_sphere(half, "box")
+    assert np.array_equal(points, half / np.linalg.norm(half.astype(float), axis=1).max())
     assert abs(np.linalg.norm(points, axis=1).max() - 1) < 1e-12
     assert points[:, 0].min() >= 0  # the middle is where the other half would begin
 

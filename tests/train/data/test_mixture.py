@@ -25,13 +25,9 @@ from torch import Tensor
 from model.open import path_of_step
 from storage.conventions import log10_radiance
 from storage.dataset.dataset import Dataset
-<<<<<<< HEAD
-from storage.dataset.training_data import TrainingData, open_training_data
-=======
 from storage.dataset.shard import ShardReader, write_shard
 from storage.dataset.shard_set import ShardSet
-from storage.dataset.training_data import TrainingData, open_mixture, open_training_data
->>>>>>> t3
+from storage.dataset.training_data import TrainingData, open_training_data
 from storage.errors import TrilightError
 from storage.records.sample import encode_sample
 from tests.for_each import for_each

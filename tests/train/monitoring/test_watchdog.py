@@ -308,7 +308,13 @@ def test_the_trace_holds_the_steps_and_the_note_says_how_to_open_it(tmp_path: Pa
     assert "aten::mm" in (tmp_path / table).read_text()
     (note,) = said
     assert str(trace) in note and "chrome://tracing" in note and table in note
-<<<<<<< HEAD
+    ended = "nothing was profiled: the run ended before step 4 of this call"
+    for asked, steps, told in ((2, 1, [ended]), (0, 8, [])):
+        said.clear()
+        with profiled_steps(asked, 0, CPU, tmp_path / "none", said.append) as end_step:
+            for _ in range(steps):
+                end_step()
+        assert said == told and not list(tmp_path.glob("none/*"))
 
 
 @for_each("written", [True, False])
@@ -325,23 +331,6 @@ def test_a_step_that_fails_is_in_the_trace_and_a_trace_that_is_not_written_is_no
             end_step()
         raise RuntimeError("step 4 fails")
     assert [text.partition(":")[0] for text in told] == ["steps 4 to 4 were profiled"] * written
-
-
-@for_each(("asked", "steps"), [(2, 1), (0, 8)])
-def test_what_was_not_reached_is_told(tmp_path: Path, asked: int, steps: int) -> None:
-    told: list[str] = []
-    with profiled_steps(asked, 0, CPU, tmp_path, told.append) as end_step:
-        for _ in range(steps):
-            end_step()
-=======
->>>>>>> t3
-    ended = "nothing was profiled: the run ended before step 4 of this call"
-    for asked, steps, told in ((2, 1, [ended]), (0, 8, [])):
-        said.clear()
-        with profiled_steps(asked, 0, CPU, tmp_path / "none", said.append) as end_step:
-            for _ in range(steps):
-                end_step()
-        assert said == told and not list(tmp_path.glob("none/*"))
 
 
 REPORT = StepReport(loss=1.0, l1=1.0, brightness=1.0, grad_norm=0.1, applied=True)

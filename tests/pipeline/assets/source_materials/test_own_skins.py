@@ -41,11 +41,6 @@ def _transformed_glb(path: Path) -> Path:
     return meshes.write_glb(path, tree, buffer)
 
 
-def _transform(stage: Usd.Stage) -> None:
-    """A quarter turn counter-clockwise and a shift back: (s, t) reads (1 - t, s)."""
-    kit.transform_coordinates(stage, 90.0, (1, 1), (1, 0))
-
-
 def _place_quad(stage: Usd.Stage) -> None:
     """One polygon with coordinates of its corners, a quarter turn above it: +y, x to -z."""
     mesh = UsdGeom.Mesh(stage.GetPrimAtPath(kit.MESH))
@@ -57,7 +52,10 @@ def _place_quad(stage: Usd.Stage) -> None:
 
 TURNED: dict[str, Callable[[Path], Path]] = {
     "glb transform": lambda folder: _transformed_glb(folder / "a.glb"),
-    "usd transform": lambda folder: kit.textured_usd(folder / "a.usda", PICTURE, _transform),
+    # counter-clockwise and a shift back: (s, t) reads (1 - t, s)
+    "usd transform": lambda folder: kit.textured_usd(
+        folder / "a.usda", PICTURE, lambda it: kit.transform_coordinates(it, 90.0, (1, 1), (1, 0))
+    ),
     "usd quad": lambda folder: kit.textured_usd(folder / "a.usda", PICTURE, _place_quad),
 }
 

@@ -102,14 +102,21 @@ def textured_obj(path: Path, picture: bytes, mtl: str = "map_Kd its picture.png\
     return path
 
 
-def find_triangle(level: Level, right: float, up: float) -> tuple[int, NDArray[np.float64]]:
-    """Return the triangle of an upright square at a place, and the weights [3] of its corners."""
-    for face, corners in enumerate(level.positions[level.faces]):
-        flat = np.vstack([corners[:, [0, 2]].T, np.ones(3)])
-        weights = np.linalg.solve(flat.astype(np.float64), [right, up, 1.0])
+def triangle_at(
+    triangles: NDArray[np.float32], x: float, y: float
+) -> tuple[int, NDArray[np.float64]]:
+    """Return the flat triangle [T, 3, 2] at a place, and the weights [3] of its corners."""
+    for face, corners in enumerate(triangles):
+        flat = np.vstack([corners.T, np.ones(3)])
+        weights = np.linalg.solve(flat.astype(np.float64), [x, y, 1.0])
         if (weights >= -1e-9).all():
             return face, np.asarray(weights, np.float64)
-    raise AssertionError(f"no triangle at {right}, {up}")
+    raise AssertionError(f"no triangle at {x}, {y}")
+
+
+def find_triangle(level: Level, right: float, up: float) -> tuple[int, NDArray[np.float64]]:
+    """Return the triangle of an upright square at a place, and the weights [3] of its corners."""
+    return triangle_at(level.positions[level.faces][..., [0, 2]], right, up)
 
 
 def seen_at(asset: Asset, right: float, up: float, column: int = 0) -> NDArray[np.float64]:

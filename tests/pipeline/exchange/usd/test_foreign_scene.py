@@ -187,11 +187,6 @@ CODED = 0.005
 """Half a step of 8 sRGB-encoded bits is at most 0.0045 in linear light."""
 
 
-def linear(srgb: tuple[int, int, int]) -> np.ndarray:
-    """Return the diffuse albedo of such a surface by its encoded color."""
-    return np.asarray(linear_from_srgb8()[list(srgb)] * (1 - F))
-
-
 Edit = Callable[[Any, UsdShade.Shader, UsdShade.Shader], None]
 
 
@@ -247,17 +242,16 @@ def test_inputs_of_a_texture_are_applied_bounded_and_said(
         assert row_at(found.scene, *place)[:3] == pytest.approx(expected, abs=CODED)
 
 
-def test_too_many_triangles_are_refused_before_all_are_read(
+def test_a_huge_picture_is_refused_and_too_many_triangles_before_all_are_read(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     path = write_stage(tmp_path)
-    monkeypatch.setattr("pipeline.exchange.textured_triangles.MAX_TRIANGLES", 1)
-    with pytest.raises(TrilightError, match=r"usda: \d+ triangles so far; expected at most 1 in"):
-        read_usd(path)
-
-
-def test_a_huge_picture_is_refused(tmp_path: Path) -> None:
-    path = write_stage(tmp_path)
+    with monkeypatch.context() as patch:
+        patch.setattr("pipeline.exchange.textured_triangles.MAX_TRIANGLES", 1)
+        with pytest.raises(
+            TrilightError, match=r"usda: \d+ triangles so far; expected at most 1 in"
+        ):
+            read_usd(path)
     Image.new("L", (9000, 9000)).save(tmp_path / "tex.png")
     with pytest.raises(TrilightError, match=r"tex.png': 9000 x 9000 pixels; expected at most"):
         read_usd(path)

@@ -41,15 +41,9 @@ from tests.sky_maps import COLOURS, POLES, one_sun, six_poles, smooth
 from tests.textured_by_hand import bumpy_scene, number_texture, sky, textured_scene
 
 OPENPBR_INPUTS = {
-    "base_color": "color3f",
-    "base_weight": "float",
-    "base_diffuse_roughness": "float",
-    "specular_weight": "float",
-    "specular_color": "color3f",
-    "specular_roughness": "float",
-    "specular_ior": "float",
-    "emission_luminance": "float",
-    "emission_color": "color3f",
+    **dict.fromkeys(("base_color", "specular_color", "emission_color"), "color3f"),
+    **dict.fromkeys(("base_weight", "base_diffuse_roughness", "emission_luminance"), "float"),
+    **dict.fromkeys(("specular_weight", "specular_roughness", "specular_ior"), "float"),
 }
 """What we write of OpenPBR 1.1's node in MaterialX, by type: no validator knows the node."""
 
@@ -80,12 +74,6 @@ def odd_scene() -> Scene:
         ),
         provenance={"a": [1, 2.5, None, {"b": "ü"}]},
     )
-
-
-def test_validators_would_see_a_mistake(tmp_path: Path) -> None:
-    stage = written(tmp_path, tiny_scene())
-    stage.ClearDefaultPrim()
-    assert errors_of(stage)
 
 
 @st.composite
@@ -152,8 +140,11 @@ def test_rows_of_materials_are_written_in_one_order() -> None:
     assert len(orders) > 1 and all(order == orders[0] for order in orders)
 
 
-def test_stage_says_units_and_holds_no_path(tmp_path: Path) -> None:
-    """A lens is in tenths of a metre."""
+def test_stage_says_units_and_lights_and_holds_no_path(tmp_path: Path) -> None:
+    """A lens is in tenths of a metre; an emitter is a light, and glows on both sides.
+
+    Validators would see a mistake.
+    """
     scene = tiny_scene()
     stage = written(tmp_path, scene, "a.usda")
     assert UsdGeom.GetStageUpAxis(stage) == "Z"
@@ -164,6 +155,16 @@ def test_stage_says_units_and_holds_no_path(tmp_path: Path) -> None:
     camera = UsdGeom.Camera.Get(stage, "/Scene/Cameras/camera_0").GetCamera()
     wanted = 0.018 / math.tan(math.radians(float(scene.fov_deg[0])) / 2)
     assert camera.focalLength / 10 == pytest.approx(wanted, rel=1e-6)
+    light = stage.GetPrimAtPath("/Scene/Objects/light")
+    assert light.HasAPI(UsdLux.MeshLightAPI)
+    assert UsdLux.LightAPI(light).GetIntensityAttr().Get() == 1
+    assert UsdGeom.Mesh(light).GetDoubleSidedAttr().Get() is True
+    assert light.GetAttribute("trilight:visibleToCamera").Get() is False
+    floor = stage.GetPrimAtPath("/Scene/Objects/floor")
+    assert not floor.HasAPI(UsdLux.MeshLightAPI)
+    assert floor.GetAttribute("trilight:licence").Get() == "CC0-1.0"
+    stage.ClearDefaultPrim()
+    assert errors_of(stage)
 
 
 def test_materials_are_bound_by_subsets_and_say_the_same_in_openpbr(tmp_path: Path) -> None:
@@ -195,18 +196,6 @@ def assert_material(material: Any, values: np.ndarray) -> None:
     head_on = ((ior - 1) / (ior + 1)) ** 2 * np.array(openpbr.GetInput("specular_color").Get())
     # beyond 0.98 no index is sought
     assert head_on == pytest.approx(np.minimum(values[3:6], 0.98), abs=1e-5)
-
-
-def test_an_emitter_is_a_light_and_glows_on_both_sides(tmp_path: Path) -> None:
-    stage = written(tmp_path, tiny_scene())
-    light = stage.GetPrimAtPath("/Scene/Objects/light")
-    assert light.HasAPI(UsdLux.MeshLightAPI)
-    assert UsdLux.LightAPI(light).GetIntensityAttr().Get() == 1
-    assert UsdGeom.Mesh(light).GetDoubleSidedAttr().Get() is True
-    assert light.GetAttribute("trilight:visibleToCamera").Get() is False
-    floor = stage.GetPrimAtPath("/Scene/Objects/floor")
-    assert not floor.HasAPI(UsdLux.MeshLightAPI)
-    assert floor.GetAttribute("trilight:licence").Get() == "CC0-1.0"
 
 
 @pytest.mark.parametrize("suffix", WRITTEN_USD_SUFFIXES)
@@ -251,10 +240,14 @@ def test_what_was_changed_or_added_is_no_longer_ours(tmp_path: Path) -> None:
 
 def test_what_is_not_written(tmp_path: Path) -> None:
     odd = (SceneObject(name="a\0b", kind="shell"), tiny_scene().objects[1])
+    long = np.zeros((1, 8193, 3), np.uint8)
+    long[0, 0] = 1
+    too_large = textured_scene(0, Texture(texels=long), number_texture())
     for scene, name, message in (
         (tiny_scene(), "a.usd", "ends in .usda, .usdc, .usdz"),
         (tiny_scene(fov_deg=np.array([45, 181], np.float32)), "a.usda", "fov_deg"),
         (tiny_scene(objects=odd), "a.usda", "a character that USD cannot store"),
+        (too_large, "a.usda", "texture: 8193 x 1 texels; expected at most 8192"),
     ):
         with pytest.raises(TrilightError, match=message):
             write_usd(tmp_path / name, scene)
@@ -415,7 +408,10 @@ def test_one_colour_is_no_texture(tmp_path: Path) -> None:
 
 
 def test_other_programs_find_every_corner_where_we_have_it(tmp_path: Path) -> None:
-    """By the words of USD alone: `st` of a corner, v up, the top row of a picture at v = 1."""
+    """By the words of USD alone: `st` of a corner, v up, the top row of a picture at v = 1.
+
+    A textured material has no constant OpenPBR that renderers of MaterialX would prefer.
+    """
     texels = np.array([[[200, 0, 0], [0, 200, 0]], [[0, 0, 200], [90, 90, 0]]], np.uint8)
     scene = textured_scene(0, Texture(texels=texels, is_srgb=True), number_texture())
     stage = written(tmp_path, scene, "a.usda")
@@ -428,11 +424,6 @@ def test_other_programs_find_every_corner_where_we_have_it(tmp_path: Path) -> No
     primvar = UsdGeom.PrimvarsAPI(stage.GetPrimAtPath("/Scene/Objects/floor")).GetPrimvar("st")
     assert primvar.GetInterpolation() == "faceVarying"
     assert np.array_equal(np.array(primvar.Get()), scene.uv[:6])  # type: ignore[index]
-
-
-def test_renderers_of_materialx_get_the_textures_too(tmp_path: Path) -> None:
-    """A textured material has no constant OpenPBR that they would prefer; others keep it."""
-    stage = written(tmp_path, textured_scene(), "a.usda")
     shaders = {FLOOR: "UsdPreviewSurface", LIGHT: "ND_open_pbr_surface_surfaceshader"}
     for row, expected in shaders.items():
         material = UsdShade.Material(stage.GetPrimAtPath(f"/Scene/Materials/material_{row}"))
@@ -454,11 +445,3 @@ def test_files_that_were_changed_are_read_as_they_are_now(tmp_path: Path) -> Non
     found = read_usd(path)
     assert any("diffuse was changed since" in text for text in found.notes)
     assert (_sky(found.scene).radiance_rgb == 7).all()
-
-
-def test_a_texture_too_large_for_usd_is_refused(tmp_path: Path) -> None:
-    long = np.zeros((1, 8193, 3), np.uint8)
-    long[0, 0] = 1
-    scene = textured_scene(0, Texture(texels=long), number_texture())
-    with pytest.raises(TrilightError, match="texture: 8193 x 1 texels; expected at most 8192"):
-        write_usd(tmp_path / "a.usda", scene)

@@ -9,6 +9,7 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.spatial.transform import Rotation
 
 _CODES = {"i1": 5120, "u1": 5121, "i2": 5122, "u2": 5123, "u4": 5125, "f4": 5126}
 _KINDS = {1: "SCALAR", 2: "VEC2", 3: "VEC3", 4: "VEC4"}
@@ -98,12 +99,8 @@ class GltfWriter:
 
 
 def matrix_of(translation: Any, rotation: Any, scale: Any) -> NDArray[np.float64]:
-    """Return [4, 4] of a translation, a unit quaternion (x, y, z, w) and a scale: p + q s v q*."""
-    vector, real = np.asarray(rotation[:3], np.float64), float(rotation[3])
+    """Return [4, 4] of a translation, a unit quaternion (x, y, z, w) and a scale."""
     found = np.eye(4)
-    for axis in range(3):
-        v = np.eye(3)[axis] * scale[axis]
-        once = 2 * np.cross(vector, v)
-        found[:3, axis] = v + real * once + np.cross(vector, once)
+    found[:3, :3] = Rotation.from_quat(rotation).as_matrix() * scale
     found[:3, 3] = translation
     return found

@@ -22,6 +22,8 @@ from pipeline.foreign.source_file import load_mesh, read_source
 from storage.errors import Rejected, TrilightError
 from storage.records.lookup import textured_rows
 from tests.for_each import case, for_each
+from tests.pipeline.assets.meshes_by_hand import gltf_tree
+from tests.pipeline.assets.source_materials.textured_kit import SQUARE
 from tests.pipeline.foreign.gltf.gltf_writer import GltfWriter, matrix_of
 
 KEPT = ReadLimits(with_materials=True)
@@ -122,8 +124,12 @@ def dialects(draw: st.DrawFn) -> dict[str, Any]:
 def written(dialect: dict[str, Any], folder: Path) -> tuple[Path, NDArray[np.float64]]:
     """Write a mesh in a dialect; return its file and what must be read of it."""
     file = GltfWriter()
-    attributes: dict[str, int] = {}
-    points = with_positions(file, dialect, attributes)
+    stored, is_unit = dialect["positions"], dialect["code"] == "unit"
+    code, points = "i1" if is_unit else dialect["code"], stored / (127 if is_unit else 1)
+    place = file.accessor(stored, code, layout=dialect["layout"], normalized=is_unit)
+    attributes = {"POSITION": place}
+    if code != "f4":
+        file.use("KHR_mesh_quantization")
     colors = with_colors(file, dialect, attributes)
     order = np.arange(len(points)) if dialect["order"] is None else np.array(dialect["order"])
     primitive: dict[str, Any] = {"attributes": attributes, "material": 0}
@@ -147,18 +153,6 @@ def written(dialect: dict[str, Any], folder: Path) -> tuple[Path, NDArray[np.flo
         shades.append(colors[three].mean(axis=0) * diffuse)
     wanted = ordered(np.reshape(corners, (-1, 3, 3)), np.reshape(shades, (-1, 3)))
     return file.save(folder, dialect["form"]), wanted
-
-
-def with_positions(
-    file: GltfWriter, dialect: dict[str, Any], attributes: dict[str, int]
-) -> NDArray[np.float64]:
-    points, is_unit = dialect["positions"], dialect["code"] == "unit"
-    code = "i1" if is_unit else dialect["code"]
-    layout = dialect["layout"]
-    attributes["POSITION"] = file.accessor(points, code, layout=layout, normalized=is_unit)
-    if code != "f4":
-        file.use("KHR_mesh_quantization")
-    return points / (127 if is_unit else 1)
 
 
 def with_colors(
@@ -272,14 +266,9 @@ def test_objects_and_scenes_of_shared_files_are_the_same(shared: Path) -> None:
 
 
 def plain(change: Callable[[GltfWriter], Any] = lambda file: None) -> GltfWriter:
-    """Return a quad of two triangles, changed."""
-    file = GltfWriter()
-    corners = np.array([[0, 0, 0], [1, 0, 0], [1, 1, 0], [0, 1, 0]])
-    attributes = {"POSITION": file.accessor(corners, "f4")}
-    indices = file.accessor(np.array([0, 1, 2, 0, 2, 3]), "u2")
-    file.add("meshes", {"primitives": [{"attributes": attributes, "indices": indices}]})
-    file.add("nodes", {"mesh": 0})
-    file.add("scenes", {"nodes": [0]})
+    """Return a square of two triangles, changed."""
+    tree, buffer = gltf_tree(SQUARE)
+    file = GltfWriter(tree=tree, data=bytearray(buffer))
     change(file)
     return file
 

@@ -176,7 +176,7 @@ def test_what_arcs_multiply_is_left(
         prims_of(OpenedStage(tmp_path / "bomb.usda"))
 
 
-def test_exactly_what_composition_makes_is_counted(
+def test_exactly_what_composition_makes_is_counted_and_one_prototype_once(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     (tmp_path / "b.usda").write_text(
@@ -189,11 +189,6 @@ def test_exactly_what_composition_makes_is_counted(
     monkeypatch.setattr(opening, "MAX_PRIMS", 16)
     with pytest.raises(TrilightError, match="more than 16 prims"):
         prims_of(OpenedStage(tmp_path / "b.usda"))
-
-
-def test_instances_of_one_prototype_count_once(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
     inner = "".join(f'def "c{i}" {{}}\n' for i in range(50))
     heir = 'def "I{}" (instanceable = true\nreferences = </P>) {{}}\n'
     heirs = "".join(map(heir.format, range(50)))
@@ -217,15 +212,12 @@ def stage_of(prototype: str, count: int) -> Usd.Stage:
 def test_instances_stand_in_their_order_and_too_many_are_refused_before_their_places_are_computed(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
+    """An instancer within itself is refused: every level would hold the places of its instances."""
     lost: list[str] = []
     found = placed.placed_prims(stage_of("/many/mesh", 3), Usd.TimeCode.Default(), lost)
     assert [each.to_world[0, 3] for each in found] == [0, 1, 2]
+    with pytest.raises(TrilightError, match="/many: nested more than 150 deep"):
+        placed.placed_prims(stage_of("/many", 2), Usd.TimeCode.Default(), [])
     monkeypatch.setattr(placed, "MAX_PLACED", 4)
     with pytest.raises(TrilightError, match="/many: 5 instances; expected at most 4"):
         placed.placed_prims(stage_of("/many/mesh", 5), Usd.TimeCode.Default(), [])
-
-
-def test_an_instancer_within_itself_is_refused() -> None:
-    """Every level would hold the places of its instances."""
-    with pytest.raises(TrilightError, match="/many: nested more than 150 deep"):
-        placed.placed_prims(stage_of("/many", 2), Usd.TimeCode.Default(), [])
