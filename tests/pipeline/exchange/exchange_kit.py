@@ -12,6 +12,7 @@ from PIL import Image
 from pxr import Gf, Sdf, Usd, UsdGeom, UsdLux, UsdValidation
 
 from pipeline.assets.settings import AssetSettings
+from pipeline.exchange.renderformer_h5 import read_renderformer_h5, write_renderformer_h5
 from pipeline.exchange.renderformer_json import write_renderformer_json
 from pipeline.exchange.scene_files import build_scene
 from pipeline.exchange.textured_triangles import LoadedScene
@@ -51,6 +52,11 @@ def json_and_back(scene: Scene, folder: Path) -> tuple[Scene, tuple[str, ...]]:
     """Return the scene that our reader makes of its RenderFormer files, and what was lost."""
     lost = write_renderformer_json(folder / "again.json", scene)
     return build_json(folder, "again.json"), lost
+
+
+def h5_and_back(scene: Scene, folder: Path) -> Scene:
+    write_renderformer_h5(folder / "again.h5", scene)
+    return read_renderformer_h5(folder / "again.h5").scene
 
 
 def edited_layer(folder: Path, scene: Scene, edit: Callable[[Any], object]) -> LoadedScene:
