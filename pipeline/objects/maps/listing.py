@@ -106,10 +106,10 @@ def _with_files(kind: str, root: Path, records: Sequence[ObjectRecord]) -> list[
         return [FoundMap(record=row, files={"map": Path(row.path)}) for row in records]
     textures: dict[str, dict[str, str]] = {}
     for folder in sorted(filter(Path.is_dir, {Path(row.path).parent for row in records})):
-        beside = [folder]
+        folders = [folder]
         if folder != root and is_part_folder(folder.name):
-            beside = [each for each in folder.parent.iterdir() if is_part_folder(each.name)]
-        paths = [path for each in beside if each.is_dir() for path in each.iterdir()]
+            folders = [each for each in folder.parent.iterdir() if is_part_folder(each.name)]
+        paths = [path for each in folders if each.is_dir() for path in each.iterdir()]
         names = [path.relative_to(root).as_posix() for path in paths]
         pictures = [n for n in names if n.lower().endswith(PICTURES) and not _is_hidden(n)]
         for files in group_textures(pictures)[0].values():
