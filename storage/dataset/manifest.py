@@ -29,7 +29,7 @@ from storage.atomic import atomic_writer
 from storage.conventions import MANIFEST_VERSION, READABLE_MANIFESTS, SPLITS
 from storage.dataset.layout import numbered_path
 from storage.dataset.shard import scan_samples
-from storage.dataset.splits import Split, cut_splits, scenes_of_shard, shard_name, shards_for
+from storage.dataset.splits import cut_splits, scenes_of_shard, shard_name, shards_for
 from storage.digests import canonical_json, sha256_hex, sha256_of_stream
 from storage.errors import TrilightError, prefix_errors
 from storage.records.safe_read import open_plain
@@ -64,7 +64,7 @@ class ShardEntry:
     name: ShardName
     """File name next to the manifest, or in one of the parts of its folder
     (storage.dataset.layout)."""
-    split: Split
+    split: Annotated[str, Spelled("|".join(SPLITS), "train, validation or test")]
     """train, validation or test."""
     num_samples: Scenes
     num_bytes: Bytes

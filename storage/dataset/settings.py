@@ -7,7 +7,9 @@ import functools
 import itertools
 from typing import Annotated, ClassVar
 
-from storage.dataset.splits import TEST_SLOT, Split
+from storage.conventions import SPLITS
+from storage.dataset.splits import TEST_SLOT
+from storage.errors import TrilightError, expected_one_of
 from storage.records.passes import pass_names
 from storage.records.profiles import Profile
 from storage.settings.described import checked, leaves_out
@@ -21,10 +23,14 @@ MOST_SCENES = 1_000_000_000
 class ListedShard:
     """One shard of a dataset whose shards are those of another."""
 
-    split: Split
+    split: str
     """Its split: train, validation or test."""
     scenes: Annotated[int, Within(1, MOST_SCENES, unit="scenes")]
     """Number of its scenes."""
+
+    def __post_init__(self) -> None:
+        if self.split not in SPLITS:
+            raise TrilightError(f"split is {self.split!r}; {expected_one_of(self.split, SPLITS)}.")
 
 
 @checked()

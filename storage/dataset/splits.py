@@ -8,18 +8,14 @@ one. Where the shards are listed, since they are those of another dataset, the l
 
 import dataclasses
 from collections.abc import Mapping
-from typing import TYPE_CHECKING, Annotated
+from typing import TYPE_CHECKING
 
 from storage.conventions import SPLITS
 from storage.dataset.layout import numbered_path
 from storage.errors import TrilightError
-from storage.typed_json import Spelled
 
 if TYPE_CHECKING:
     from storage.dataset.settings import SplitSettings
-
-Split = Annotated[str, Spelled("|".join(SPLITS), "train, validation or test")]
-"""Name of a split."""
 
 JUDGED_SPLIT = "test"
 """Split of whole sets that are judged by, never learnt from."""

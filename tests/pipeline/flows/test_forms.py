@@ -19,6 +19,7 @@ from unittest.mock import Mock
 import pytest
 from PIL import Image
 from prefect.exceptions import ParameterTypeError
+from prefect.utilities.schema_tools.validation import is_valid_schema
 
 from infra.serving.train_model import train_model
 from pipeline.executors.registry import find_executor
@@ -79,6 +80,7 @@ def test_every_parameter_has_a_sentence_and_a_default(name: str) -> None:
         assert len(schema["description"]) > 10, parameter
         assert "default" in schema, parameter
     assert not flow.parameters.required
+    is_valid_schema(flow.parameters.model_dump())  # as the server asks when it is deployed
 
 
 def test_the_forms_within_have_every_setting_of_a_build_and_its_range() -> None:
