@@ -166,7 +166,7 @@ def test_a_bad_file_and_a_dark_scene_cost_themselves(
         ("000000000", "unusable_scene_file", 0),
         ("000000001", "black_view", 0),
     ]
-    assert "bad.json: cameras is missing; add it." in rows[0].message
+    assert "bad.json: 0 objects; expected 1 to 8192." in rows[0].message
     trilight("verify", "set")
     again = trilight("generate", "smoke", *arguments, *EXACT, "--workers", "2")
     assert json.loads(again.stdout)["dataset_digest"] == outcome["dataset_digest"]

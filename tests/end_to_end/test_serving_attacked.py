@@ -249,9 +249,9 @@ def test_the_same_page_does_as_it_likes_with_prefect_alone(tmp_path: Path) -> No
                 time.sleep(0.2)
             _, flow = alone.ask("POST", "/api/flows/", {"name": "f"})
             given = {"name": "local", "flow_id": flow["id"], "entrypoint": "f_scenes"}
-            assert alone.ask("POST", "/api/deployments/", given)[0] == 201
             won: set[str] = set()
-            for _ in range(3):  # a server that has just started breaks off answers on a busy disk
+            for _ in range(5):  # a server that has just started breaks off answers on a busy disk
+                assert alone.ask("POST", "/api/deployments/", given)[0] in (200, 201)  # deleted?
                 with browser(RESOLVED) as page:
                     told = _attack_of(alone, page, _origins(alone)["another port of this machine"])
                 won |= {name for name, how in told.items() if how.startswith("answered")}
