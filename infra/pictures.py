@@ -18,7 +18,6 @@ from PIL import Image, ImageDraw, ImageFont
 
 from infra.cli.console import console
 from infra.render.path_tracer import PathTracer, RenderChild
-from infra.render.quality import measured_settings
 from infra.viewer.open_source import open_handlers
 from model.inference import NeuralRenderer
 from pipeline.assets.cleaning.clean import clean, normalize
@@ -32,6 +31,7 @@ from pipeline.generation.generate_options import GenerateOptions
 from pipeline.generation.pipeline import make_dataset
 from pipeline.renders.mitsuba_variant import choose_variant
 from pipeline.renders.renderer import RenderedView
+from pipeline.renders.settings import measured_settings
 from storage.conventions import preview_gain, preview_srgb8
 from storage.dataset.dataset import open_dataset
 from storage.metrics import psnr_log_db

@@ -9,10 +9,9 @@ from typing import TYPE_CHECKING, cast
 import numpy as np
 from numpy.typing import NDArray
 
-from infra.render.quality import MOST_TRACED_SPP, measured_settings
 from infra.torch_library import require_torch
 from pipeline.renders.renderer import RenderedView
-from pipeline.renders.settings import StatedError
+from pipeline.renders.settings import MOST_TRACED_SPP, StatedError, measured_settings
 from storage.atomic import write_atomically
 from storage.conventions import HALF_FLOAT_MAX, preview_srgb8
 from storage.errors import TrilightError

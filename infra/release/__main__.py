@@ -23,14 +23,13 @@ from infra.cli.console import Bars, first_words, next_step, print_rows
 from infra.release.push_to_hub import NETWORK_FILE, kind_of, require_within_limits
 from infra.render.networks import NetworkRenderer
 from infra.render.path_tracer import PathTracer, RenderChild
-from infra.render.quality import samples_text
 from model.open import BUILTIN_NETWORKS
 from pipeline.documents.checksums import write_sums
 from pipeline.documents.pages import Figure, render_page
 from pipeline.documents.png import encode_png
 from pipeline.documents.sheets import choose_scenes, read_chosen
 from pipeline.renders.mitsuba_variant import choose_variant
-from pipeline.renders.preview import PreviewSettings
+from pipeline.renders.preview import PreviewSettings, samples_text
 from storage.atomic import write_atomically
 from storage.conventions import SPLITS, preview_srgb8
 from storage.dataset.dataset import Dataset, open_dataset

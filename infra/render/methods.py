@@ -8,8 +8,7 @@ import numpy as np
 
 from infra.render.networks import DirectLightRenderer, NetworkRenderer, traced_network
 from infra.render.path_tracer import PathTracer, RenderChild
-from infra.render.quality import samples_text
-from pipeline.renders.preview import PreviewSettings
+from pipeline.renders.preview import PreviewSettings, samples_text
 from pipeline.renders.settings import Filtered
 from storage.denoiser import Features, Quality, denoise
 from storage.renderer import Renderer

@@ -3,17 +3,19 @@
 from pathlib import Path
 from typing import Annotated, Literal
 
-from infra.render.quality import MOST_TRACED_SPP, Budget, measured_settings
+from infra.render.preview_table import Budget
 from infra.render.tone_mapping import ToneMap
 from pipeline.exchange.from_description import AlbedoOverOne
 from pipeline.renders.preview import MOST_SPP, PreviewSettings, usual_filter
 from pipeline.renders.settings import (
+    MOST_TRACED_SPP,
     Filtered,
     NoiseFloor,
     RenderSettings,
     Resolution,
     Samples,
     StatedError,
+    measured_settings,
 )
 from storage.errors import TrilightError
 from storage.metrics import MAX_DB

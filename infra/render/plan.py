@@ -16,8 +16,7 @@ import numpy as np
 from infra.render.networks import NetworkRenderer
 from infra.render.options import EngineChoice, RenderOptions
 from infra.render.path_tracer import PathTracer, RenderChild
-from infra.render.preview_table import Choice, choose, known_costs, price_all, shipped_table
-from infra.render.quality import Budget
+from infra.render.preview_table import Budget, Choice, choose, known_costs, price_all, shipped_table
 from infra.render.tone_mapping import Look
 from infra.torch_library import require_torch
 from pipeline.exchange.reader import SceneReader, SceneSource, scene_source

@@ -19,9 +19,8 @@ from typing import Annotated, Any, Literal
 
 import numpy as np
 
-from infra.render.quality import Budget, samples_text
 from pipeline.renders.mitsuba_variant import Variant
-from pipeline.renders.preview import MOST_SPP, SCENE, PreviewSettings, preview_parts
+from pipeline.renders.preview import MOST_SPP, SCENE, PreviewSettings, preview_parts, samples_text
 from pipeline.renders.settings import Filtered, Resolution
 from storage.atomic import write_atomically
 from storage.cache import cache_folder
@@ -155,6 +154,19 @@ def keep_machine_costs(costs: PictureCosts) -> Path:
     path = machine_costs_path()
     write_atomically(path, canonical_json(settings_record(costs)) + b"\n")
     return path
+
+
+@dataclass(frozen=True)
+class Budget:
+    """The least expected error in some seconds a picture, or the least time to a median error."""
+
+    option: Literal["--seconds", "--error"]
+    limit: float
+    """Wall-clock seconds a picture, or dB of psnr_log_db."""
+
+    def __str__(self) -> str:
+        """Return the option of the command line."""
+        return f"{self.option} {self.limit:g}"
 
 
 NETWORK = "the network builtin:tokens"

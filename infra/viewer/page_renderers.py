@@ -21,12 +21,11 @@ from numpy.typing import NDArray
 
 from infra.render.networks import NetworkRenderer, RendererHere, SceneHere
 from infra.render.path_tracer import PathTracer, RenderChild
-from infra.render.quality import measured_settings, samples_text
 from infra.viewer.picture_options import PictureOptions, apply_edits
 from pipeline.documents.scene_page import PASS_VIEWS, PassView
 from pipeline.exchange.formats import LoadedScene
-from pipeline.renders.preview import PreviewSettings, usual_filter
-from pipeline.renders.settings import RenderSettings
+from pipeline.renders.preview import PreviewSettings, samples_text, usual_filter
+from pipeline.renders.settings import RenderSettings, measured_settings
 from storage.errors import TrilightError, Unrenderable
 from storage.metrics import psnr_log_db
 from storage.records.passes import pass_names, view_passes

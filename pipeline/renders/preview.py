@@ -202,3 +202,8 @@ def all_parts() -> tuple[str, ...]:
 FIRST_LOOKS_SPP = (1, 4, 16)
 """Samples of the previews; each is a picture of its own, and together they cost less than a third
 of the samples before the first measurement."""
+
+
+def samples_text(spp: int) -> str:
+    """Return a number of samples as text, such as `4 samples`."""
+    return f"{spp} sample{'s' if spp > 1 else ''}"

@@ -39,6 +39,9 @@ NoiseFloor = Annotated[float, Within(0, MAX_DB, low_open=True, high_open=True, u
 USUAL_FLOOR_DB = 40.0
 """psnr_log_db of a picture that a person asks for without any target."""
 
+MOST_TRACED_SPP = 4096
+"""Default maximum number of samples per pixel."""
+
 _METRICS = {
     "noise_floor_db": "psnr_log_db",
     "noise_floor_linear_db": "psnr_linear_db",
@@ -177,3 +180,41 @@ def target_overrides(stated: Mapping[str, Any]) -> dict[str, float | None]:
     """Return the targets among stated values, None for others; empty if no target is set."""
     targets = {name: stated.get(name) for name in _METRICS}
     return {} if set(targets.values()) == {None} else targets
+
+
+def measured_settings(
+    resolution: int,
+    targets: Targets,
+    *,
+    max_spp: int = MOST_TRACED_SPP,
+    max_depth: int = RenderSettings.max_depth,
+    split: bool = False,
+    split_lobes: bool = False,
+    stated_error: StatedError = "calibrated",
+) -> RenderSettings:
+    """Return the settings of a picture, which may be dark, that is sampled to a measured error.
+
+    Args:
+        resolution: width in pixels.
+        targets: target errors; psnr_log_db of 40 where none is set.
+        max_depth: maximum length of a path in edges; 2 is direct light.
+        split: keep direct and indirect light apart.
+        split_lobes: keep diffuse and specular light apart.
+
+    Raises:
+        TrilightError: a value is invalid; the message names it.
+    """
+    looks: Mapping[str, Any] = CALIBRATED_LOOKS
+    if stated_error == "bound":
+        looks = {"min_spp": FIRST_SPP}
+    goals = target_overrides(targets) or {"noise_floor_db": USUAL_FLOOR_DB}
+    return RenderSettings(
+        resolution=resolution,
+        max_spp=max_spp,
+        max_depth=max_depth,
+        min_mean_radiance=0.0,
+        split=split,
+        split_lobes=split_lobes,
+        arithmetic="device",
+        **{**goals, **looks, "min_spp": min(looks["min_spp"], max_spp)},
+    )

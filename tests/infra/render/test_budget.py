@@ -17,6 +17,7 @@ from infra.render.preview_table import (
     MEASURE,
     NETWORK_SCENE,
     NETWORK_VIEW,
+    Budget,
     PartCost,
     PictureCosts,
     PreviewError,
@@ -30,7 +31,6 @@ from infra.render.preview_table import (
     price_all,
     shipped_table,
 )
-from infra.render.quality import Budget
 from infra.setup.preview_table import NETWORK, WIDTHS, ladder, part_names, table_of
 from pipeline.renders.mitsuba_variant import Variant
 from pipeline.renders.preview import PreviewSettings, all_parts

@@ -27,7 +27,6 @@ from infra.render.plan import (
     pair_cameras,
     plan_render,
 )
-from infra.render.quality import measured_settings
 from infra.render.raw_references import true_error, true_error_db
 from infra.render.run_render import Frame, flicker
 from model.config import SIZES
@@ -36,6 +35,7 @@ from pipeline.exchange.reader import SceneReader, SceneSource, scene_source
 from pipeline.renders.mitsuba_variant import choose_variant
 from pipeline.renders.noise_floor import clamped_radiance
 from pipeline.renders.preview import PreviewSettings
+from pipeline.renders.settings import measured_settings
 from storage.conventions import log10_radiance, look_at_c2w
 from storage.dataset.shard import write_shard
 from storage.errors import TrilightError, Unrenderable

@@ -12,7 +12,6 @@ from numpy.typing import NDArray
 from PIL import Image
 
 from infra.render.path_tracer import PathTracer, RenderChild
-from infra.render.quality import measured_settings
 from pipeline.exchange.convert import convert_scene
 from pipeline.exchange.reader import SceneReader, SceneSource
 from pipeline.exchange.usd.write_usd import write_usd
@@ -25,6 +24,7 @@ from pipeline.presets.registry import preset_settings
 from pipeline.presets.settings import DatasetSettings
 from pipeline.renders.mitsuba_variant import Device, Variant, activate, choose_variant
 from pipeline.renders.renderer import RenderedView
+from pipeline.renders.settings import measured_settings
 from storage.conventions import look_at_c2w
 from storage.dataset.layout import DatasetFolder
 from storage.dataset.shard import write_shard

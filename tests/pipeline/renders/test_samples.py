@@ -12,7 +12,6 @@ from hypothesis import strategies as st
 from hypothesis.extra import numpy as hnp
 from numpy.typing import NDArray
 
-from infra.render.quality import measured_settings
 from pipeline.renders.calibrated_error import first_spp
 from pipeline.renders.noise_floor import Curve
 from pipeline.renders.pictures import NUMPY, means, pixel_errors, read_sums
@@ -28,7 +27,7 @@ from pipeline.renders.samples import (
     slope_db,
     tile_means,
 )
-from pipeline.renders.settings import RenderSettings, target_overrides
+from pipeline.renders.settings import RenderSettings, measured_settings, target_overrides
 from pipeline.renders.tracer import Chosen, PixelCamera, load_tracer
 from storage.conventions import log10_radiance
 from storage.errors import TrilightError
