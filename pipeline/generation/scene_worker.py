@@ -13,10 +13,9 @@ import contextlib
 import functools
 import os
 import time
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -36,7 +35,7 @@ from pipeline.renders.renderer import RenderedView, SceneRenderer, set_threads
 from pipeline.scenes.compose import compose_scene
 from pipeline.scenes.triangle_budget import FitTable, ObjectPool, PooledAsset, least_triangles
 from pipeline.scenes.views import ViewCamera, Visibility, cameras_of, cameras_of_view, with_cameras
-from scene_templates.scene_maps import OwnMaps, UserMap, UserTexture
+from scene_templates.scene_maps import UserMap, UserMaps
 from scene_templates.settings import SceneSettings
 from storage.dataset.layout import DatasetFolder
 from storage.dataset.progress import tell_views
@@ -241,15 +240,14 @@ class SplitPool(ObjectPool):
         return pooled
 
 
-def user_maps(rows: Iterable[tuple[LockedObject, Path]], split: str) -> OwnMaps:
+def user_maps(rows: Iterable[tuple[LockedObject, Path]], split: str) -> UserMaps:
     """Return the maps that scenes of a split may use, sorted by uid; no file is read yet.
 
     Args:
         rows: rows of a lock with the prepared files.
         split: train, validation or test.
     """
-    loads: Mapping[str, Callable[[Path], Any]] = {TEXTURE: _texture, SKY: _radiance}
-    of_kind: dict[str, list[UserMap[Any]]] = {TEXTURE: [], SKY: []}
+    of_kind: dict[str, list[UserMap]] = {TEXTURE: [], SKY: []}
     for locked, path in sorted(rows, key=lambda row: row[0].uid):
         if locked.split == split:
             source = MapSource(
@@ -258,18 +256,13 @@ def user_maps(rows: Iterable[tuple[LockedObject, Path]], split: str) -> OwnMaps:
                 attribution=locked.attribution,
                 source_url=locked.source_url,
             )
-            load = functools.partial(loads[locked.kind], path)
+            load = functools.partial(_arrays, path)
             of_kind[locked.kind].append(UserMap(uid=locked.uid, source=source, load=load))
-    return OwnMaps(textures=of_kind[TEXTURE], skies=of_kind[SKY])
+    return of_kind
 
 
-def _texture(path: Path) -> UserTexture:
-    arrays = decode_prepared(path.read_bytes(), path.name).arrays
-    return arrays["diffuse"], arrays["specular"], arrays.get("roughness")
-
-
-def _radiance(path: Path) -> NDArray[np.float32]:
-    return decode_prepared(path.read_bytes(), path.name).arrays["radiance"]
+def _arrays(path: Path) -> Mapping[str, NDArray[np.float32]]:
+    return decode_prepared(path.read_bytes(), path.name).arrays
 
 
 class ViewProgress:

@@ -36,7 +36,6 @@ from scene_templates.scene_maps import (
     TexturedLook,
     TextureSettings,
     UserMap,
-    UserTexture,
     draw_look,
 )
 from scene_templates.surfaces.maps import SurfaceMaps
@@ -265,7 +264,7 @@ def with_drawn_textures(
     settings: TextureSettings,
     scene_key: SceneKey,
     *,
-    user_textures: Sequence[UserMap[UserTexture]] = (),
+    user_textures: Sequence[UserMap] = (),
 ) -> list[ScenePiece]:
     """Return the pieces, some with drawn textures; emitters have none.
 
