@@ -43,8 +43,7 @@ from storage.errors import Rejected
 from storage.records.lights import (
     MAX_LIGHTS,
     Parts,
-    light_rows,
-    num_light_pictures,
+    light_sources,
     rounded_to_half,
     sum_of_lights,
 )
@@ -157,11 +156,10 @@ class SceneRenderer:
         self._sees_sky = scene.environment is not None and scene.environment.is_seen
         if settings.per_light:
             most = MAX_LIGHTS // max(1, len(settings.part_names))
-            if (count := num_light_pictures(scene)) > most:
-                raise Rejected("too_many_lights", f"{count} lights apart; at most {most}")
-            rows = light_rows(scene)
-            sky = [None] * (count - len(rows))
-            self._tracers = [self.tracer.only_light(row) for row in (*rows, *sky)]
+            lights = light_sources(scene)
+            if len(lights) > most:
+                raise Rejected("too_many_lights", f"{len(lights)} lights apart; at most {most}")
+            self._tracers = [self.tracer.only_light(row) for row in lights]
         self._light_seed = light_seed if settings.light_paths == "scene" else None
         if self._light_seed is not None:
             views = zip(scene.c2w, scene.fov_deg, strict=True)

@@ -227,16 +227,24 @@ def declared_passes() -> tuple[Pass, ...]:
 
     Emission is 0 wherever a surface is seen, since emitters are hidden from cameras.
     """
-    return PASSES + tuple(
-        _over_surfaces(
-            f"material_{column.name}",
-            column.means,
-            partial(_column, part),
-            short=column.name,
-            channels=_channels(column.width, is_colour=column.is_colour),
+    passes = list(PASSES)
+    for column, part in laid_out():
+        channels = _RGB if column.is_colour else tuple(map(str, range(column.width)))
+        is_number = column.width == 1
+        passes.append(
+            _over_surfaces(
+                f"material_{column.name}",
+                column.means,
+                partial(_column, part.start if is_number else part),
+                short=column.name,
+                channels=() if is_number else channels,
+            )
         )
-        for column, part in laid_out()
-    )
+    return tuple(passes)
+
+
+def _column(at: slice | int, hits: FirstHits, *_: View | None) -> NDArray[np.float32]:
+    return hits.material[..., at]
 
 
 def pass_names(words: Iterable[str]) -> tuple[str, ...]:
@@ -261,18 +269,6 @@ def pass_names(words: Iterable[str]) -> tuple[str, ...]:
             raise TrilightError(f"there is no pass {word!r:.60}; {expected_one_of(word, meant)}.")
         selected.add(meant[word])
     return tuple(each.name for each in passes if each.name in selected)
-
-
-def _channels(width: int, *, is_colour: bool) -> tuple[str, ...]:
-    if is_colour:
-        return _RGB
-    return () if width == 1 else tuple(str(index) for index in range(width))
-
-
-def _column(part: slice, hits: FirstHits, *_: View | None) -> NDArray[np.float32]:
-    """Return the numbers of a column; of one that is a single number, without the last axis."""
-    rows = hits.material
-    return rows[..., part.start] if part.stop == part.start + 1 else rows[..., part]
 
 
 BLOCK_RAYS = 2**14

@@ -33,7 +33,7 @@ from storage.records.lights import (
     Parts,
     decode_parts_exr,
     encode_parts_exr,
-    num_light_pictures,
+    light_sources,
 )
 from storage.records.packed_maps import HeldMaps, packed_maps, unpacked_maps
 from storage.records.passes import picture_passes
@@ -278,7 +278,7 @@ def _decode_parts(
     if packed is None:
         return {}
     height, width = size
-    num_lights = None if scene is None else num_light_pictures(scene)
+    num_lights = None if scene is None else len(light_sources(scene))
     by_view = [decode_parts_exr(data, names, (height, width), num_lights) for data in packed]
     return {name: np.stack([of_view[name] for of_view in by_view]) for name in names}
 
