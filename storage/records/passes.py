@@ -33,7 +33,7 @@ class View:
 
     scene: Scene
     row: int
-    """Row of `scene.c2w`."""
+    """Row of the camera in `scene.c2w`."""
     resolution: int
     """Width and height of the picture in pixels, however many rays a pixel has."""
 
@@ -325,24 +325,29 @@ def view_passes(
     if all(each.averaging == "centre ray" for each in chosen):
         rays_a_side = 1
     seen = SeenFrom(scene, now.c2w[:3, 3], surfaces)
-
-    def hits(first: int, last: int, a_side: int) -> FirstHits:
-        rows = slice(first * a_side, last * a_side)
-        return seen.hits(camera_rays(now.c2w, now.fov_deg, resolution * a_side, rows)[1])
-
-    pictures: dict[str, list[NDArray]] = {each.name: [] for each in chosen}
     rows = max(1, BLOCK_RAYS // (resolution * rays_a_side**2))
-    for first in range(0, resolution, rows):
-        last = min(first + rows, resolution)
-        centre = hits(first, last, 1)
-        spread = centre if rays_a_side == 1 else hits(first, last, rays_a_side)
-        for each in chosen:
-            if each.averaging == "centre ray":
-                block = each.at(centre, now, later)
-            else:
-                block = _means(each.at(spread, now, later), rays_a_side, each.nothing)
-            pictures[each.name].append(block)
-    return {name: np.concatenate(blocks) for name, blocks in pictures.items()}
+    blocks = [
+        _block(chosen, seen, now, later, range(resolution)[first : first + rows], rays_a_side)
+        for first in range(0, resolution, rows)
+    ]
+    return {each.name: np.concatenate([block[each.name] for block in blocks]) for each in chosen}
+
+
+def _block(
+    chosen: Sequence[Pass], seen: SeenFrom, now: View, later: View | None, rows: range, a_side: int
+) -> dict[str, NDArray]:
+    """Return passes of some rows of pixels, from one ray in their centres or `a_side` squared."""
+    hits = {}
+    for count in {1, a_side}:
+        lines = slice(rows.start * count, rows.stop * count)
+        _, directions = camera_rays(now.c2w, now.fov_deg, now.resolution * count, lines)
+        hits[count] = seen.hits(directions)
+    return {
+        each.name: each.at(hits[1], now, later)
+        if each.averaging == "centre ray"
+        else _means(each.at(hits[a_side], now, later), a_side, each.nothing)
+        for each in chosen
+    }
 
 
 def _means(values: NDArray, a_side: int, nothing: float) -> NDArray:
