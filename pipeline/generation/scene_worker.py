@@ -30,7 +30,6 @@ from pipeline.generation.scene_origins import (
 from pipeline.objects.maps.prepared import decode_prepared
 from pipeline.presets.settings import DatasetSettings
 from pipeline.renders.mitsuba_variant import Variant, activate
-from pipeline.renders.noise_floor import MeasuredFloor
 from pipeline.renders.renderer import RenderedView, SceneRenderer, set_threads
 from pipeline.scenes.compose import compose_scene
 from pipeline.scenes.triangle_budget import FitTable, ObjectPool, PooledAsset, least_triangles
@@ -382,9 +381,7 @@ def _record(
     facts = sight.facts(camera.c2w, float(camera.fov_deg), grid)
     return ViewRecord(
         spp=rendered.spp,
-        noise_floor_db=round(rendered.noise_floor_db, 3),
-        noise_floor_linear_db=round(rendered.noise_floor_linear_db, 3),
-        object_noise_floor_db=round(rendered.object_noise_floor_db, 3),
+        **rendered.rounded,
         coverage=round(facts.coverage, 6),
         at_cap=rendered.at_cap,
         seed=seed,
@@ -396,9 +393,5 @@ def _record(
     )
 
 
-def _part_floor(floor: MeasuredFloor) -> PartFloor:
-    return PartFloor(
-        noise_floor_db=round(floor.log_db, 3),
-        noise_floor_linear_db=round(floor.linear_db, 3),
-        object_noise_floor_db=round(floor.object_log_db, 3),
-    )
+def _part_floor(floor: PartFloor) -> PartFloor:
+    return PartFloor(**floor.rounded)

@@ -24,7 +24,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from pipeline.renders.calibrated_error import first_spp
-from pipeline.renders.noise_floor import MeasuredFloor
+from pipeline.renders.noise_floor import by_metric
 from pipeline.renders.pictures import ViewPictures
 from pipeline.renders.preview import FIRST_LOOKS_SPP, preview_steps, usual_filter
 from pipeline.renders.samples import (
@@ -47,6 +47,7 @@ from storage.records.lights import (
     rounded_to_half,
     sum_of_lights,
 )
+from storage.records.sample import PartFloor
 from storage.records.scene import Scene
 from storage.renderer import Image, Sampling
 
@@ -64,7 +65,7 @@ slower passes cost easier ones 7 to 11 %."""
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
-class RenderedView:
+class RenderedView(PartFloor):
     """One finished picture with its measured error."""
 
     radiance_rgb: NDArray[np.float32]
@@ -72,13 +73,7 @@ class RenderedView:
     spp: int
     """Samples per pixel that were spent, on each light where they are apart: the mean over the
     pixels that show anything, rounded down."""
-    noise_floor_db: float
-    """Measured error as psnr_log_db, in dB; more is better."""
-    noise_floor_linear_db: float
-    """Measured error as psnr_linear_db, in dB; more is better."""
-    object_noise_floor_db: float
-    """Measured error as object_psnr_log_db over `hits`, in dB; more is better."""
-    expected_error: MeasuredFloor | None = None
+    expected_error: PartFloor | None = None
     """Errors that are as often better as worse, in dB, where the three above are calibrated bounds
     (pipeline.renders.calibrated_error); None where they are bounds by estimate and allowances."""
     at_cap: bool
@@ -95,9 +90,9 @@ class RenderedView:
     """[R, R, 3] radiance of each part, with `split` or `split_lobes`; rounded to half floats. With
     `per_light` [L, R, R, 3]. Their storage.records.lights.sum_of_parts is `radiance_rgb`, or
     `lights_rgb`, in every bit."""
-    part_floors: Mapping[str, MeasuredFloor] | None = None
+    part_floors: Mapping[str, PartFloor] | None = None
     """Measured error of each part, of all lights together."""
-    light_floors: Sequence[MeasuredFloor] | None = None
+    light_floors: Sequence[PartFloor] | None = None
     """Measured error of each of `lights_rgb`."""
 
 
@@ -213,12 +208,12 @@ class SceneRenderer:
             samples.counted = pictures.visible
         look = yield from self._render_until_targets(samples, pictures)
         floor = look.floor
-        missed = gaps_db(settings.targets_db, floor.by_metric)
+        missed = gaps_db(settings.targets_db, by_metric(floor))
         if settings.reject_at_cap and missed:
             raise Rejected(
                 "floor_not_reached",
                 ", ".join(
-                    f"{metric} is {floor.by_metric[metric]:.1f} dB; expected "
+                    f"{metric} is {by_metric(floor)[metric]:.1f} dB; expected "
                     f"{settings.targets_db[metric]:g}"
                     for metric in missed
                 ),
@@ -226,9 +221,7 @@ class SceneRenderer:
         stored = self._to_stored(pictures.finish())
         yield RenderedView(
             spp=samples.spp,
-            noise_floor_db=floor.log_db,
-            noise_floor_linear_db=floor.linear_db,
-            object_noise_floor_db=floor.object_log_db,
+            **vars(floor),
             at_cap=bool(missed),
             core_s=time.process_time() - self._began_s,
             hits=pictures.hits,
@@ -274,8 +267,8 @@ class SceneRenderer:
                 quality = "fast"
             look = pictures.look(quality)
             tiles.learn(look.changes, samples, quality)
-            measured.append((samples.spp, look.floor.by_metric))
-            gaps = gaps_db(targets_db, look.floor.by_metric)
+            measured.append((samples.spp, by_metric(look.floor)))
+            gaps = gaps_db(targets_db, by_metric(look.floor))
             if not gaps or samples.spp >= max_spp:
                 return look
             step = 2 * samples.pass_spp
@@ -289,7 +282,7 @@ class SceneRenderer:
                 image = Image(
                     radiance_rgb=radiance_rgb,
                     samples=samples.spp,
-                    stated_error_db=look.floor.log_db,
+                    stated_error_db=look.floor.noise_floor_db,
                     cpu_seconds=core_s,
                     facts={"spp": samples.spp},
                     remark=few_samples_remark(samples.spp),

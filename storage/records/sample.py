@@ -64,6 +64,12 @@ class PartFloor:
     object_noise_floor_db: Plausible
     """The same error as object_psnr_log_db: over pixels that show geometry."""
 
+    @property
+    def rounded(self) -> dict[str, float]:
+        """The three errors by name, to a thousandth: as records and headers state them."""
+        names = [field.name for field in dataclasses.fields(PartFloor)]
+        return {name: round(getattr(self, name), 3) for name in names}
+
 
 @dataclass(frozen=True)
 class KnownParts(Law):

@@ -295,7 +295,7 @@ def test_one_light_alone_is_the_picture_but_for_its_rounding() -> None:
     assert together.lights_rgb is None and together.light_floors is None
     separate = render_view(scene, SETTINGS)
     assert separate.light_floors is not None
-    assert [floor.log_db for floor in separate.light_floors] == [separate.noise_floor_db]
+    assert [floor.noise_floor_db for floor in separate.light_floors] == [separate.noise_floor_db]
     np.testing.assert_array_equal(separate.radiance_rgb, rounded_to_half(together.radiance_rgb))
     assert separate.noise_floor_db == together.noise_floor_db
 
