@@ -249,12 +249,7 @@ def user_maps(rows: Iterable[tuple[LockedObject, Path]], split: str) -> UserMaps
     of_kind: dict[str, list[UserMap]] = {TEXTURE: [], SKY: []}
     for locked, path in sorted(rows, key=lambda row: row[0].uid):
         if locked.split == split:
-            source = MapSource(
-                name=locked.title,
-                licence=locked.licence,
-                attribution=locked.attribution,
-                source_url=locked.source_url,
-            )
+            source = MapSource(name=locked.title, **locked.rights)
             load = functools.partial(_arrays, path)
             of_kind[locked.kind].append(UserMap(uid=locked.uid, source=source, load=load))
     return of_kind

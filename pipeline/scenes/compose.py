@@ -262,9 +262,7 @@ def _entry(pooled: PooledAsset, taken: Sequence[str]) -> SceneObject:
         name=next(name for name in variants if name not in taken),
         kind="object",
         uid=locked.uid,
-        licence=locked.licence,
-        attribution=locked.attribution,
-        source_url=locked.source_url,
+        **locked.rights,
     )
 
 

@@ -377,12 +377,7 @@ def _skin(skin: LevelSkin, locked: LockedObject) -> Skin:
     """
 
     def with_rights(texture: Texture, column: str) -> Texture:
-        source = MapSource(
-            name=f"{locked.uid} {column}",
-            licence=locked.licence,
-            attribution=locked.attribution,
-            source_url=locked.source_url,
-        )
+        source = MapSource(name=f"{locked.uid} {column}", **locked.rights)
         return dataclasses.replace(texture, source=source)
 
     try:
