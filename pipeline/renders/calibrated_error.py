@@ -18,7 +18,7 @@ from typing import Annotated
 import numpy as np
 from numpy.typing import NDArray
 
-from pipeline.renders.noise_floor import BLOCK_PX, ErrorMeasures, by_metric
+from pipeline.renders.noise_floor import BLOCK_PX, FLOOR_METRICS, ErrorMeasures, by_metric
 from pipeline.renders.samples import TILE_PX, DualBuffer, gaps_db
 from pipeline.renders.settings import FIRST_SPP, PASS_SPP, RenderSettings
 from pipeline.renders.view_pictures import (
@@ -39,11 +39,7 @@ _CODE = 1
 """Number to raise where pictures or measures change without a change of a constant below."""
 
 FILE = Path(__file__).with_name("stated_errors.json")
-_FIELDS = {
-    "log": "noise_floor_db",
-    "linear": "noise_floor_linear_db",
-    "object": "object_noise_floor_db",
-}
+_FIELDS = dict(zip(("log", "linear", "object"), FLOOR_METRICS, strict=True))
 """Field of PartFloor by metric."""
 
 METRICS = tuple(_FIELDS)

@@ -63,7 +63,7 @@ Curve = Callable[[Any], Any]
 """What errors are taken in, of radiance."""
 
 
-_FIELDS = {
+FLOOR_METRICS = {
     "noise_floor_db": "psnr_log_db",
     "noise_floor_linear_db": "psnr_linear_db",
     "object_noise_floor_db": "object_psnr_log_db",
@@ -73,7 +73,7 @@ _FIELDS = {
 
 def by_metric(floor: PartFloor) -> dict[str, float]:
     """Return the three errors of a floor in dB by the name of their metric."""
-    return {metric: getattr(floor, field) for field, metric in _FIELDS.items()}
+    return {metric: getattr(floor, field) for field, metric in FLOOR_METRICS.items()}
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -122,7 +122,7 @@ def measured_floor(
             bound += deviations * _standard_error(sums, counts)
         smallest = 10 ** (-MAX_DB / 10)
         floors_db.append(MAX_DB if bound <= smallest else float(-10 * np.log10(bound)))
-    return PartFloor(**dict(zip(_FIELDS, floors_db, strict=True)))
+    return PartFloor(**dict(zip(FLOOR_METRICS, floors_db, strict=True)))
 
 
 def _standard_error(sums: NDArray[np.float64], counts: NDArray[np.float64]) -> float:
