@@ -26,6 +26,7 @@ from scene_templates.scene_maps import TextureSettings
 from scene_templates.settings import Excursion, SceneSettings, ViewLaws
 from scene_templates.skies.procedural_skies import SkyMapSettings, SkySettings
 from scene_templates.surfaces.procedural_textures import SurfaceMapSettings
+from storage.settings.overrides import apply_overrides
 
 _ROOM = SharedRoom(
     square_share=0.5, scale=(1.0, 1.35), shift=0.05, raise_z=(-0.05, 0.25), tilt_deg=3.0
@@ -152,26 +153,27 @@ def median_settings() -> SceneSettings:
     """Return scenes of two objects under four lights, every range at its middle."""
     rough = SCENES_V1.materials
     median_roughness = math.sqrt(math.prod(rough.roughness_log)) - rough.roughness_bias
-    return dataclasses.replace(
-        SCENES_V1,
-        families=tuple(_median_family(family) for family in ONE_FAMILY_EACH),
-        max_triangles=4096,
-        placement=dataclasses.replace(SCENES_V1.placement, overlap_share=0.0),
-        materials=dataclasses.replace(
-            rough,
-            albedo_sum=_point(0.95),
-            specular_ratio=_point(0.5),
-            roughness_clip=_point(round(median_roughness, 4)),
-        ),
-        lights=dataclasses.replace(
-            SCENES_V1.lights,
-            count=(4, 4),
-            total_emission=_point(_MEDIAN_EMISSION),
-            scale=_point(_MEDIAN_SIZE),
-            distance=_point(2.4),
-        ),
-        cameras=dataclasses.replace(SCENES_V1.cameras, distance=_point(1.75), fov_deg=_point(45.0)),
-    )
+    changes = {
+        "families.shell.square_share": 1.0,
+        "families.shell.scale": _point(1.175),
+        "families.shell.shift": 0.0,
+        "families.shell.raise_z": _point(0.1),
+        "families.shell.tilt_deg": 0.0,
+        "families.num_objects": (2, 2),
+        "families.object_scale": _point(1.3),
+        "max_triangles": 4096,
+        "placement.overlap_share": 0.0,
+        "materials.albedo_sum": _point(0.95),
+        "materials.specular_ratio": _point(0.5),
+        "materials.roughness_clip": _point(round(median_roughness, 4)),
+        "lights.count": (4, 4),
+        "lights.total_emission": _point(_MEDIAN_EMISSION),
+        "lights.scale": _point(_MEDIAN_SIZE),
+        "lights.distance": _point(2.4),
+        "cameras.distance": _point(1.75),
+        "cameras.fov_deg": _point(45.0),
+    }
+    return apply_overrides(SCENES_V1, changes)
 
 
 _Axes = tuple[tuple[str, tuple[float, ...], Callable[[float], dict[str, Any]]], ...]
@@ -219,13 +221,6 @@ def out_of_range_settings(*, has_maps: bool = False) -> SceneSettings:
         for value in values
     )
     return dataclasses.replace(median_settings(), excursions=excursions)
-
-
-def _median_family(family: Family) -> Family:
-    room = SharedRoom(
-        square_share=1.0, scale=_point(1.175), shift=0.0, raise_z=_point(0.1), tilt_deg=0.0
-    )
-    return dataclasses.replace(family, shell=room, num_objects=(2, 2), object_scale=_point(1.3))
 
 
 def _point(value: float) -> Range:

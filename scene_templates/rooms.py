@@ -81,17 +81,10 @@ def patch(side: Side, placement: PatchPlacement) -> NDArray[np.float64]:
     return (turned * placement.scale + placement.translation) / 2
 
 
-def _patch_faces() -> NDArray[np.uint32]:
-    rows = np.arange((QUADS + 1) ** 2, dtype=np.uint32).reshape(QUADS + 1, QUADS + 1)
-    a = rows[:-1, :-1]
-    b = rows[1:, :-1]
-    c = rows[1:, 1:]
-    d = rows[:-1, 1:]
-    pairs = np.stack([np.stack([a, b, c], axis=-1), np.stack([a, c, d], axis=-1)], axis=2)
-    return pairs.reshape(-1, 3)
+_GRID = np.arange((QUADS + 1) ** 2, dtype=np.uint32).reshape(QUADS + 1, QUADS + 1)
+_CORNERS = np.stack([_GRID[:-1, :-1], _GRID[1:, :-1], _GRID[1:, 1:], _GRID[:-1, 1:]], axis=-1)
 
-
-PATCH_FACES = _patch_faces()
+PATCH_FACES: NDArray[np.uint32] = _CORNERS[..., [0, 1, 2, 0, 2, 3]].reshape(-1, 3)
 """[128, 3], counter-clockwise seen from the room."""
 PATCH_FACES.setflags(write=False)
 

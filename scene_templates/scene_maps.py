@@ -4,15 +4,15 @@
 of their own, so that a preset with skies has the objects, materials and lights that it has without
 them, and the cameras too, but for views that only the sky lights.
 
-A user's own textures and maps (`OwnMaps`) are drawn beside the procedural ones. Two that are under
+A user's own textures and maps (`UserMap`) are drawn beside the procedural ones. Two that are under
 different share-alike licences, or one and an object, never meet in a scene: it could be shared
 under neither.
 """
 
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
-from typing import Annotated, Any, Generic, TypeVar
+from typing import Annotated, Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -28,44 +28,32 @@ from storage.seeds import SceneKey, rng_for
 from storage.settings.described import checked
 from storage.settings.ranges import Share, Within
 
-Made = TypeVar("Made")
-
 
 @dataclass(frozen=True, kw_only=True, eq=False)
-class UserMap(Generic[Made]):
+class UserMap:
     """A texture or map that is read when it is drawn."""
 
     uid: str
     """Identifier in objects.lock.jsonl."""
     source: MapSource
     """Title, URL and license."""
-    load: Callable[[], Made]
+    load: Callable[[], Mapping[str, NDArray[np.float32]]]
+    """Returns its arrays, linear, the top row first: "radiance" [H, 2H, 3] of a map; "diffuse" and
+    "specular" albedo [H, W, 3] of a texture, and "roughness" [H, W, 1], without which one number is
+    drawn."""
 
 
-UserTexture = tuple[NDArray[np.float32], NDArray[np.float32], NDArray[np.float32] | None]
-"""Diffuse and specular albedo [H, W, 3], linear, the top row first; and roughness [H, W, 1], or
-None where one number is to be drawn."""
-
-
-@dataclass(frozen=True, kw_only=True, eq=False)
-class OwnMaps:
-    """User textures and skies that the scenes of a split may use."""
-
-    textures: Sequence[UserMap[UserTexture]] = ()
-    """The user's textures, sorted by uid."""
-    skies: Sequence[UserMap[NDArray[np.float32]]] = ()
-    """Maps [H, 2H, 3] of linear radiance, sorted by uid."""
-
-
-NO_OWN_MAPS = OwnMaps()
+UserMaps = Mapping[str, Sequence[UserMap]]
+"""User textures and skies that the scenes of a split may use, sorted by uid, by the names of their
+kinds in a lock (storage.records.objects)."""
 
 
 def draw_user_map(
     rng: np.random.Generator,
-    user_maps: Sequence[UserMap[Made]],
+    user_maps: Sequence[UserMap],
     share: float,
     licences: Sequence[str],
-) -> UserMap[Made] | None:
+) -> UserMap | None:
     """Return one of a user's own, each equally likely, or None where a procedural one is taken.
 
     Nothing is drawn of `rng` where the share is 0 or there is none.
@@ -133,7 +121,7 @@ class TexturedLook:
 def draw_look(
     rng: np.random.Generator,
     settings: TextureSettings,
-    user_textures: Sequence[UserMap[UserTexture]] = (),
+    user_textures: Sequence[UserMap] = (),
     licences: Sequence[str] = (),
 ) -> TexturedLook | None:
     """Return the texture of a surface, or None where it has none.
@@ -156,12 +144,12 @@ def draw_look(
         maps = draw_surface(rng, settings.surfaces)
     else:
         clip = settings.surfaces.roughness_clip
-        diffuse_rgb, specular_rgb, rough = chosen.load()
-        if rough is None:
-            rough = np.full((*diffuse_rgb.shape[:2], 1), rng.uniform(*clip), np.float32)
+        arrays = chosen.load()
+        if (rough := arrays.get("roughness")) is None:
+            rough = np.full((*arrays["diffuse"].shape[:2], 1), rng.uniform(*clip), np.float32)
         maps = SurfaceMaps(
-            diffuse_rgb=diffuse_rgb,
-            specular_rgb=specular_rgb,
+            diffuse_rgb=arrays["diffuse"],
+            specular_rgb=arrays["specular"],
             roughness=np.clip(rough, *clip).astype(np.float32),
             source=chosen.source,
         )
@@ -184,7 +172,7 @@ def scene_sky(
     radiance_rgb: NDArray[np.float64],
     scene_key: SceneKey,
     *,
-    user_skies: Sequence[UserMap[NDArray[np.float32]]] = (),
+    user_skies: Sequence[UserMap] = (),
     licences: Sequence[str] = (),
 ) -> tuple[Environment, dict[str, Any], str] | None:
     """Return the sky of a scene, or None where it has none.
@@ -212,7 +200,7 @@ def scene_sky(
         source = MapSource(name=family)
     else:
         family = "own"
-        radiance = chosen.load()
+        radiance = chosen.load()["radiance"]
         source = chosen.source
     low, high = (math.log(bound) for bound in settings.over_lamps_log)
     over_lamps = math.exp(rng.uniform(low, high))

@@ -49,7 +49,7 @@ if TYPE_CHECKING:
     from scene_templates.settings import SceneSettings as SceneSettings
     from scene_templates.skies.procedural_skies import SKIES as SKIES
     from scene_templates.skies.procedural_skies import SkyDraws as SkyDraws
-    from scene_templates.skies.texels import SkyTexels as SkyTexels
+    from scene_templates.skies.procedural_skies import SkyTexels as SkyTexels
     from scene_templates.surfaces.maps import Finish as Finish
     from scene_templates.surfaces.maps import SurfaceDraws as SurfaceDraws
     from scene_templates.surfaces.maps import Texels as Texels

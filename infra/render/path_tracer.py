@@ -15,7 +15,6 @@ from typing import Any
 
 from pipeline.isolation import ChildFailed, ChildLimits, IsolatedChild, Result, with_retries
 from pipeline.renders.mitsuba_variant import Variant, activate, environment
-from pipeline.renders.noise_floor import MeasuredFloor
 from pipeline.renders.preview import PreviewSettings, load_preview
 from pipeline.renders.renderer import RenderedView, SceneRenderer, few_samples_remark, set_threads
 from pipeline.renders.settings import RenderSettings
@@ -212,18 +211,14 @@ class RenderWorker:
 
 def image_of(view: RenderedView) -> Image:
     """Return a picture of the path tracer with its facts."""
-    stated = MeasuredFloor(
-        log_db=view.noise_floor_db,
-        linear_db=view.noise_floor_linear_db,
-        object_log_db=view.object_noise_floor_db,
-    )
-    facts: dict[str, Fact] = {"spp": view.spp, **_floor_facts(stated)}
+    facts: dict[str, Fact] = {"spp": view.spp, **view.rounded}
     if view.expected_error is not None:
-        facts |= _floor_facts(view.expected_error, "expected_error")
+        expected = view.expected_error.rounded.items()
+        facts |= {name.replace("noise_floor", "expected_error"): db for name, db in expected}
     facts["at_cap"] = int(view.at_cap)
     facts["mean_radiance"] = float(f"{view.radiance_rgb.mean(dtype='float64'):.6g}")
     for part, floor in (view.part_floors or {}).items():
-        facts |= _floor_facts(floor, prefix=f"{part}.")
+        facts |= {f"{part}.{name}": error_db for name, error_db in floor.rounded.items()}
     return Image(
         radiance_rgb=view.radiance_rgb,
         samples=view.spp,
@@ -233,13 +228,3 @@ def image_of(view: RenderedView) -> Image:
         layers_rgb=view.parts_rgb or {},
         remark=few_samples_remark(view.spp) if view.expected_error is None else "",
     )
-
-
-def _floor_facts(
-    floor: MeasuredFloor, name: str = "noise_floor", prefix: str = ""
-) -> dict[str, Fact]:
-    return {
-        f"{prefix}{name}_db": round(floor.log_db, 3),
-        f"{prefix}{name}_linear_db": round(floor.linear_db, 3),
-        f"{prefix}object_{name}_db": round(floor.object_log_db, 3),
-    }

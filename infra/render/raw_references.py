@@ -17,7 +17,7 @@ from pipeline.renders.calibrated_error import LEAST_ERROR
 from pipeline.renders.noise_floor import Curve, secant_slope
 from pipeline.renders.settings import PASS_SPP
 from pipeline.renders.tracer import PixelCamera, load_tracer, pixel_camera
-from storage.records.lights import light_rows, num_light_pictures
+from storage.records.lights import light_sources
 from storage.records.scene import Scene
 from storage.seeds import seed_for
 
@@ -47,9 +47,8 @@ def raw_reference(scene: Scene, camera: PixelCamera, spp: int, *name: int) -> Ra
 def light_references(scene: Scene, camera: PixelCamera, spp: int) -> NDArray[np.float64]:
     """Return the `raw_reference` of each light alone (storage.records.lights), [L, 2, R, R, 3]."""
     tracer = load_tracer(scene)
-    rows: list[int | None] = list(light_rows(scene))
-    rows += [None] * (num_light_pictures(scene) - len(rows))
-    return np.stack([_reference(tracer.only_light(row), camera, spp) for row in rows])
+    lights = light_sources(scene)
+    return np.stack([_reference(tracer.only_light(row), camera, spp) for row in lights])
 
 
 def _reference(tracer: Any, camera: PixelCamera, spp: int, *name: int) -> RawReference:

@@ -25,8 +25,8 @@ from scene_templates.skies.procedural_skies import (
     SKIES,
     SkyDraws,
     SkyMapSettings,
+    SkyTexels,
 )
-from scene_templates.skies.texels import SkyTexels
 from scene_templates.surfaces.maps import LEAST_TINT, SurfaceDraws, Texels
 from scene_templates.surfaces.procedural_textures import OUR_SURFACES, SURFACES, SurfaceMapSettings
 from storage.markdown import table

@@ -13,10 +13,9 @@ import contextlib
 import functools
 import os
 import time
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -31,12 +30,11 @@ from pipeline.generation.scene_origins import (
 from pipeline.objects.maps.prepared import decode_prepared
 from pipeline.presets.settings import DatasetSettings
 from pipeline.renders.mitsuba_variant import Variant, activate
-from pipeline.renders.noise_floor import MeasuredFloor
 from pipeline.renders.renderer import RenderedView, SceneRenderer, set_threads
 from pipeline.scenes.compose import compose_scene
 from pipeline.scenes.triangle_budget import FitTable, ObjectPool, PooledAsset, least_triangles
 from pipeline.scenes.views import ViewCamera, Visibility, cameras_of, cameras_of_view, with_cameras
-from scene_templates.scene_maps import OwnMaps, UserMap, UserTexture
+from scene_templates.scene_maps import UserMap, UserMaps
 from scene_templates.settings import SceneSettings
 from storage.dataset.layout import DatasetFolder
 from storage.dataset.progress import tell_views
@@ -241,35 +239,24 @@ class SplitPool(ObjectPool):
         return pooled
 
 
-def user_maps(rows: Iterable[tuple[LockedObject, Path]], split: str) -> OwnMaps:
+def user_maps(rows: Iterable[tuple[LockedObject, Path]], split: str) -> UserMaps:
     """Return the maps that scenes of a split may use, sorted by uid; no file is read yet.
 
     Args:
         rows: rows of a lock with the prepared files.
         split: train, validation or test.
     """
-    loads: Mapping[str, Callable[[Path], Any]] = {TEXTURE: _texture, SKY: _radiance}
-    of_kind: dict[str, list[UserMap[Any]]] = {TEXTURE: [], SKY: []}
+    of_kind: dict[str, list[UserMap]] = {TEXTURE: [], SKY: []}
     for locked, path in sorted(rows, key=lambda row: row[0].uid):
         if locked.split == split:
-            source = MapSource(
-                name=locked.title,
-                licence=locked.licence,
-                attribution=locked.attribution,
-                source_url=locked.source_url,
-            )
-            load = functools.partial(loads[locked.kind], path)
+            source = MapSource(name=locked.title, **locked.rights)
+            load = functools.partial(_arrays, path)
             of_kind[locked.kind].append(UserMap(uid=locked.uid, source=source, load=load))
-    return OwnMaps(textures=of_kind[TEXTURE], skies=of_kind[SKY])
+    return of_kind
 
 
-def _texture(path: Path) -> UserTexture:
-    arrays = decode_prepared(path.read_bytes(), path.name).arrays
-    return arrays["diffuse"], arrays["specular"], arrays.get("roughness")
-
-
-def _radiance(path: Path) -> NDArray[np.float32]:
-    return decode_prepared(path.read_bytes(), path.name).arrays["radiance"]
+def _arrays(path: Path) -> Mapping[str, NDArray[np.float32]]:
+    return decode_prepared(path.read_bytes(), path.name).arrays
 
 
 class ViewProgress:
@@ -389,9 +376,7 @@ def _record(
     facts = sight.facts(camera.c2w, float(camera.fov_deg), grid)
     return ViewRecord(
         spp=rendered.spp,
-        noise_floor_db=round(rendered.noise_floor_db, 3),
-        noise_floor_linear_db=round(rendered.noise_floor_linear_db, 3),
-        object_noise_floor_db=round(rendered.object_noise_floor_db, 3),
+        **rendered.rounded,
         coverage=round(facts.coverage, 6),
         at_cap=rendered.at_cap,
         seed=seed,
@@ -403,9 +388,5 @@ def _record(
     )
 
 
-def _part_floor(floor: MeasuredFloor) -> PartFloor:
-    return PartFloor(
-        noise_floor_db=round(floor.log_db, 3),
-        noise_floor_linear_db=round(floor.linear_db, 3),
-        object_noise_floor_db=round(floor.object_log_db, 3),
-    )
+def _part_floor(floor: PartFloor) -> PartFloor:
+    return PartFloor(**floor.rounded)

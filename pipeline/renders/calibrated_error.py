@@ -18,7 +18,7 @@ from typing import Annotated
 import numpy as np
 from numpy.typing import NDArray
 
-from pipeline.renders.noise_floor import BLOCK_PX, ErrorMeasures, MeasuredFloor
+from pipeline.renders.noise_floor import BLOCK_PX, FLOOR_METRICS, ErrorMeasures, by_metric
 from pipeline.renders.samples import TILE_PX, DualBuffer, gaps_db
 from pipeline.renders.settings import FIRST_SPP, PASS_SPP, RenderSettings
 from pipeline.renders.view_pictures import (
@@ -31,6 +31,7 @@ from pipeline.renders.view_pictures import (
 )
 from storage.digests import canonical_json, sha256_hex
 from storage.metrics import MAX_DB
+from storage.records.sample import PartFloor
 from storage.settings.ranges import Within
 from storage.typed_json import Sha256, ShortText, read_json
 
@@ -38,8 +39,8 @@ _CODE = 1
 """Number to raise where pictures or measures change without a change of a constant below."""
 
 FILE = Path(__file__).with_name("stated_errors.json")
-_FIELDS = {"log": "log_db", "linear": "linear_db", "object": "object_log_db"}
-"""Field of MeasuredFloor by metric."""
+_FIELDS = dict(zip(("log", "linear", "object"), FLOOR_METRICS, strict=True))
+"""Field of PartFloor by metric."""
 
 METRICS = tuple(_FIELDS)
 MEASURES = ("estimate", "agreement", "move", "surprise", "sure")
@@ -111,7 +112,7 @@ class CalibratedStatement:
 
     def state(
         self, measures: Mapping[str, ErrorMeasures], resolution: int, spp: int
-    ) -> tuple[MeasuredFloor, MeasuredFloor]:
+    ) -> tuple[PartFloor, PartFloor]:
         """Return what a picture's errors are calibrated to keep, and what they are expected to be.
 
         Args:
@@ -129,7 +130,7 @@ class CalibratedStatement:
             for result, shifts in ((bound, metric.bound), (expected, metric.expected)):
                 shift_db = 0.0 if is_empty else shifts[group]
                 result[_FIELDS[name]] = min(MAX_DB, center_db + shift_db)
-        return MeasuredFloor(**bound), MeasuredFloor(**expected)
+        return PartFloor(**bound), PartFloor(**expected)
 
 
 OUTSIDE = "other samples, widths, filters, layers or versions than measured, or guided paths"
@@ -215,7 +216,7 @@ def _statement_of(settings: RenderSettings) -> CalibratedStatement | None:
     return statement if narrowest <= settings.resolution <= widest else None
 
 
-def is_far(bound: MeasuredFloor, settings: RenderSettings, spp: int) -> bool:
+def is_far(bound: PartFloor, settings: RenderSettings, spp: int) -> bool:
     """Return whether halves alone show that sampling goes on, so that no picture is needed.
 
     Args:
@@ -226,7 +227,7 @@ def is_far(bound: MeasuredFloor, settings: RenderSettings, spp: int) -> bool:
     within_db = settings.picture_within_db
     if within_db is None or spp >= settings.max_spp:
         return False
-    return max(gaps_db(settings.targets_db, bound.by_metric).values(), default=0.0) > within_db
+    return max(gaps_db(settings.targets_db, by_metric(bound)).values(), default=0.0) > within_db
 
 
 @functools.cache

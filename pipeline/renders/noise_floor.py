@@ -45,6 +45,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from storage.metrics import MAX_DB
+from storage.records.sample import PartFloor
 
 BLOCK_PX = 8
 """Pixels across the blocks of the standard error: errors of a denoised picture are correlated over
@@ -62,29 +63,17 @@ Curve = Callable[[Any], Any]
 """What errors are taken in, of radiance."""
 
 
-@dataclass(frozen=True, kw_only=True)
-class MeasuredFloor:
-    """The measured error of one picture, in dB."""
-
-    log_db: float
-    """Stated error as psnr_log_db, in dB: the "noise floor" without another word."""
-    linear_db: float
-    """Stated error as psnr_linear_db, in dB: of radiance clamped to [0, 1]."""
-    object_log_db: float
-    """Stated error as object_psnr_log_db, in dB: over pixels that show geometry."""
-
-    @property
-    def by_metric(self) -> dict[str, float]:
-        """The three errors in dB by the name of their metric (storage.metrics)."""
-        return {metric: getattr(self, field) for field, metric in _FIELDS.items()}
-
-
-_FIELDS = {
-    "log_db": "psnr_log_db",
-    "linear_db": "psnr_linear_db",
-    "object_log_db": "object_psnr_log_db",
+FLOOR_METRICS = {
+    "noise_floor_db": "psnr_log_db",
+    "noise_floor_linear_db": "psnr_linear_db",
+    "object_noise_floor_db": "object_psnr_log_db",
 }
-"""The metric of each error."""
+"""The metric of each error (storage.metrics)."""
+
+
+def by_metric(floor: PartFloor) -> dict[str, float]:
+    """Return the three errors of a floor in dB by the name of their metric."""
+    return {metric: getattr(floor, field) for field, metric in FLOOR_METRICS.items()}
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -116,7 +105,7 @@ class ErrorMeasures:
 
 def measured_floor(
     rows: Iterable[tuple[float, float, NDArray[np.float64], NDArray[np.float64]]],
-) -> MeasuredFloor:
+) -> PartFloor:
     """Return the floor of a picture.
 
     Args:
@@ -133,7 +122,7 @@ def measured_floor(
             bound += deviations * _standard_error(sums, counts)
         smallest = 10 ** (-MAX_DB / 10)
         floors_db.append(MAX_DB if bound <= smallest else float(-10 * np.log10(bound)))
-    return MeasuredFloor(**dict(zip(_FIELDS, floors_db, strict=True)))
+    return PartFloor(**dict(zip(FLOOR_METRICS, floors_db, strict=True)))
 
 
 def _standard_error(sums: NDArray[np.float64], counts: NDArray[np.float64]) -> float:

@@ -24,7 +24,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from pipeline.renders.calibrated_error import first_spp
-from pipeline.renders.noise_floor import MeasuredFloor
+from pipeline.renders.noise_floor import by_metric
 from pipeline.renders.pictures import ViewPictures
 from pipeline.renders.preview import FIRST_LOOKS_SPP, preview_steps, usual_filter
 from pipeline.renders.samples import (
@@ -43,11 +43,11 @@ from storage.errors import Rejected
 from storage.records.lights import (
     MAX_LIGHTS,
     Parts,
-    light_rows,
-    num_light_pictures,
+    light_sources,
     rounded_to_half,
     sum_of_lights,
 )
+from storage.records.sample import PartFloor
 from storage.records.scene import Scene
 from storage.renderer import Image, Sampling
 
@@ -65,7 +65,7 @@ slower passes cost easier ones 7 to 11 %."""
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
-class RenderedView:
+class RenderedView(PartFloor):
     """One finished picture with its measured error."""
 
     radiance_rgb: NDArray[np.float32]
@@ -73,13 +73,7 @@ class RenderedView:
     spp: int
     """Samples per pixel that were spent, on each light where they are apart: the mean over the
     pixels that show anything, rounded down."""
-    noise_floor_db: float
-    """Measured error as psnr_log_db, in dB; more is better."""
-    noise_floor_linear_db: float
-    """Measured error as psnr_linear_db, in dB; more is better."""
-    object_noise_floor_db: float
-    """Measured error as object_psnr_log_db over `hits`, in dB; more is better."""
-    expected_error: MeasuredFloor | None = None
+    expected_error: PartFloor | None = None
     """Errors that are as often better as worse, in dB, where the three above are calibrated bounds
     (pipeline.renders.calibrated_error); None where they are bounds by estimate and allowances."""
     at_cap: bool
@@ -96,9 +90,9 @@ class RenderedView:
     """[R, R, 3] radiance of each part, with `split` or `split_lobes`; rounded to half floats. With
     `per_light` [L, R, R, 3]. Their storage.records.lights.sum_of_parts is `radiance_rgb`, or
     `lights_rgb`, in every bit."""
-    part_floors: Mapping[str, MeasuredFloor] | None = None
+    part_floors: Mapping[str, PartFloor] | None = None
     """Measured error of each part, of all lights together."""
-    light_floors: Sequence[MeasuredFloor] | None = None
+    light_floors: Sequence[PartFloor] | None = None
     """Measured error of each of `lights_rgb`."""
 
 
@@ -157,11 +151,10 @@ class SceneRenderer:
         self._sees_sky = scene.environment is not None and scene.environment.is_seen
         if settings.per_light:
             most = MAX_LIGHTS // max(1, len(settings.part_names))
-            if (count := num_light_pictures(scene)) > most:
-                raise Rejected("too_many_lights", f"{count} lights apart; at most {most}")
-            rows = light_rows(scene)
-            sky = [None] * (count - len(rows))
-            self._tracers = [self.tracer.only_light(row) for row in (*rows, *sky)]
+            lights = light_sources(scene)
+            if len(lights) > most:
+                raise Rejected("too_many_lights", f"{len(lights)} lights apart; at most {most}")
+            self._tracers = [self.tracer.only_light(row) for row in lights]
         self._light_seed = light_seed if settings.light_paths == "scene" else None
         if self._light_seed is not None:
             views = zip(scene.c2w, scene.fov_deg, strict=True)
@@ -215,12 +208,12 @@ class SceneRenderer:
             samples.counted = pictures.visible
         look = yield from self._render_until_targets(samples, pictures)
         floor = look.floor
-        missed = gaps_db(settings.targets_db, floor.by_metric)
+        missed = gaps_db(settings.targets_db, by_metric(floor))
         if settings.reject_at_cap and missed:
             raise Rejected(
                 "floor_not_reached",
                 ", ".join(
-                    f"{metric} is {floor.by_metric[metric]:.1f} dB; expected "
+                    f"{metric} is {by_metric(floor)[metric]:.1f} dB; expected "
                     f"{settings.targets_db[metric]:g}"
                     for metric in missed
                 ),
@@ -228,9 +221,7 @@ class SceneRenderer:
         stored = self._to_stored(pictures.finish())
         yield RenderedView(
             spp=samples.spp,
-            noise_floor_db=floor.log_db,
-            noise_floor_linear_db=floor.linear_db,
-            object_noise_floor_db=floor.object_log_db,
+            **vars(floor),
             at_cap=bool(missed),
             core_s=time.process_time() - self._began_s,
             hits=pictures.hits,
@@ -276,8 +267,8 @@ class SceneRenderer:
                 quality = "fast"
             look = pictures.look(quality)
             tiles.learn(look.changes, samples, quality)
-            measured.append((samples.spp, look.floor.by_metric))
-            gaps = gaps_db(targets_db, look.floor.by_metric)
+            measured.append((samples.spp, by_metric(look.floor)))
+            gaps = gaps_db(targets_db, by_metric(look.floor))
             if not gaps or samples.spp >= max_spp:
                 return look
             step = 2 * samples.pass_spp
@@ -291,7 +282,7 @@ class SceneRenderer:
                 image = Image(
                     radiance_rgb=radiance_rgb,
                     samples=samples.spp,
-                    stated_error_db=look.floor.log_db,
+                    stated_error_db=look.floor.noise_floor_db,
                     cpu_seconds=core_s,
                     facts={"spp": samples.spp},
                     remark=few_samples_remark(samples.spp),

@@ -22,10 +22,11 @@ import numpy as np
 from numpy.lib.stride_tricks import sliding_window_view
 from numpy.typing import NDArray
 
-from pipeline.renders.noise_floor import MeasuredFloor, clamped_radiance
+from pipeline.renders.noise_floor import clamped_radiance
 from pipeline.renders.samples import by_tiles
 from storage.conventions import HALF_FLOAT_MAX, log10_radiance
 from storage.errors import Rejected
+from storage.records.sample import PartFloor
 
 LEAST_PASSES = 10
 """Passes from which on their spread says how far a pixel has converged: of fewer, 4 standard errors
@@ -62,12 +63,12 @@ which would hide the overflow."""
 class MeasuredLook:
     """Measurements on the samples of a view at one time."""
 
-    floor: MeasuredFloor
-    part_floors: Mapping[str, MeasuredFloor]
+    floor: PartFloor
+    part_floors: Mapping[str, PartFloor]
     """Stated error of each part that is stored, of all lights together."""
-    light_floors: Sequence[MeasuredFloor]
+    light_floors: Sequence[PartFloor]
     """Stated error of each light whose picture is stored; empty where they are together."""
-    expected: MeasuredFloor | None = None
+    expected: PartFloor | None = None
     """Error of the picture that is as often better as worse, where the stated one is calibrated
     (pipeline.renders.calibrated_error); None where it is the bound of noise_floor."""
     changes: Sequence[NDArray[np.float64]]

@@ -12,6 +12,7 @@ import dataclasses
 import heapq
 import itertools
 from collections.abc import Iterator, Sequence
+from types import MappingProxyType
 from typing import Any, Literal
 
 import fcl
@@ -36,11 +37,12 @@ from pipeline.scenes.views import require_valid, with_first_cameras
 from scene_templates.layout import Layout, Pose
 from scene_templates.rotations import rotate_points
 from scene_templates.sample_layout import ScenePlan, sample_layout, scene_plan
-from scene_templates.scene_maps import NO_OWN_MAPS, OwnMaps, scene_sky
+from scene_templates.scene_maps import UserMaps, scene_sky
 from scene_templates.settings import SceneSettings
 from storage.errors import Rejected, TrilightError
 from storage.records.asset import Level
 from storage.records.material import EMISSION
+from storage.records.objects import SKY, TEXTURE
 from storage.records.retextured import without_constant_textures
 from storage.records.scene import Scene, SceneObject
 from storage.seeds import SceneKey
@@ -123,7 +125,7 @@ def compose_scene(
     pool: ObjectPool,
     scene_key: SceneKey,
     *,
-    user_maps: OwnMaps = NO_OWN_MAPS,
+    user_maps: UserMaps = MappingProxyType({}),
 ) -> Scene:
     """Compose one scene.
 
@@ -159,7 +161,7 @@ def compose_scene(
     skins = source_skins(chosen, levels, settings.materials, scene_key)
     pieces = scene_pieces(layout, chosen, shapes, settings, rng, skins)
     pieces = with_drawn_textures(
-        pieces, layout, settings.textures, scene_key, user_textures=user_maps.textures
+        pieces, layout, settings.textures, scene_key, user_textures=user_maps.get(TEXTURE, ())
     )
     arrays = concatenate_pieces(pieces)
     arrays["materials"] = with_drawn_columns(arrays["materials"], scene_key)
@@ -181,7 +183,7 @@ def _with_sky(
     scene: Scene,
     settings: SceneSettings,
     scene_key: SceneKey,
-    user_maps: OwnMaps,
+    user_maps: UserMaps,
     uids: set[str],
 ) -> Scene:
     """Return a scene with its sky, if any, and with the uids of the user's maps in it."""
@@ -191,7 +193,7 @@ def _with_sky(
         scene.vertex_positions[scene.faces[emits]].astype(np.float64),
         scene.materials[scene.material_index[emits], EMISSION].astype(np.float64),
         scene_key,
-        user_skies=user_maps.skies,
+        user_skies=user_maps.get(SKY, ()),
         licences=scene.licences,
     )
     provenance = dict(scene.provenance)
@@ -260,9 +262,7 @@ def _entry(pooled: PooledAsset, taken: Sequence[str]) -> SceneObject:
         name=next(name for name in variants if name not in taken),
         kind="object",
         uid=locked.uid,
-        licence=locked.licence,
-        attribution=locked.attribution,
-        source_url=locked.source_url,
+        **locked.rights,
     )
 
 

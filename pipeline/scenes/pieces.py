@@ -36,7 +36,6 @@ from scene_templates.scene_maps import (
     TexturedLook,
     TextureSettings,
     UserMap,
-    UserTexture,
     draw_look,
 )
 from scene_templates.surfaces.maps import SurfaceMaps
@@ -265,7 +264,7 @@ def with_drawn_textures(
     settings: TextureSettings,
     scene_key: SceneKey,
     *,
-    user_textures: Sequence[UserMap[UserTexture]] = (),
+    user_textures: Sequence[UserMap] = (),
 ) -> list[ScenePiece]:
     """Return the pieces, some with drawn textures; emitters have none.
 
@@ -378,12 +377,7 @@ def _skin(skin: LevelSkin, locked: LockedObject) -> Skin:
     """
 
     def with_rights(texture: Texture, column: str) -> Texture:
-        source = MapSource(
-            name=f"{locked.uid} {column}",
-            licence=locked.licence,
-            attribution=locked.attribution,
-            source_url=locked.source_url,
-        )
+        source = MapSource(name=f"{locked.uid} {column}", **locked.rights)
         return dataclasses.replace(texture, source=source)
 
     try:

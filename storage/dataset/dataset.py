@@ -13,7 +13,6 @@ from storage.dataset.manifest import Manifest, ShardEntry, decode_manifest, miss
 from storage.dataset.shard import ShardReader
 from storage.errors import EnvironmentFailure, ShardMissing, TrilightError, Unreadable
 from storage.records.objects import Failure, LockedObject, decode_failures
-from storage.records.packed_maps import HeldMaps
 from storage.records.sample import (
     Sample,
     SceneRecord,
@@ -136,10 +135,9 @@ class Dataset:
         It raises TrilightError where the file is missing or its bytes are not those of the
         manifest.
         """
-        held = HeldMaps()
         with self.open_shard(shard, checked=True) as opened:
             for key, members in opened:
-                yield decode_sample(key, members, held)
+                yield decode_sample(key, members)
 
     def read_scenes(self, shard: ShardEntry) -> Iterator[SceneRecord]:
         """Yield the samples of a shard without their pictures, through its headers.
@@ -159,14 +157,13 @@ class Dataset:
         self,
         shard: ShardEntry,
         keys: Iterable[str] | None,
-        decode: Callable[[str, Mapping[str, bytes], HeldMaps], Record],
+        decode: Callable[[str, Mapping[str, bytes]], Record],
         accepts: Callable[[str], bool] = lambda suffix: True,
     ) -> Iterator[Record]:
-        held = HeldMaps()
         with self.open_shard(shard) as opened:
             for key in opened.samples if keys is None else keys:
                 with reading(self.display_name, shard.name):
-                    record = decode(key, opened.members(key, accepts), held)
+                    record = decode(key, opened.members(key, accepts))
                     require_lawful(record)
                 yield record
 

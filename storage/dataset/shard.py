@@ -23,7 +23,7 @@ from typing import BinaryIO
 
 from storage.atomic import atomic_writer
 from storage.errors import ShardMissing, TrilightError, prefix_errors
-from storage.records.packed_maps import MAP_NAME, HeldMaps, map_member
+from storage.records.packed_maps import MAP_NAME, map_member
 from storage.records.safe_read import open_plain
 from storage.records.sample import Sample, StoredSample, decode_sample, stored_sample
 
@@ -147,13 +147,12 @@ def scan_samples(
 class ShardReader(AbstractContextManager["ShardReader"]):
     """An open shard, which gives any of its samples, in any order and to several threads."""
 
-    def __init__(self, stream: BinaryIO, name: str, held: HeldMaps | None = None) -> None:
+    def __init__(self, stream: BinaryIO, name: str) -> None:
         """Read the headers; raises TrilightError as `scan_samples`, and closes the file then.
 
         Args:
             stream: the shard, a file of this machine.
             name: of the shard, for messages.
-            held: maps of other shards that were unpacked already.
         """
         self.name = name
         self.maps: dict[str, Member] = {}
@@ -168,7 +167,6 @@ class ShardReader(AbstractContextManager["ShardReader"]):
         """Members by suffix of each sample by key, in the order of the file."""
         self.keys = list(samples)
         """The keys of its samples, in the order of the file."""
-        self._held = HeldMaps() if held is None else held
 
     def sample(self, row: int) -> Sample:
         """Return a sample that passes `Sample.check`.
@@ -177,7 +175,7 @@ class ShardReader(AbstractContextManager["ShardReader"]):
             TrilightError: it is not whole, not readable or breaks a law; names shard and sample.
         """
         with prefix_errors(self.name):
-            sample = decode_sample(self.keys[row], self.members(self.keys[row]), self._held)
+            sample = decode_sample(self.keys[row], self.members(self.keys[row]))
             sample.check()
             return sample
 
@@ -188,7 +186,7 @@ class ShardReader(AbstractContextManager["ShardReader"]):
             TrilightError: its scene is not readable or breaks a law; names shard and sample.
         """
         with prefix_errors(self.name):
-            return stored_sample(self.keys[row], self.members(self.keys[row]), self._held)
+            return stored_sample(self.keys[row], self.members(self.keys[row]))
 
     def members(
         self, key: str, accepts: Callable[[str], bool] = lambda suffix: True

@@ -2,7 +2,7 @@
 
 A set knows its shards by number and opens each when it is wanted. An open shard gives any of its
 samples, in any order and from several threads at once; nothing of it stays in memory but the names
-of its members, and of a whole set as many unpacked maps as storage.records.packed_maps allows.
+of its members, and of all shards as many unpacked maps as storage.records.packed_maps allows.
 """
 
 import itertools
@@ -22,7 +22,6 @@ from storage.conventions import SPLITS
 from storage.dataset.shard import ShardReader
 from storage.digests import sha256_hex
 from storage.errors import TrilightError
-from storage.records.packed_maps import HeldMaps
 from storage.records.safe_read import open_plain
 from storage.remote.shard_cache import shard_cache
 from storage.remote.url import RemoteUrl, parse_local_path, parse_url, printable, safe_text
@@ -183,7 +182,6 @@ class ShardSet:
         """The numbers of each dataset's shards."""
         self._seen = seen or KeysSeen()
         self._counts: dict[int, int] = {}
-        self._held = HeldMaps()
 
     def num_samples(self, number: int) -> int:
         """Return how many samples a shard holds; opens it where nothing else tells."""
@@ -200,7 +198,7 @@ class ShardSet:
             TrilightError: it cannot be read, or is not what it should be; the message names it.
         """
         shard = self._shards[number]
-        opened = ShardReader(shard.open(), shard.name, self._held)
+        opened = ShardReader(shard.open(), shard.name)
         count = len(opened.keys)
         try:
             if shard.num_samples is None:

@@ -22,7 +22,6 @@ from storage.licences import mixed_share_alike
 from storage.machine import available_cores
 from storage.records.lights import part_names, sum_of_lights, sum_of_parts
 from storage.records.objects import LockedObject, locked_uids
-from storage.records.packed_maps import HeldMaps
 from storage.records.passes import decode_passes_exr, passes_in_file, picture_passes
 from storage.records.sample import Sample, decode_sample
 from storage.records.scene import Scene
@@ -232,11 +231,10 @@ def _check_content(
     locked: Mapping[str, LockedObject] | None,
 ) -> Iterator[str]:
     unused = set(opened.maps)
-    held = HeldMaps()
     for key, members in opened:
         unused -= members.keys()
         try:
-            sample = decode_sample(key, members, held)
+            sample = decode_sample(key, members)
         except TrilightError as error:
             yield str(error)
         else:

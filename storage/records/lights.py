@@ -33,9 +33,10 @@ def num_lights(scene: Scene) -> int:
     return len(light_rows(scene))
 
 
-def num_light_pictures(scene: Scene) -> int:
-    """Return the number of lights whose pictures add up to that of a scene: the sky is one."""
-    return num_lights(scene) + (shining_sky(scene) is not None)
+def light_sources(scene: Scene) -> tuple[int | None, ...]:
+    """Return the lights whose pictures add up to that of a scene: `light_rows`, None for a sky."""
+    sky = () if shining_sky(scene) is None else (None,)
+    return (*light_rows(scene), *sky)
 
 
 def shining_sky(scene: Scene) -> Environment | None:

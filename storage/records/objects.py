@@ -43,6 +43,11 @@ class NamedObject:
         """Identity and rights as keywords, for another row about this object."""
         return {field.name: getattr(self, field.name) for field in dataclasses.fields(NamedObject)}
 
+    @property
+    def rights(self) -> dict[str, str]:
+        """Rights as keywords, for a record of a scene that shows this object."""
+        return {name: getattr(self, name) for name in ("licence", "attribution", "source_url")}
+
 
 @dataclass(frozen=True, kw_only=True)
 class ObjectRecord(NamedObject):

@@ -36,8 +36,8 @@ from storage.settings.ranges import Within
 from storage.typed_json import Sha256
 
 HELD_BYTES = 1 << 26
-"""Most bytes that the maps of all open shards of a set take: 40 skies of 512 x 256 texels in
-float32, or 340 colours of 256 x 256 in 8 bits."""
+"""Most bytes that the unpacked maps of a process take beside those in use: 40 skies of 512 x 256
+texels in float32, or 340 colours of 256 x 256 in 8 bits."""
 
 MAP_NAME = re.compile(r"__map-([0-9a-f]{64})__")
 """Name of a map among the members of a shard."""
@@ -95,6 +95,10 @@ class HeldMaps:
                 self._maps[key] = made
                 self.num_bytes += array.nbytes
         return made
+
+
+_HELD = HeldMaps()
+"""The maps of this process: samples of all shards that it reads share them."""
 
 
 def _array(one: Texture | Environment) -> NDArray:
@@ -265,15 +269,14 @@ def held_values(stored: NDArray) -> NDArray:
     return stored.astype(np.float32) if stored.dtype == np.float16 else stored
 
 
-def unpacked_maps(
-    maps: Maps, members: Mapping[str, bytes], held: HeldMaps | None = None
-) -> dict[str, Any]:
+def unpacked_maps(maps: Maps, members: Mapping[str, bytes]) -> dict[str, Any]:
     """Return the fields `textures` and `environment` of a scene, whose arrays are read-only.
+
+    Maps that are held are not unpacked again; equal members give equal scenes with any.
 
     Args:
         maps: what the record says of them, from outside.
         members: bytes of the maps by the names of their members; others are ignored.
-        held: those of other samples, which are not unpacked again; None where there is no other.
 
     Raises:
         TrilightError: a map is missing or damaged, all of them take more than MAX_MAPS_BYTES, or
@@ -289,7 +292,6 @@ def unpacked_maps(
         packed[name] = _PackedMap(members[name], f"map {entry.sha256}")
     if (total := sum(each.num_bytes_held for each in packed.values())) > MAX_MAPS_BYTES:
         wrong_value("maps", f"{total} bytes", f"at most {MAX_MAPS_BYTES}")
-    known = HeldMaps() if held is None else held
 
     def load(kind: Any, entry: MapEntry, _: int) -> Any:
         name = map_member(entry.sha256)
@@ -301,7 +303,7 @@ def unpacked_maps(
                 wrong_value(one.name, one.form, expected)
             return checked_map(kind, entry, one.values(), is_srgb=one.form == "srgb")
 
-        return known.get_or_unpack(kind, entry.sha256, members[name], unpack)
+        return _HELD.get_or_unpack(kind, entry.sha256, members[name], unpack)
 
     return maps.load(load)
 

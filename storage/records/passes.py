@@ -11,7 +11,7 @@ holds 0 instead of NaN, since filters of other programs would spread NaN over it
 readers restore it. For the same reason a scene without textures has no channels of the pass `uv`.
 """
 
-from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import cached_property, partial
 from typing import Literal
@@ -28,49 +28,45 @@ from storage.records.scene import Scene
 
 
 @dataclass(frozen=True, eq=False)
-class Later:
-    """Another moment of a scene, or another camera, that `motion_px` leads to."""
+class View:
+    """A camera of a scene, and the width of its picture."""
 
     scene: Scene
-    """Has the same triangles with their corners in the same order, possibly elsewhere."""
-    view: int
+    row: int
+    """Row of the camera in `scene.c2w`."""
+    resolution: int
+    """Width and height of the picture in pixels, however many rays a pixel has."""
+
+    @cached_property
+    def c2w(self) -> NDArray[np.float64]:
+        """[4, 4] of the camera."""
+        return self.scene.c2w[self.row].astype(np.float64)
+
+    @cached_property
+    def fov_deg(self) -> float:
+        """Full field of view in degrees."""
+        return float(self.scene.fov_deg[self.row])
 
     @cached_property
     def corners(self) -> NDArray[np.float64]:
         """[T + 1, 3, 3] positions in metres, the last row NaN."""
         return corner_table(self.scene, self.scene.vertex_positions)
 
-
-@dataclass(frozen=True, kw_only=True, eq=False)
-class PassRays:
-    """Rays of a view, with what they meet."""
-
-    hits: FirstHits
-    c2w: NDArray[np.float64]
-    """[4, 4] of the camera."""
-    fov_deg: float
-    resolution: int
-    """Width and height of the picture in pixels, however many rays a pixel has."""
-    later: Later | None
+    def places(self, positions: NDArray[np.float64]) -> NDArray[np.float64]:
+        """Return where the picture shows positions, as `pixel_places`."""
+        return pixel_places(positions, self.c2w, self.fov_deg, self.resolution)
 
 
-def motion_px(rays: PassRays) -> NDArray[np.float64]:
-    """Return where the other camera shows the points that rays meet, less where this one does.
+def motion_px(hits: FirstHits, view: View, later: View | None) -> NDArray[np.float64]:
+    """Return where the later picture shows the points that rays meet, less where this one does.
 
     That is x to the right and y down [..., 2] in pixels; NaN where nothing is met or where the
-    point lies behind the other camera.
+    point lies behind the other camera. The later scene is another moment, whose triangles have
+    their corners in the same order, or this one.
     """
-    if rays.later is None:
+    if later is None:
         raise TrilightError("motion_px: no other moment is given; expected `then` or `then_view`.")
-    later_scene = rays.later.scene
-    view = rays.later.view
-    places = pixel_places(
-        rays.hits.interpolate(rays.later.corners),
-        later_scene.c2w[view],
-        float(later_scene.fov_deg[view]),
-        rays.resolution,
-    )
-    return places - pixel_places(rays.hits.position, rays.c2w, rays.fov_deg, rays.resolution)
+    return later.places(hits.interpolate(later.corners)) - view.places(hits.position)
 
 
 Frame = Literal["", "world", "camera", "picture"]
@@ -90,8 +86,8 @@ class Pass:
     name: str
     """Lower case letters and underscores, with the unit where there is one."""
     means: str
-    of: str | Callable[[PassRays], NDArray] = field(compare=False, repr=False)
-    """Name of a quantity of `FirstHits`, or a function of rays: [...] or [..., channels]."""
+    of: str | Callable[[FirstHits, View, View | None], NDArray] = field(compare=False, repr=False)
+    """Name of a quantity of `FirstHits`, or a function as `at`."""
     averaging: Averaging
     channels: tuple[str, ...] = ()
     """Names of its numbers; a single number has none, and its picture no last axis."""
@@ -105,10 +101,11 @@ class Pass:
     layer: str = ""
     """Name of its layer in OpenEXR files, where other programs have one; by default its own."""
 
-    def at(self, rays: PassRays) -> NDArray:
-        """Return the values at rays, [...] or [..., channels]."""
-        values: NDArray = getattr(rays.hits, self.of) if isinstance(self.of, str) else self.of(rays)
-        return values.astype(self.dtype)
+    def at(self, hits: FirstHits, view: View, later: View | None) -> NDArray:
+        """Return the values [...] or [..., channels] at what rays of a view meet."""
+        if isinstance(self.of, str):
+            return np.asarray(getattr(hits, self.of), self.dtype)
+        return np.asarray(self.of(hits, view, later), self.dtype)
 
     @property
     def exr_channels(self) -> tuple[str, ...]:
@@ -145,7 +142,7 @@ def _in_camera(name: str) -> Pass:
     return _over_surfaces(
         f"{name}_camera",
         f"The pass `{name}` in the axes of the camera.",
-        lambda rays: getattr(rays.hits, name) @ rays.c2w[:3, :3],
+        lambda hits, view, _: getattr(hits, name) @ view.c2w[:3, :3],
         channels=_XYZ,
         frame="camera",
     )
@@ -178,7 +175,7 @@ PASSES = (
     _depth(
         "depth_axis_m",
         "Distance from the camera's plane to the surface, along the axis of the camera.",
-        lambda rays: -in_camera(rays.hits.position, rays.c2w)[..., 2],
+        lambda hits, view, _: -in_camera(hits.position, view.c2w)[..., 2],
         short="depth",
         layer="Z",
     ),
@@ -230,16 +227,24 @@ def declared_passes() -> tuple[Pass, ...]:
 
     Emission is 0 wherever a surface is seen, since emitters are hidden from cameras.
     """
-    return PASSES + tuple(
-        _over_surfaces(
-            f"material_{column.name}",
-            column.means,
-            partial(_column, part=part),
-            short=column.name,
-            channels=_channels(column.width, is_colour=column.is_colour),
+    passes = list(PASSES)
+    for column, part in laid_out():
+        channels = _RGB if column.is_colour else tuple(map(str, range(column.width)))
+        is_number = column.width == 1
+        passes.append(
+            _over_surfaces(
+                f"material_{column.name}",
+                column.means,
+                partial(_column, part.start if is_number else part),
+                short=column.name,
+                channels=() if is_number else channels,
+            )
         )
-        for column, part in laid_out()
-    )
+    return tuple(passes)
+
+
+def _column(at: slice | int, hits: FirstHits, *_: View | None) -> NDArray[np.float32]:
+    return hits.material[..., at]
 
 
 def pass_names(words: Iterable[str]) -> tuple[str, ...]:
@@ -264,18 +269,6 @@ def pass_names(words: Iterable[str]) -> tuple[str, ...]:
             raise TrilightError(f"there is no pass {word!r:.60}; {expected_one_of(word, meant)}.")
         selected.add(meant[word])
     return tuple(each.name for each in passes if each.name in selected)
-
-
-def _channels(width: int, *, is_colour: bool) -> tuple[str, ...]:
-    if is_colour:
-        return _RGB
-    return () if width == 1 else tuple(str(index) for index in range(width))
-
-
-def _column(rays: PassRays, part: slice) -> NDArray[np.float32]:
-    """Return the numbers of a column; of one that is a single number, without the last axis."""
-    rows = rays.hits.material
-    return rows[..., part.start] if part.stop == part.start + 1 else rows[..., part]
 
 
 BLOCK_RAYS = 2**14
@@ -325,48 +318,36 @@ def view_passes(
     require_row("view", view, scene.num_views)
     _require_whole("resolution", resolution, 2**16)
     _require_whole("rays_a_side", rays_a_side, MOST_A_SIDE)
-    later = _later(scene, view, then, then_view)
+    now = View(scene, view, resolution)
+    later = _later(now, then, then_view)
     without = {UV: scene.uv is None, MOTION: later is None}
     chosen = _select_passes(names, without={name for name, lacks in without.items() if lacks})
     if all(each.averaging == "centre ray" for each in chosen):
         rays_a_side = 1
-    origin = scene.c2w[view, :3, 3].astype(np.float64)
-    seen = SeenFrom(scene, origin, surfaces)
+    seen = SeenFrom(scene, now.c2w[:3, 3], surfaces)
+    rows = max(1, BLOCK_RAYS // (resolution * rays_a_side**2))
     blocks = [
-        {
-            each.name: each.at(centre)
-            if each.averaging == "centre ray"
-            else _means(each.at(spread), rays_a_side, each.nothing)
-            for each in chosen
-        }
-        for centre, spread in _blocks(seen, view, resolution, rays_a_side, later)
+        _block(chosen, seen, now, later, range(resolution)[first : first + rows], rays_a_side)
+        for first in range(0, resolution, rows)
     ]
     return {each.name: np.concatenate([block[each.name] for block in blocks]) for each in chosen}
 
 
-def _blocks(
-    seen: SeenFrom, view: int, resolution: int, a_side: int, later: Later | None
-) -> Iterator[tuple[PassRays, PassRays]]:
-    """Yield the rays of some rows of pixels at a time: those of the centres, and all."""
-    c2w = seen.scene.c2w[view].astype(np.float64)
-    fov_deg = float(seen.scene.fov_deg[view])
-
-    def rays(first: int, last: int, a_side: int) -> PassRays:
-        rows = slice(first * a_side, last * a_side)
-        _, directions = camera_rays(c2w, fov_deg, resolution * a_side, rows)
-        return PassRays(
-            hits=seen.hits(directions),
-            c2w=c2w,
-            fov_deg=fov_deg,
-            resolution=resolution,
-            later=later,
-        )
-
-    rows = max(1, BLOCK_RAYS // (resolution * a_side**2))
-    for first in range(0, resolution, rows):
-        last = min(first + rows, resolution)
-        centre = rays(first, last, 1)
-        yield centre, centre if a_side == 1 else rays(first, last, a_side)
+def _block(
+    chosen: Sequence[Pass], seen: SeenFrom, now: View, later: View | None, rows: range, a_side: int
+) -> dict[str, NDArray]:
+    """Return passes of some rows of pixels, from one ray in their centres or `a_side` squared."""
+    hits = {}
+    for count in {1, a_side}:
+        lines = slice(rows.start * count, rows.stop * count)
+        _, directions = camera_rays(now.c2w, now.fov_deg, now.resolution * count, lines)
+        hits[count] = seen.hits(directions)
+    return {
+        each.name: each.at(hits[1], now, later)
+        if each.averaging == "centre ray"
+        else _means(each.at(hits[a_side], now, later), a_side, each.nothing)
+        for each in chosen
+    }
 
 
 def _means(values: NDArray, a_side: int, nothing: float) -> NDArray:
@@ -393,32 +374,30 @@ def _select_passes(names: Iterable[str] | None, *, without: Collection[str] = ()
     for name in names:
         if name not in known:
             raise TrilightError(f"there is no pass {name!r:.60}; expected of {', '.join(known)}.")
-    return [known[name] for name in names]
+    return [known[name] for name in dict.fromkeys(names)]
 
 
-def _later(scene: Scene, view: int, then: Scene | None, then_view: int | None) -> Later | None:
+def _later(now: View, then: Scene | None, then_view: int | None) -> View | None:
+    """Return the view that `motion_px` leads to; raises TrilightError for other triangles."""
     if then is None and then_view is None:
         return None
-    later = Later(scene if then is None else then, view if then_view is None else then_view)
-    require_row("then_view", later.view, later.scene.num_views)
-    _require_same_triangles(scene, later.scene)
-    return later
-
-
-def _require_same_triangles(now: Scene, then: Scene) -> None:
-    """Raise TrilightError unless the triangles of two scenes have the same corners, in order."""
-    if now.faces.shape != then.faces.shape:
+    scene = now.scene if then is None else then
+    later = View(scene, now.row if then_view is None else then_view, now.resolution)
+    require_row("then_view", later.row, scene.num_views)
+    faces = now.scene.faces
+    if faces.shape != scene.faces.shape:
         raise TrilightError(
-            f"motion_px: the other scene has {then.num_triangles} triangles; expected the "
-            f"{now.num_triangles} of this one, in the same order."
+            f"motion_px: the other scene has {scene.num_triangles} triangles; expected the "
+            f"{now.scene.num_triangles} of this one, in the same order."
         )
-    differ = np.flatnonzero((now.faces != then.faces).any(axis=1))
+    differ = np.flatnonzero((faces != scene.faces).any(axis=1))
     if len(differ):
-        row = int(differ[0])
+        row = differ[0]
         raise TrilightError(
-            f"motion_px: faces[{row}] of the other scene is {then.faces[row].tolist()}; expected "
-            f"{now.faces[row].tolist()} as in this one, since points are followed by triangles."
+            f"motion_px: faces[{row}] of the other scene is {scene.faces[row].tolist()}; expected "
+            f"{faces[row].tolist()} as in this one, since points are followed by triangles."
         )
+    return later
 
 
 def _require_whole(name: str, value: int, most: int) -> None:

@@ -33,9 +33,9 @@ from storage.records.lights import (
     Parts,
     decode_parts_exr,
     encode_parts_exr,
-    num_light_pictures,
+    light_sources,
 )
-from storage.records.packed_maps import HeldMaps, packed_maps, unpacked_maps
+from storage.records.packed_maps import packed_maps, unpacked_maps
 from storage.records.passes import picture_passes
 from storage.records.profiles import Profile, pack_arrays, pack_picture, unpack_arrays
 from storage.records.retextured import without_constant_textures
@@ -63,6 +63,12 @@ class PartFloor:
     """The same error as psnr_linear_db."""
     object_noise_floor_db: Plausible
     """The same error as object_psnr_log_db: over pixels that show geometry."""
+
+    @property
+    def rounded(self) -> dict[str, float]:
+        """The three errors by name, to a thousandth: as records and headers state them."""
+        names = [field.name for field in dataclasses.fields(PartFloor)]
+        return {name: round(getattr(self, name), 3) for name in names}
 
 
 @dataclass(frozen=True)
@@ -228,14 +234,14 @@ def encode_sample(sample: Sample, profile: Profile = "lossless") -> dict[str, by
     return {**members, **packed_maps(scene), **sample.kept_members}
 
 
-def decode_sample(key: str, members: Mapping[str, bytes], held: HeldMaps | None = None) -> Sample:
-    """Return the sample of its members (suffix to bytes); `held` as `decode_scene`.
+def decode_sample(key: str, members: Mapping[str, bytes]) -> Sample:
+    """Return the sample of its members (suffix to bytes).
 
     Raises:
         TrilightError: a member is missing, unreadable or of another schema version. Laws are not
             checked here; `Sample.check` does that before a network learns from it.
     """
-    record = decode_scene(key, members, held)
+    record = decode_scene(key, members)
     with name_errors(key):
         every = range(len(record.views))
         radiance_rgb = np.stack([decode_exr(members[f"{view}.exr"]) for view in every])
@@ -278,18 +284,15 @@ def _decode_parts(
     if packed is None:
         return {}
     height, width = size
-    num_lights = None if scene is None else num_light_pictures(scene)
+    num_lights = None if scene is None else len(light_sources(scene))
     by_view = [decode_parts_exr(data, names, (height, width), num_lights) for data in packed]
     return {name: np.stack([of_view[name] for of_view in by_view]) for name in names}
 
 
-def decode_scene(
-    key: str, members: Mapping[str, bytes], held: HeldMaps | None = None
-) -> SceneRecord:
+def decode_scene(key: str, members: Mapping[str, bytes]) -> SceneRecord:
     """Return a sample without its pictures, whose members may be absent.
 
     The maps that its record names are among the members, under the names that shards give them.
-    Those that are held are not unpacked again; equal members give equal scenes with any.
 
     Raises:
         TrilightError: as `decode_sample`.
@@ -299,7 +302,7 @@ def decode_scene(
     with name_errors(key):
         record = read_scene_record(members["json"], SampleJson, f"member {key}.json")
         maps = record.maps
-        fields = {} if maps is None else unpacked_maps(maps, members, held)
+        fields = {} if maps is None else unpacked_maps(maps, members)
         fields |= decode_arrays(unpack_arrays(members), maps)
         return SceneRecord(key=key, scene=record.scene(**fields), views=record.views)
 
@@ -404,16 +407,14 @@ class StoredSample(SceneRecord):
         return lights.get(ALL_LIGHT)
 
 
-def stored_sample(
-    key: str, members: Mapping[str, bytes], held: HeldMaps | None = None
-) -> StoredSample:
-    """Return the sample of its members; `held` as `decode_scene`.
+def stored_sample(key: str, members: Mapping[str, bytes]) -> StoredSample:
+    """Return the sample of its members, whose pictures stay packed.
 
     Raises:
         TrilightError: its scene or record is missing, unreadable or breaks a law, or it has not as
             many records of views, and pictures, as cameras.
     """
-    record = decode_scene(key, members, held)
+    record = decode_scene(key, members)
     require_lawful(record)
     suffixes = (f"{view}.exr" for view in range(len(record.views)))
     if missing := [suffix for suffix in suffixes if suffix not in members]:

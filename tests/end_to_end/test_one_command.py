@@ -14,7 +14,7 @@ from pipeline.exchange.exports.pictures import stands_alone
 from storage.conventions import preview_srgb8
 from storage.dataset.dataset import open_dataset
 from storage.dataset.layout import DatasetFolder
-from storage.records.lights import num_light_pictures, sum_of_lights
+from storage.records.lights import light_sources, sum_of_lights
 from storage.records.objects import read_failures
 from storage.records.passes import view_passes
 from tests.command_line import expect_mistake, expect_output, run_program
@@ -225,7 +225,7 @@ def test_the_page_relights_a_scene_one_light_at_a_time(tmp_path: Path) -> None:
     (sample,) = open_dataset(str(tmp_path / "data/olat")).samples("train")
     assert sample.lights_rgb is not None and sample.views[0].lights is not None
     lights = sample.lights_rgb[0]
-    assert len(lights) == num_light_pictures(sample.scene) > 2
+    assert len(lights) == len(light_sources(sample.scene)) > 2
     np.testing.assert_array_equal(sum_of_lights(lights), sample.radiance_rgb[0])
     assert json.loads(printed) == [floor.noise_floor_db for floor in sample.views[0].lights]
     relit = lights[0] * np.array([4, 1, 0.2], np.float32) + np.float32(0.25) * lights[1:].sum(

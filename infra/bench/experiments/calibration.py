@@ -72,9 +72,9 @@ def record_looks(
             row = {
                 "spp": float(self._samples.spp),
                 "hits": float(self.hits.mean()),
-                "bound_log": look.floor.log_db,
-                "bound_linear": look.floor.linear_db,
-                "bound_object": look.floor.object_log_db,
+                "bound_log": look.floor.noise_floor_db,
+                "bound_linear": look.floor.noise_floor_linear_db,
+                "bound_object": look.floor.object_noise_floor_db,
             }
             everywhere = np.ones_like(self.hits)
             for metric, curve in CURVES.items():

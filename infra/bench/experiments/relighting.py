@@ -66,7 +66,7 @@ def _measure(target_db: float, context: BenchContext, trial: str) -> Figures:
     gains = MOST_GAIN ** rng_for(index, "gains").uniform(-1, 1, (len(references), 1, 1, 3))
     of_relit = (gains[:, None] * references).sum(axis=0)
     lights = zip(view.light_floors, view.lights_rgb, references, strict=True)
-    excess = np.array([floor.log_db - error_db(light, raw) for floor, light, raw in lights])
+    excess = np.array([floor.noise_floor_db - error_db(light, raw) for floor, light, raw in lights])
     relit = (gains * view.lights_rgb).sum(axis=0).astype(np.float32)
     return {
         "core_s": view.core_s,

@@ -8,8 +8,6 @@
   must handle them.
 """
 
-from dataclasses import dataclass, replace
-
 import numpy as np
 from numpy.typing import NDArray
 
@@ -337,46 +335,37 @@ def _tiers(params: _Tree, rng: np.random.Generator) -> list[Mesh]:
     return parts
 
 
-@dataclass(frozen=True, kw_only=True)
-class LeafParams:
-    """Shape of one leaf; lengths are fractions of the leaf's length."""
+class _Plant:
+    """Shape of a random plant; measures of a leaf but its length are fractions of it."""
 
-    length: float  # from base to tip, along the midrib
-    width: float  # largest width
-    widest: float  # where along the midrib that is, in (0, 1)
-    base: float  # width of the base, as a share of the largest
-    arch_rad: float  # how far the midrib turns downwards from base to tip
-    fold_rad: float  # how far each half is raised from the plane of the midrib
-    teeth: int  # notches along each edge; 0 is a smooth one
-    tooth_depth: float  # depth of the notches as a share of the width there, in [0, 1)
-    rows: int  # rows of vertices from base to tip; at least twice the teeth
-
-
-def leaf_sheet(leaf: LeafParams, rise_rad: float) -> Mesh:
-    """Return one leaf: an open sheet of 8 (rows - 1) + 4 triangles from the origin towards x.
-
-    The sheet faces upwards and ends in a point.
-    """
-    along = np.arange(leaf.rows) / leaf.rows
-    across = np.array([-1.0, -0.5, 0.0, 0.5, 1.0])
-    slope = rise_rad - leaf.arch_rad * np.append(along, 1.0)
-    steps = np.stack([np.cos(slope), 0 * slope, np.sin(slope)], axis=1) * leaf.length / leaf.rows
-    rib = np.concatenate([[[0.0, 0.0, 0.0]], np.cumsum(steps[:-1], axis=0)])
-    rising = leaf.base + (1 - leaf.base) * np.sin(0.5 * np.pi * along / leaf.widest)
-    falling = np.sin(0.5 * np.pi * (1 - along) / (1 - leaf.widest)) ** 0.8
-    width = np.where(along < leaf.widest, rising, falling)
-    if leaf.teeth:
-        width = width * (1 - leaf.tooth_depth * (np.arange(leaf.rows) % 2))
-    half = 0.5 * leaf.length * leaf.width * width
-    over = np.stack([-np.sin(slope), 0 * slope, np.cos(slope)], axis=1)[:-1]
-    out = half[:, None] * across
-    lift = np.abs(out) * np.sin(leaf.fold_rad)
-    grid = rib[:-1, None] + lift[..., None] * over[:, None]
-    grid[..., 1] += out * np.cos(leaf.fold_rad)
-    last = (leaf.rows - 1) * 5 + np.arange(4)
-    tip = np.stack([last + 1, last, np.full(4, leaf.rows * 5)], axis=1)
-    faces = np.concatenate([sheet_faces(leaf.rows, 5)[:, ::-1], tip])
-    return np.concatenate([grid.reshape(-1, 3), rib[-1:]]), faces
+    def __init__(self, rng: np.random.Generator) -> None:
+        kind = str(rng.choice(["agave", "grass", "palm", "broad", "herb"]))
+        leaf, leaves, stems, stalks, rises = {
+            "agave": ((0.75, 0.24, 0.4, 0.7), (14, 27), (0.0, 0.0), (0.0, 0.0), (1.4, 0.3)),
+            "grass": ((1.1, 0.07, 0.4, 0.7), (28, 45), (0.0, 0.0), (0.0, 0.0), (1.5, 0.8)),
+            "palm": ((1.0, 0.34, 0.45, 0.2), (9, 15), (0.7, 1.5), (0.0, 0.0), (1.2, 0.2)),
+            "broad": ((0.6, 0.75, 0.35, 0.3), (7, 14), (0.0, 0.5), (0.35, 0.7), (1.3, 0.6)),
+            "herb": ((0.4, 0.45, 0.45, 0.1), (16, 29), (0.6, 1.1), (0.03, 0.1), (0.9, 0.1)),
+        }[kind]
+        # where along the midrib the leaf is widest, and its base as a share of that width
+        length, width, self.widest, self.base = leaf
+        # notches along each edge; 0 is a smooth one
+        self.teeth = {"palm": 14, "broad": int(rng.choice([0, 4]))}.get(kind, 0)
+        self.tooth_depth = 0.75 if kind == "palm" else 0.4  # as a share of the width there
+        self.length = length * rng.uniform(0.8, 1.25)  # of the largest leaf, base to tip
+        self.width = width * rng.uniform(0.8, 1.25)  # largest width
+        # how far the midrib turns downwards, and each half is raised from its plane
+        self.arch_rad = rng.uniform(*((0.5, 1.1) if kind in ("agave", "broad") else (1, 2)))
+        self.fold_rad = rng.uniform(0.15, 0.6)
+        self.rows = max(2 * self.teeth, int(rng.integers(9, 13)))  # of vertices, base to tip
+        self.leaves = int(rng.integers(*leaves))
+        self.stem = rng.uniform(*stems)  # height of the stem above the pot; 0 is a rosette
+        self.stalk = rng.uniform(*stalks)  # length of each leaf's own stalk; 0 is none
+        self.steepest_rad = rises[0] + rng.uniform(-0.1, 0.1)  # rise of the uppermost leaf
+        self.flattest_rad = rises[1] + rng.uniform(-0.2, 0.2)  # rise of the lowest leaf
+        self.smallest = rng.uniform(0.4, 0.8)  # size of the uppermost leaf over the largest
+        self.pot_height = rng.uniform(0.22, 0.42)
+        self.pot_foot = 0.28 * rng.uniform(0.55, 1.0)  # radius of the pot's foot
 
 
 def sample_plant(rng: np.random.Generator) -> Mesh:
@@ -384,67 +373,40 @@ def sample_plant(rng: np.random.Generator) -> Mesh:
 
     The rim of its pot has a radius of about 0.3.
     """
-    kind = str(rng.choice(["agave", "grass", "palm", "broad", "herb"]))
-    leaf, numbers, stems, stalks, rises = {
-        "agave": ((0.75, 0.24, 0.4, 0.7), (14, 27), (0.0, 0.0), (0.0, 0.0), (1.4, 0.3)),
-        "grass": ((1.1, 0.07, 0.4, 0.7), (28, 45), (0.0, 0.0), (0.0, 0.0), (1.5, 0.8)),
-        "palm": ((1.0, 0.34, 0.45, 0.2), (9, 15), (0.7, 1.5), (0.0, 0.0), (1.2, 0.2)),
-        "broad": ((0.6, 0.75, 0.35, 0.3), (7, 14), (0.0, 0.5), (0.35, 0.7), (1.3, 0.6)),
-        "herb": ((0.4, 0.45, 0.45, 0.1), (16, 29), (0.6, 1.1), (0.03, 0.1), (0.9, 0.1)),
-    }[kind]
-    length, width, widest, base = leaf
-    teeth = {"palm": 14, "broad": int(rng.choice([0, 4]))}.get(kind, 0)
-    shape = LeafParams(
-        length=float(length * rng.uniform(0.8, 1.25)),
-        width=float(width * rng.uniform(0.8, 1.25)),
-        widest=widest,
-        base=base,
-        arch_rad=float(rng.uniform(0.5, 1.1) if kind in ("agave", "broad") else rng.uniform(1, 2)),
-        fold_rad=float(rng.uniform(0.15, 0.6)),
-        teeth=teeth,
-        tooth_depth=0.75 if kind == "palm" else 0.4,
-        rows=max(2 * teeth, int(rng.integers(9, 13))),
-    )
-    leaves = int(rng.integers(*numbers))
-    stem = rng.uniform(*stems)  # height of the stem above the pot; 0 is a rosette
-    stalk = rng.uniform(*stalks)  # length of each leaf's own stalk; 0 is none
-    steepest_rad = rises[0] + rng.uniform(-0.1, 0.1)  # rise of the uppermost leaf
-    flattest_rad = rises[1] + rng.uniform(-0.2, 0.2)  # rise of the lowest leaf
-    smallest = rng.uniform(0.4, 0.8)  # size of the uppermost leaf, as a share of the largest
-    pot_height = rng.uniform(0.22, 0.42)
-    pot_foot = 0.28 * rng.uniform(0.55, 1.0)  # radius of the pot's foot
-    outline = [(0.9 * pot_foot, 0.0), (pot_foot, 0.02), (0.28, pot_height - 0.1)]
-    outline += [(0.31, pot_height - 0.09), (0.31, pot_height), (0.28, pot_height)]  # rim
-    outline += [(0.27, pot_height - 0.03), (0.14, pot_height - 0.025)]  # earth to just below it
+    params = _Plant(rng)
+    high = params.pot_height
+    outline = [(0.9 * params.pot_foot, 0.0), (params.pot_foot, 0.02), (0.28, high - 0.1)]
+    outline += [(0.31, high - 0.09), (0.31, high), (0.28, high)]  # rim
+    outline += [(0.27, high - 0.03), (0.14, high - 0.025)]  # earth to just below it
     parts = [lathe(outline, 20)]
-    top = pot_height - 0.03
-    if stem:
+    top = high - 0.03
+    if stem := params.stem:
         bend = np.linspace(0, 1, 10)
         path = np.stack([0.1 * stem * bend**2, 0 * bend, stem * bend], axis=1)
         path[:, 2] += top - 0.02
         parts.append(tube(path, 0.045 - 0.02 * bend, 8))
-    for number in range(leaves):
-        fraction = (number + 0.5) / leaves
-        azimuth = number * np.pi * (3 - np.sqrt(5))
-        rise = flattest_rad + fraction * (steepest_rad - flattest_rad)
+    for number in range(params.leaves):
+        fraction = (number + 0.5) / params.leaves
+        rise = params.flattest_rad + fraction * (params.steepest_rad - params.flattest_rad)
         level = (0.35 + 0.65 * fraction) * stem
         foot = np.array([0.1 * level**2 / stem if stem else 0.0, 0.0, top + level])
-        size = 1 - fraction * (1 - smallest)
-        scaled = replace(shape, length=shape.length * size)
-        parts += _leaf_on_stalk(scaled, stalk * size, foot, azimuth, rise)
+        size = 1 - fraction * (1 - params.smallest)
+        azimuth = number * np.pi * (3 - np.sqrt(5))
+        parts += _leaf_on_stalk(params, size, foot, azimuth, rise)
     return join(parts)
 
 
 def _leaf_on_stalk(
-    leaf: LeafParams, stalk: float, foot: NDArray[np.float64], azimuth: float, rise: float
+    params: _Plant, size: float, foot: NDArray[np.float64], azimuth: float, rise: float
 ) -> list[Mesh]:
     """Return a leaf that starts at `foot` or at the end of its stalk, and the stalk if any."""
+    stalk = params.stalk * size
     ahead = np.array([np.cos(azimuth), np.sin(azimuth), 0.0])
     direction = np.cos(rise) * ahead + np.array([0.0, 0.0, np.sin(rise)])
     # Without a stalk it begins just inside the stem or the earth.
     start = foot + (direction * stalk if stalk else 0.025 * ahead - [0.0, 0.0, 0.01])
     # A leaf at the end of a stalk hangs from it, the others go on in their own direction.
-    positions, faces = leaf_sheet(leaf, rise - 0.5 if stalk > 0.2 else rise)
+    positions, faces = _leaf(params, params.length * size, rise - 0.5 if stalk > 0.2 else rise)
     aside = np.array([-ahead[1], ahead[0], 0.0])
     turned = positions @ np.stack([ahead, aside, [0.0, 0.0, 1.0]])
     parts: list[Mesh] = [(turned + start, faces)]
@@ -452,3 +414,30 @@ def _leaf_on_stalk(
         path = foot + np.linspace(-0.02, stalk + 0.02, 5)[:, None] * direction
         parts.append(tube(path, np.linspace(0.014, 0.008, 5) * (1 + stalk), 5))
     return parts
+
+
+def _leaf(params: _Plant, length: float, rise_rad: float) -> Mesh:
+    """Return one leaf: an open sheet of 8 (rows - 1) + 4 triangles from the origin towards x.
+
+    The sheet faces upwards and ends in a point.
+    """
+    along = np.arange(params.rows) / params.rows
+    across = np.array([-1.0, -0.5, 0.0, 0.5, 1.0])
+    slope = rise_rad - params.arch_rad * np.append(along, 1.0)
+    steps = np.stack([np.cos(slope), 0 * slope, np.sin(slope)], axis=1) * length / params.rows
+    rib = np.concatenate([[[0.0, 0.0, 0.0]], np.cumsum(steps[:-1], axis=0)])
+    rising = params.base + (1 - params.base) * np.sin(0.5 * np.pi * along / params.widest)
+    falling = np.sin(0.5 * np.pi * (1 - along) / (1 - params.widest)) ** 0.8
+    width = np.where(along < params.widest, rising, falling)
+    if params.teeth:
+        width = width * (1 - params.tooth_depth * (np.arange(params.rows) % 2))
+    half = 0.5 * length * params.width * width
+    over = np.stack([-np.sin(slope), 0 * slope, np.cos(slope)], axis=1)[:-1]
+    out = half[:, None] * across
+    lift = np.abs(out) * np.sin(params.fold_rad)
+    grid = rib[:-1, None] + lift[..., None] * over[:, None]
+    grid[..., 1] += out * np.cos(params.fold_rad)
+    last = (params.rows - 1) * 5 + np.arange(4)
+    tip = np.stack([last + 1, last, np.full(4, params.rows * 5)], axis=1)
+    faces = np.concatenate([sheet_faces(params.rows, 5)[:, ::-1], tip])
+    return np.concatenate([grid.reshape(-1, 3), rib[-1:]]), faces

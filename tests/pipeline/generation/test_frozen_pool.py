@@ -324,8 +324,8 @@ def test_documents_name_them_and_a_stranger_in_a_scene_is_a_fault(
 
 
 def test_share_alike_licences_never_meet() -> None:
-    def map_under(licence: str) -> UserMap[int]:
-        return UserMap(uid=licence, source=MapSource(licence=licence), load=lambda: 0)
+    def map_under(licence: str) -> UserMap:
+        return UserMap(uid=licence, source=MapSource(licence=licence), load=dict)
 
     own = [map_under("CC-BY-SA-4.0"), map_under("CC-BY-SA-3.0"), map_under("CC0-1.0")]
     drawn = {

@@ -238,7 +238,7 @@ def test_the_floor_of_a_kept_glint_is_its_noise() -> None:
 
 def _floor_db(raws: Sequence[Sequence[NDArray]], denoised: Sequence[Sequence[NDArray]]) -> float:
     a, b = (Half(*raw, *each) for raw, each in zip(raws, denoised, strict=True))
-    return floor_of(a, b, np.ones((32, 32), bool)).log_db
+    return floor_of(a, b, np.ones((32, 32), bool)).noise_floor_db
 
 
 def test_the_standard_error_is_that_between_passes() -> None:
@@ -341,7 +341,7 @@ def test_the_device_measures_what_numpy_measures(
             np.testing.assert_allclose(found, oracle, rtol=1e-3, err_msg=metric)
     for one in views:
         assert one.expected_error is not None
-        apart = one.expected_error.log_db - one.noise_floor_db
+        apart = one.expected_error.noise_floor_db - one.noise_floor_db
         assert apart == pytest.approx(3.5), "the shifts of narrow pictures"
 
 

@@ -24,7 +24,7 @@ from scene_templates.rotations import uniform_rotation
 from storage.denoiser import Features
 from storage.errors import TrilightError
 from storage.raycast import first_hits
-from storage.records.lights import light_rows
+from storage.records.lights import light_sources
 from storage.records.lookup import (
     FLAT,
     LEAST_Z,
@@ -194,7 +194,7 @@ def test_the_sky_alone_and_each_lamp_add_up_to_all_light() -> None:
     tracer = _tracer(scene)
     *lamps, sky = (
         render_passes(tracer.only_light(row), scene, first_seed=500, passes=8)
-        for row in (*light_rows(scene), None)
+        for row in light_sources(scene)
     )
     every = render_passes(tracer, scene, passes=8)
     assert_same_light(np.sum([*lamps, sky], axis=0), every, name="sum")

@@ -44,7 +44,7 @@ from storage.errors import Rejected, TrilightError
 from storage.metrics import psnr_log_db
 from storage.records.lights import (
     light_rows,
-    num_light_pictures,
+    light_sources,
     rounded_to_half,
     sum_of_lights,
 )
@@ -239,7 +239,7 @@ def test_the_picture_is_the_sum_of_its_lights_in_the_order_of_objects_the_sky_la
     scene = dataclasses.replace(lit_scene(), environment=constant(0.3))
     view = render_view(scene, SETTINGS)
     lights = _lights(view)
-    assert lights.shape == (num_light_pictures(scene), 32, 32, 3) == (4, 32, 32, 3)
+    assert lights.shape == (len(light_sources(scene)), 32, 32, 3) == (4, 32, 32, 3)
     np.testing.assert_array_equal(lights, rounded_to_half(lights))
     np.testing.assert_array_equal(sum_of_lights(lights), view.radiance_rgb)
     for light_rgb, colour in zip(lights, COLOURS, strict=False):  # objects 0, 2 and 4
@@ -248,7 +248,7 @@ def test_the_picture_is_the_sum_of_its_lights_in_the_order_of_objects_the_sky_la
     without = _lights(render_view(lit_scene(), SETTINGS))
     np.testing.assert_allclose(lights[:3].mean(axis=(1, 2)), without.mean(axis=(1, 2)), rtol=0.1)
     black = dataclasses.replace(lit_scene(), environment=constant(0.0))
-    assert len(_lights(render_view(black, SETTINGS))) == num_light_pictures(black) == 3
+    assert len(_lights(render_view(black, SETTINGS))) == len(light_sources(black)) == 3
 
 
 def test_doubling_one_light_doubles_its_picture_and_no_other() -> None:
@@ -295,7 +295,7 @@ def test_one_light_alone_is_the_picture_but_for_its_rounding() -> None:
     assert together.lights_rgb is None and together.light_floors is None
     separate = render_view(scene, SETTINGS)
     assert separate.light_floors is not None
-    assert [floor.log_db for floor in separate.light_floors] == [separate.noise_floor_db]
+    assert [floor.noise_floor_db for floor in separate.light_floors] == [separate.noise_floor_db]
     np.testing.assert_array_equal(separate.radiance_rgb, rounded_to_half(together.radiance_rgb))
     assert separate.noise_floor_db == together.noise_floor_db
 

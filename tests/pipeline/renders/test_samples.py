@@ -274,8 +274,12 @@ def test_a_bias_that_both_halves_share_is_stated() -> None:
     assert psnr_log_db(a.denoised_rgb, b.denoised_rgb) == MAX_DB, "the halves agree exactly"
     floor = floor_of(a, b, EVERYWHERE)
     # The allowances take off what one standard error and one pixel's surprise are: under 1 dB here.
-    assert psnr_log_db(flat, truth()) - 1 < floor.log_db < psnr_log_db(flat, truth())
-    assert psnr_linear_db(flat, truth()) - 1 < floor.linear_db < psnr_linear_db(flat, truth())
+    assert psnr_log_db(flat, truth()) - 1 < floor.noise_floor_db < psnr_log_db(flat, truth())
+    assert (
+        psnr_linear_db(flat, truth()) - 1
+        < floor.noise_floor_linear_db
+        < psnr_linear_db(flat, truth())
+    )
 
 
 def test_rare_light_that_one_half_found_is_allowed_for() -> None:
@@ -288,9 +292,11 @@ def test_rare_light_that_one_half_found_is_allowed_for() -> None:
     assert errors(found, missed, log10_radiance)[1].max() == pytest.approx(surprise)
     floor = floor_of(found, missed, EVERYWHERE)
     # What one half alone has cancels in the estimate: the allowance is all that is stated.
-    assert floor.log_db == pytest.approx(-10 * np.log10(surprise / PX**2), abs=0.1)
+    assert floor.noise_floor_db == pytest.approx(-10 * np.log10(surprise / PX**2), abs=0.1)
     both = floor_of(found, found, EVERYWHERE)
-    assert both.log_db < floor.log_db - 3, "light that both found is an error, and still a surprise"
+    assert both.noise_floor_db < floor.noise_floor_db - 3, (
+        "light that both found is an error, and still a surprise"
+    )
 
 
 def test_raw_halves_state_the_error_of_one_and_none_or_no_geometry_the_cap() -> None:
@@ -299,10 +305,10 @@ def test_raw_halves_state_the_error_of_one_and_none_or_no_geometry_the_cap() -> 
     a, b, calm = (Half(raw_rgb=picture, denoised_rgb=picture) for picture in (*raw, truth()))
     exact = psnr_log_db(raw[0], truth())
     # One standard error of 64 blocks more: 0.2 dB.
-    assert floor_of(a, b, EVERYWHERE).log_db == pytest.approx(exact, abs=0.4)
-    assert floor_of(calm, calm, EVERYWHERE).log_db == MAX_DB
+    assert floor_of(a, b, EVERYWHERE).noise_floor_db == pytest.approx(exact, abs=0.4)
+    assert floor_of(calm, calm, EVERYWHERE).noise_floor_db == MAX_DB
     a, b = half(rng), half(rng)
-    assert floor_of(a, b, ~EVERYWHERE).object_log_db == MAX_DB
+    assert floor_of(a, b, ~EVERYWHERE).object_noise_floor_db == MAX_DB
     assert floor_of(a, b, EVERYWHERE) == floor_of(b, a, EVERYWHERE)
 
 
@@ -316,8 +322,8 @@ def test_an_empty_background_earns_nothing() -> None:
         for each in inner
     )
     alone, floor = floor_of(*inner, EVERYWHERE), floor_of(framed, other, hits)
-    assert floor.object_log_db == pytest.approx(alone.log_db, abs=1e-9)
-    assert floor.log_db > alone.log_db + 3, "three quarters of the pixels are exact"
+    assert floor.object_noise_floor_db == pytest.approx(alone.noise_floor_db, abs=1e-9)
+    assert floor.noise_floor_db > alone.noise_floor_db + 3, "three quarters of the pixels are exact"
 
 
 class RareLight(HostTracer):

@@ -270,8 +270,8 @@ def test_light_that_is_not_there_is_exactly_nothing() -> None:
     np.testing.assert_array_equal(alone.parts_rgb["diffuse_direct"], alone.radiance_rgb)
     for name in ("diffuse_indirect", "specular_direct", "specular_indirect"):
         np.testing.assert_array_equal(alone.parts_rgb[name], 0)
-        assert alone.part_floors[name].log_db == MAX_DB
-    assert alone.part_floors["diffuse_direct"].log_db == alone.noise_floor_db < MAX_DB
+        assert alone.part_floors[name].noise_floor_db == MAX_DB
+    assert alone.part_floors["diffuse_direct"].noise_floor_db == alone.noise_floor_db < MAX_DB
     screen = np.array([[-3, 0, 0], [3, 0, 0], [3, 0, 9], [-3, 0, 9]])
     ceiling = np.array([[-3, -3, 9.5], [3, -3, 9.5], [3, 3, 9.5], [-3, 3, 9.5]])
     walls = [quad(corners, material(diffuse=0.8)) for corners in (screen, ceiling)]
@@ -318,7 +318,7 @@ def test_floors_of_parts_are_honest() -> None:
         for view in views:
             assert view.parts_rgb is not None and view.part_floors is not None
             true_db = psnr_log_db(view.parts_rgb[name], right)
-            too_good_db.append(view.part_floors[name].log_db - true_db)
+            too_good_db.append(view.part_floors[name].noise_floor_db - true_db)
         assert np.mean(too_good_db) < 0, name
         assert max(too_good_db) < 4, name
 

@@ -13,7 +13,7 @@ from pipeline.scenes.pieces import ScenePiece, Skin, shell_piece, surface_piece
 from pipeline.scenes.triangle_budget import FitTable, ObjectPool, PooledAsset, least_triangles
 from scene_templates.layout import ShellPart, SurfaceLook
 from scene_templates.rooms import PATCH_FACES, SIDES, patch
-from scene_templates.scene_maps import OwnMaps
+from scene_templates.scene_maps import UserMaps
 from scene_templates.settings import SceneSettings
 from storage.errors import Rejected
 from storage.records.asset import Asset, Level, LevelQuality, LevelRecord, SourceFacts
@@ -142,7 +142,7 @@ class ListPool(list[PooledAsset], ObjectPool):
 
 
 def composed(
-    settings: SceneSettings, pool: Sequence[PooledAsset], key: SceneKey, **user_maps: OwnMaps
+    settings: SceneSettings, pool: Sequence[PooledAsset], key: SceneKey, **user_maps: UserMaps
 ) -> Scene:
     """Return the scene of a key."""
     each = pool if isinstance(pool, ObjectPool) else ListPool(pool)

@@ -22,10 +22,10 @@ from scene_templates.skies.procedural_skies import (
     SkyDraws,
     SkyMapSettings,
     SkySettings,
+    SkyTexels,
     draw_sky,
     planckian_rgb,
 )
-from scene_templates.skies.texels import SkyTexels
 from storage.records.scene import Scene
 from storage.records.texture import Environment
 from storage.seeds import SceneKey, rng_for

@@ -241,16 +241,28 @@ def test_a_hostile_scene_file_is_one_line(
     assert str(caught.value).startswith("a.safetensors: ") and "\n" not in str(caught.value)
 
 
-def test_equal_members_give_equal_samples_with_and_without_what_is_held() -> None:
+@pytest.fixture
+def held(monkeypatch: pytest.MonkeyPatch) -> HeldMaps:
+    """Return what the process holds: nothing yet."""
+    held = HeldMaps()
+    monkeypatch.setattr(packed_maps, "_HELD", held)
+    return held
+
+
+def test_equal_members_give_equal_samples_with_and_without_what_is_held(
+    held: HeldMaps, monkeypatch: pytest.MonkeyPatch
+) -> None:
     """Another name and another turn of the same maps: both are the entry's, not the held one's."""
     turned = sky(rotation=np.array([[0, -1, 0], [1, 0, 0], [0, 0, 1]], np.float32), is_seen=True)
     renamed = dataclasses.replace(turned, source=MapSource(name="dusk", licence="CC-BY-4.0"))
     first = encode_sample(textured_sample(KEY))
     scene = textured_scene(environment=renamed)
     second = encode_sample(dataclasses.replace(textured_sample(KEY), scene=scene))
-    held = HeldMaps()
     for members in (first, second, first):
-        found, plain = decode_sample(KEY, members, held), decode_sample(KEY, members)
+        found = decode_sample(KEY, members)
+        with monkeypatch.context() as patch:
+            patch.setattr(packed_maps, "_HELD", HeldMaps())
+            plain = decode_sample(KEY, members)
         found.check()
         assert encode_sample(found) == encode_sample(plain) == members
         assert found.scene.environment is not None and plain.scene.environment is not None
@@ -258,12 +270,12 @@ def test_equal_members_give_equal_samples_with_and_without_what_is_held() -> Non
         assert found.scene.environment.is_seen == plain.scene.environment.is_seen
 
 
+@pytest.mark.usefixtures("held")
 def test_a_map_is_unpacked_once(monkeypatch: pytest.MonkeyPatch) -> None:
     members, values = encode_sample(textured_sample(KEY)), packed_maps._PackedMap.values
     unpack: Any = mock.create_autospec(values, side_effect=values)
     monkeypatch.setattr(packed_maps._PackedMap, "values", unpack)
-    held = HeldMaps()
-    scenes = [decode_sample(KEY, members, held).scene for _ in range(3)]
+    scenes = [decode_sample(KEY, members).scene for _ in range(3)]
     unpacked = [each.args[0].name for each in unpack.call_args_list]
     assert len(unpacked) == len(set(unpacked)) == 3
     one, other = scenes[0].textures[0], scenes[2].textures[0]
@@ -292,24 +304,24 @@ def test_memory_is_bounded_and_the_oldest_goes(monkeypatch: pytest.MonkeyPatch) 
     assert made[-2:] == [9, 9] and held.num_bytes <= 1000
 
 
+@pytest.mark.usefixtures("held")
 def test_what_is_refused_stays_refused() -> None:
     """A damaged copy of a held map, a held map under another name, and one of another kind."""
-    held = HeldMaps()
     members = encode_sample(textured_sample(KEY))
-    decode_sample(KEY, members, held)
+    decode_sample(KEY, members)
     name, other = map_member(colour_texture().sha256), map_member(sky().sha256)
     for wrong in (members[name][:-9], members[other], encode_sample(textured_sample(KEY, 1))):
         swapped = wrong if isinstance(wrong, bytes) else wrong[map_member(colour_texture(1).sha256)]
         for _ in range(2):
             with pytest.raises(TrilightError):
-                decode_sample(KEY, {**members, name: swapped}, held)
-    decode_sample(KEY, members, held)
+                decode_sample(KEY, {**members, name: swapped})
+    decode_sample(KEY, members)
 
 
-def test_threads_share_it() -> None:
-    members, held = encode_sample(textured_sample(KEY)), HeldMaps()
+def test_threads_share_it(held: HeldMaps) -> None:
+    members = encode_sample(textured_sample(KEY))
     with ThreadPoolExecutor(4) as pool:
-        found = list(pool.map(lambda _: decode_sample(KEY, members, held), range(16)))
+        found = list(pool.map(lambda _: decode_sample(KEY, members), range(16)))
     assert all(encode_sample(each) == members for each in found)
     assert held.num_bytes == sum(
         each.nbytes for each in (*(t.texels for t in found[0].scene.textures), sky().radiance_rgb)

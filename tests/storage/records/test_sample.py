@@ -34,7 +34,7 @@ from storage.records.lights import (
     MAX_LIGHTS,
     decode_parts_exr,
     encode_parts_exr,
-    num_light_pictures,
+    light_sources,
     num_lights,
     part_names,
     rounded_to_half,
@@ -350,7 +350,7 @@ def _lit_sample(**changes: Any) -> Sample:
 
 def test_a_sky_is_one_more_light_of_a_sample() -> None:
     scene = dataclasses.replace(_lit_sample().scene, environment=constant(0.5))
-    assert num_light_pictures(scene) == 3 and num_lights(scene) == 2
+    assert len(light_sources(scene)) == 3 and num_lights(scene) == 2
     lights = rounded_to_half(np.stack([_noise(3, *SIZE), _noise(3, *SIZE)]))
     pictures = np.stack([sum_of_lights(view) for view in lights])
     views = [dataclasses.replace(view, lights=(FLOOR,) * 3) for view in _lit_sample().views]
