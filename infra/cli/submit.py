@@ -1,9 +1,8 @@
 """`trilight submit`: runs `generate` by workers of a Prefect server, or as an array of tasks."""
 
 import shlex
-from collections.abc import Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import Annotated, Any
 
 from cyclopts import App, Group
 
@@ -34,11 +33,9 @@ from pipeline.flows.prefect_server import load_prefect
 from pipeline.generation.generate_options import GenerateOptions
 from storage.errors import TrilightError
 from storage.number_ranges import number_ranges
+from storage.remote.url import safe_text
 from storage.settings.described import checked
 from storage.settings.ranges import Within
-
-if TYPE_CHECKING:
-    from pipeline.flows.submission import RunStatus, SubmittedRun
 
 app = App(
     name="submit",
@@ -155,29 +152,40 @@ def _submit_flow(
 
     values = prefect.parameters(with_base_settings(options, base))
     with prefect.server() as client:
-        run = prefect.submit(client, flow, runs.deployment, values)
-        console.print(f"Run {run.name} of {run.deployment}: {run.page}", soft_wrap=True)
+        deployment = prefect.find_deployment(client, flow, runs.deployment)
+        name = f"{flow}/{deployment.name}"
+        run = client.create_flow_run_from_deployment(deployment.id, parameters=values)
+        page = prefect.page_of(client, run.id)
+        console.print(f"Run {run.name} of {name}: {page}", soft_wrap=True)
         ends = f"prefect flow-run cancel {run.id} ends it"
         console.print(f"Ctrl-C here leaves it running; {ends}", soft_wrap=True)
-        if not prefect.workers_online(client, run.pool):
-            start = f"prefect worker start --pool {run.pool}"
-            text = f"no worker of the pool {run.pool} is online, and the run waits for one"
-            note(f"{text}: {start}")
+        pool = deployment.work_pool_name or ""
+        if not prefect.workers_online(client, pool):
+            start = f"prefect worker start --pool {pool}"
+            note(f"no worker of the pool {pool} is online, and the run waits for one: {start}")
+        record: dict[str, Any] = {"flow_run": str(run.id), "deployment": name}
         if runs.no_watch:
-            print_json({"flow_run": str(run.id), "deployment": run.deployment})
+            print_json(record)
             return
-        last: RunStatus | None = None
+        shown = ""
         with Bars() as bars:
             bar = bars.add_task("percent", total=100, note="")
-            for look in prefect.poll_run(client, run.id):
-                if last is None or last.state != look.state:
-                    bars.console.print(look.state)
-                scenes = dict(look.tables.get("progress", ())).get("scenes in shards")
+            for state, percent, tables in prefect.poll_run(client, run.id):
+                if state.name and state.name != shown:
+                    shown = state.name
+                    bars.console.print(shown)
+                scenes = tables.get("progress", {}).get("scenes in shards")
                 text = f"scenes {scenes}" if scenes else ""
-                bars.update(bar, completed=round(look.percent), note=text)
-                last = look
-    assert last is not None  # a run has at least one look
-    _report(run, last, options.place)
+                bars.update(bar, completed=round(percent), note=text)
+    summary = tables.get("summary", {})
+    message = safe_text(state.message or "")
+    print_json({**record, "state": shown, "message": message, "summary": summary})
+    if not state.is_completed():
+        raise TrilightError(
+            f"{name}: the run ended as {shown}: {message.rstrip('.') or 'no reason given'}. Its "
+            f"log is at {page}; the same command goes on with what is missing."
+        )
+    print_rows(f"{name} finished", [*summary.items(), ("where", options.place)])
     if Path(options.place).is_dir():
         next_step(["verify", options.place], ["inspect", options.place])
 
@@ -220,23 +228,3 @@ def submit_to_array(
         return
     note("the same command submits again what is missing then, once no task is left in the queue")
     next_step(["status", options.place])
-
-
-def _report(run: "SubmittedRun", last: "RunStatus", where: str) -> None:
-    rows: Sequence[tuple[str, str]] = last.tables.get("summary", ())
-    print_json(
-        {
-            "flow_run": str(run.id),
-            "deployment": run.deployment,
-            "state": last.state,
-            "message": last.message,
-            "summary": dict(rows),
-        }
-    )
-    if not last.is_completed:
-        reason = last.message.rstrip(".") or "no reason given"
-        raise TrilightError(
-            f"{run.deployment}: the run ended as {last.state}: {reason}. Its log is "
-            f"at {run.page}; the same command goes on with what is missing."
-        )
-    print_rows(f"{run.deployment} finished", [*rows, ("where", where)])
