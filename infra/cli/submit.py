@@ -22,12 +22,8 @@ from pipeline.executors.slurm_and_kubernetes import (
     DatasetByArray,
     KubernetesOptions,
     array_job,
-    create_command,
-    sbatch_command,
-    sbatch_environment,
     submit_job,
     submit_slurm_array,
-    write_job_file,
 )
 from pipeline.flows.prefect_server import load_prefect
 from pipeline.generation.generate_options import GenerateOptions
@@ -206,17 +202,12 @@ def submit_to_array(
         return
     numbers = number_ranges(job.tasks)
     record: dict[str, Any] = {"array": numbers, "shards_per_task": job.per_task}
+    name: str | None
     if isinstance(scheduler, SlurmOptions):
-        name = None if array.dry_run else submit_slurm_array(job, scheduler.sbatch)
-        variables = sbatch_environment(job).items()
-        words = sbatch_command(job, scheduler.sbatch)
-        set_all = [f"{name}={shlex.quote(value)}" for name, value in variables]
-        # without the folder of the logs all tasks fail
-        line = " ".join(["mkdir -p logs &&", *set_all, shlex.join(words)])
+        name, line = submit_slurm_array(job, scheduler.sbatch, dry_run=array.dry_run)
     else:
-        manifest = (write_job_file if array.dry_run else submit_job)(job, scheduler)
+        manifest, words = submit_job(job, scheduler, dry_run=array.dry_run)
         name = manifest.parent.name
-        words = create_command(manifest)
         line = shlex.join(words)
         record |= {"files": [str(manifest)], "commands": [words], "submitted": not array.dry_run}
     print_json({"job": name, **record})

@@ -98,9 +98,9 @@ def make_by_array(**parameters: Any) -> None:
         )
         if job.tasks:
             name = (
-                submit_slurm_array(job)
+                submit_slurm_array(job)[0]
                 if on == "slurm"
-                else submit_job(job, options_from_environment()).parent.name
+                else submit_job(job, options_from_environment())[0].parent.name
             )
             get_run_logger().info(
                 "%s has %s: tasks %s of %d shards", on, name, number_ranges(job.tasks), job.per_task
