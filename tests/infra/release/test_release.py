@@ -71,7 +71,7 @@ def test_the_page_shows_everybody_and_opens_from_disk(tmp_path: Path) -> None:
     assert "network 29.5 28.0 1 sample, filtered 30.0 30.0 1 of 2" in text
     assert "traced, stated error 41.3 dB" in text
     assert not {"script", "link"} & set(tags.tags)
-    assert planned_upload(tmp_path, "ada/page").kind == "space"
+    assert planned_upload(tmp_path, "ada/page")[0] == "space"
     write_page(tmp_path, [beside("000000002", 28.0)], about=[])
     left = {path.name[:9] for path in (tmp_path / "pictures").iterdir()}
     assert left == {"000000002"}, "an earlier page's pictures would be uploaded too"
@@ -92,7 +92,7 @@ def test_a_network_that_is_released_opens(tmp_path: Path) -> None:
     _write_network(tmp_path)
     assert open_network(str(tmp_path)).config.view_stage == "hits"
     assert (tmp_path / "README.md").read_text().startswith("---\n")
-    assert planned_upload(tmp_path, "ada/network").kind == "model"
+    assert planned_upload(tmp_path, "ada/network")[0] == "model"
 
 
 @pytest.mark.usefixtures("bare_reports")
