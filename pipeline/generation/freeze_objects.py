@@ -383,7 +383,7 @@ def _prepare_maps(
     scenes = settings.scenes
     workers = available_cores()
     size = scenes.textures.surfaces.size if kind == TEXTURE else scenes.skies.maps.height
-    all_files = reach(files=(path for user_map in maps for path in user_map.files.values()))
+    all_files = reach(path for user_map in maps for path in user_map.files.values())
 
     def prepare(user_map: FoundMap) -> tuple[LockedObject, Path] | Failure:
         try:

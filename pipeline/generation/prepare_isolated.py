@@ -60,7 +60,7 @@ def mesh_stage(settings: AssetSettings, workers: int) -> Iterator[Prepare]:
 
     def prepare(records: list[ObjectRecord], done: Callable[[], None]) -> PrepareResult:
         paths = {path for one in records for path in (one.path, one.root) if path}
-        all_files = reach(files=map(Path, sorted(paths)))
+        all_files = reach(map(Path, sorted(paths)))
 
         @contextlib.contextmanager
         def borrow() -> Iterator[IsolatedChild]:

@@ -18,7 +18,7 @@ import sys
 import tempfile
 import threading
 import traceback
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass
 from multiprocessing.connection import Connection
 from multiprocessing.reduction import ForkingPickler
@@ -37,7 +37,14 @@ from pipeline.isolation.answers import (
     wait_forever,
 )
 from pipeline.isolation.call_failures import ChildFailed, Result, with_retries
-from pipeline.isolation.confinement import Reach, code_of, confine, should_confine
+from pipeline.isolation.confinement import (
+    Reach,
+    code_of,
+    confine,
+    covers,
+    merge_folders,
+    should_confine,
+)
 from storage.errors import EnvironmentFailure, Rejected, TrilightError
 from storage.extensions import load_same, loaded_files, mistake_in_extension
 from storage.installation import child_environment, order_installed_first
@@ -84,6 +91,7 @@ class IsolatedChild:
         factory: Callable[..., object] | None = None,
         args: tuple[Any, ...] = (),
         confined_to: Reach | None = None,
+        writes: Iterable[Path] = (),
     ) -> None:
         """Configure the child; the first call starts it.
 
@@ -91,8 +99,9 @@ class IsolatedChild:
             factory: an importable class or function that makes the object which a new child
                 holds, for `call_method`; it may also load a library.
             args: picklable arguments of `factory`.
-            confined_to: files that the child may use beside libraries, if the machine can confine
-                children; `may` adds to them. None for an unconfined child.
+            confined_to: files that the child may read beside libraries, if the machine can confine
+                children; `allow_files` adds to them. None for an unconfined child.
+            writes: existing folders in which a confined child may also read and write.
 
         Raises:
             TrilightError: TRILIGHT_CONFINE has an unknown value, or requires a missing feature.
@@ -104,16 +113,19 @@ class IsolatedChild:
         self._connection: Connection | None = None
         self._calls_left = 0
         self._closed = False
-        self._reach = confined_to if confined_to is not None and should_confine() else None
+        self._writes = frozenset(Path(path).resolve() for path in writes)
+        self._reach: Reach | None = None
+        if confined_to is not None and should_confine():
+            self._reach = confined_to | self._writes
         self._code = frozenset[Path]()
 
     def allow_files(self, more: Reach) -> None:
-        """Extend the files that a confined child may use; not while another thread calls.
+        """Extend the files that a confined child may read; not while another thread calls.
 
         A running child without that access is replaced: the kernel cannot loosen a confinement.
         """
-        if self._reach is not None and not self._reach.covers(more):
-            self._reach = self._reach.with_all_of(more)
+        if self._reach is not None and not covers(self._reach, more):
+            self._reach = merge_folders(self._reach | more)
             self.retire()
 
     def call(self, function: Callable[..., Result], *args: Any, of_held: bool = False) -> Result:
@@ -174,7 +186,7 @@ class IsolatedChild:
                 code = self._code | {Path(path).parent for path, _ in files}
                 if self._factory is not None:
                     code |= code_of(self._factory)
-                self._exchange(confine, (self._reach, code), _START_UP_S)
+                self._exchange(confine, (self._reach, self._writes, code), _START_UP_S)
             if files:  # first: the factory may use their definitions
                 self._exchange(load_same, (files,), _START_UP_S)
             if self._factory is not None:
