@@ -187,10 +187,6 @@ def _is_stopped(process_id: int) -> bool:
     return line.rpartition(")")[2].split()[0] == "T"
 
 
-class TooLong(Exception):
-    """A message claims to be longer than the memory that a child may have."""
-
-
 def send(file: int, parts: Sequence[bytes | memoryview], wait: Wait) -> None:
     """Write one message; raises OSError if the other side has ended."""
     table = np.array([len(parts), *map(len, parts)], _LENGTH).tobytes()
@@ -209,15 +205,17 @@ def receive(file: int, wait: Wait, most: int) -> list[NDArray[np.uint8]]:
 
     Raises:
         EOFError: the other side has ended.
-        TooLong: the message claims more bytes, or more parts than `MOST_PARTS`.
+        ChildFailed: `nonsense`, if the message claims more bytes, or more parts than `MOST_PARTS`.
         MemoryError: this process has no memory for it.
     """
     (count,) = _receive_bytes(file, _LENGTH.itemsize, wait).view(_LENGTH).tolist()
     if count > MOST_PARTS:
-        raise TooLong(f"{count} parts; expected at most {MOST_PARTS}")
+        said = f"{count} parts; expected at most {MOST_PARTS}"
+        raise ChildFailed("nonsense", f"its answer would have {said}")
     lengths = _receive_bytes(file, count * _LENGTH.itemsize, wait).view(_LENGTH).tolist()
     if sum(lengths) > most:
-        raise TooLong(f"{sum(lengths)} bytes; expected at most {most}")
+        said = f"{sum(lengths)} bytes; expected at most {most}"
+        raise ChildFailed("nonsense", f"its answer would have {said}")
     return [_receive_bytes(file, length, wait) for length in lengths]
 
 

@@ -28,7 +28,6 @@ from typing import Any
 
 from pipeline.isolation.answers import (
     CallTime,
-    TooLong,
     decode_answer,
     encode_error,
     encode_result,
@@ -222,8 +221,6 @@ class IsolatedChild:
             answer = receive(file, wait, min(self._limits.memory_bytes, _MOST_BYTES))
             result: Result = decode_answer(answer, function)
             return result
-        except TooLong as error:
-            raise ChildFailed("nonsense", f"its answer would have {error}") from error
         except MemoryError as error:
             raise ChildFailed("out_of_memory", "this process has no memory for the call") from error
         except (EOFError, OSError) as error:

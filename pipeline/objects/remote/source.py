@@ -6,6 +6,7 @@ file is not downloaded again. The files that a glTF names are downloaded with it
 or not at all. Nothing is written on the server.
 """
 
+import contextlib
 import dataclasses
 import errno
 import html
@@ -21,7 +22,7 @@ from urllib.parse import unquote
 
 from pipeline.foreign.gltf.document import read_container
 from pipeline.foreign.material_files import is_elsewhere
-from pipeline.objects.listing import CountDone, Fetched, Listing, fetch_all
+from pipeline.objects.listing import Listing, fetch_all
 from pipeline.objects.local.folder import (
     CATALOGUE_NAMES,
     list_files,
@@ -42,7 +43,6 @@ from storage.remote.transfers import (
     with_tries,
 )
 from storage.remote.url import RemoteUrl, printable, safe_url, shared_driver
-from storage.typed_json import read_json
 
 _MAX_NAME_BYTES = 220
 """File systems allow 255; the rest is for the name of an unfinished file."""
@@ -223,9 +223,10 @@ class RemoteFolder:
         version = version_of(facts)
         if size is not None:
             version["size"] = str(size)
+        record = json.dumps(version, sort_keys=True).encode()
         versions = self.files.parent / "versions"
         note = versions / f"{sha256_hex(os.fsencode(name))}.json"
-        if not version or not _is_here(path, note, version):
+        if not version or not _is_here(path, note, record, size):
             try:
                 with atomic_writer(path) as stream:
                     target = cast(BinaryIO, _StoppableStream(stream, self.stop))
@@ -235,7 +236,7 @@ class RemoteFolder:
                     message = f"the name {printable(name)[:100]!r} clashes with another one here"
                     raise TransferFailed("unsafe_name", message) from error
                 raise
-            write_atomically(note, json.dumps(version, sort_keys=True).encode())
+            write_atomically(note, record)
         return path
 
     def _check_size(self, size: int) -> None:
@@ -269,14 +270,10 @@ class _StoppableStream:
         return getattr(self._stream, name)
 
 
-def _is_here(path: Path, note: Path, version: dict[str, str]) -> bool:
-    try:
-        known = read_json(note.read_bytes(), dict[str, str], str(note))
-        return known == version and str(path.stat().st_size) == known.get(
-            "size", str(path.stat().st_size)
-        )
-    except (OSError, ValueError):
-        return False
+def _is_here(path: Path, note: Path, version: bytes, size: int | None) -> bool:
+    with contextlib.suppress(OSError):
+        return note.read_bytes() == version and size in (None, path.stat().st_size)
+    return False
 
 
 def buffer_names(path: Path, name: str) -> list[str]:
@@ -329,7 +326,17 @@ def list_remote(url: RemoteUrl, licence: str | None) -> Listing:
         listing = _list_object_files(folder, licence)
     else:
         listing = Listing(records=_list_catalogue(folder, catalogue))
-    return dataclasses.replace(listing, fetch=partial(_fetch, folder))
+
+    def fetch(record: ObjectRecord) -> Path:
+        name = folder.name_of(record)
+        try:
+            return folder.fetch_object(name)
+        except TransferFailed as error:
+            message = f"{folder.display_url(name)}: {error.message}"
+            raise TransferFailed(error.reason, message) from error
+
+    fetch_some = partial(fetch_all, fetch=fetch, cancel=folder.stop.set)
+    return dataclasses.replace(listing, fetch=fetch_some)
 
 
 def _list_catalogue(folder: RemoteFolder, catalogue: str) -> list[ObjectRecord]:
@@ -358,15 +365,3 @@ def _list_object_files(folder: RemoteFolder, licence: str | None) -> Listing:
         licence,
         lambda name: {"path": str(folder.path(name)), "source_url": folder.display_url(name)},
     )
-
-
-def _fetch(folder: RemoteFolder, records: list[ObjectRecord], downloaded: CountDone) -> Fetched:
-    def fetch(record: ObjectRecord) -> Path:
-        name = folder.name_of(record)
-        try:
-            return folder.fetch_object(name)
-        except TransferFailed as error:
-            message = f"{folder.display_url(name)}: {error.message}"
-            raise TransferFailed(error.reason, message) from error
-
-    return fetch_all(records, fetch, downloaded, folder.stop.set)
