@@ -22,7 +22,7 @@ from prefect.settings import PREFECT_API_URL, temporary_settings
 from prefect.states import Completed, Failed, Running, Scheduled, State
 
 from pipeline.flows import guarded_server
-from pipeline.flows.guarded_server import RequestGuard
+from pipeline.flows.guarded_server import guard_requests
 from pipeline.flows.prefect_flows import generate_scenes
 from pipeline.flows.prefect_server import (
     name_prefect_failures,
@@ -183,7 +183,8 @@ def _answer(kind: str = "http", **headers: str) -> list[MutableMapping[str, Any]
 
     raw = [(name.encode(), value.encode()) for name, value in headers.items()]
     scope = {"type": kind, "headers": raw, "path": "/api/deployments/filter"}
-    asyncio.run(RequestGuard(_application, ["server", "My-Host"])(scope, receive, send))
+    guarded: Any = guard_requests(_application, ["server", "My-Host"])
+    asyncio.run(guarded(scope, receive, send))
     return sent
 
 
