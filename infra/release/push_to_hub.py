@@ -123,7 +123,7 @@ def push(folder: Path, repository: str, kind: RepositoryKind, *, private: bool) 
             repo_type=kind,
             folder_path=folder,
             ignore_patterns=list(UNPUBLISHED),
-            commit_message=f"Upload of {len(list(published_files(folder)))} files",
+            commit_message=f"Upload of {len(published_files(folder))} files",
         )
     except TrilightError:
         raise
@@ -149,7 +149,7 @@ def require_within_limits(folder: Path) -> tuple[int, int]:
     Raises:
         TrilightError: the folder is empty, or exceeds the hub's limits.
     """
-    files = list(published_files(folder))
+    files = published_files(folder).values()
     sizes = {path: path.stat().st_size for path in files}
     entries = Counter(path.parent for path in files).most_common(1)
     largest = max(sizes, key=lambda path: sizes[path], default=None)

@@ -168,7 +168,7 @@ def test_the_hub_gets_every_file_and_reads_as_it_was(dataset: Dataset, tmp_path:
     assert said["address"] == f"{url}/datasets/ada/set"
     assert made[-1]["type"] == "dataset" and made[-1]["name"] == "set"
     root = dataset.folder.root
-    sent = {path.relative_to(root) for path in published_files(root)}
+    sent = set(map(Path, published_files(root)))
     assert said["files"] == len(sent)
     assert not any(path.parts[0] == "logs" for path in sent)
     for path in sent:
