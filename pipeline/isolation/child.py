@@ -38,7 +38,6 @@ from pipeline.isolation.answers import (
 from pipeline.isolation.call_failures import ChildFailed, Result, with_retries
 from pipeline.isolation.confinement import (
     Reach,
-    code_of,
     confine,
     covers,
     merge_folders,
@@ -116,7 +115,6 @@ class IsolatedChild:
         self._reach: Reach | None = None
         if confined_to is not None and should_confine():
             self._reach = confined_to | self._writes
-        self._code = frozenset[Path]()
 
     def allow_files(self, more: Reach) -> None:
         """Extend the files that a confined child may read; not while another thread calls.
@@ -141,9 +139,6 @@ class IsolatedChild:
         """
         if self._closed:
             raise ChildClosed
-        if self._reach is not None and not (code := code_of(function)) <= self._code:
-            self._code |= code
-            self.retire()
         try:
             if self._calls_left == 0:
                 try:
@@ -182,10 +177,8 @@ class IsolatedChild:
         try:
             files = loaded_files()
             if self._reach is not None:  # before it starts threads
-                code = self._code | {Path(path).parent for path, _ in files}
-                if self._factory is not None:
-                    code |= code_of(self._factory)
-                self._exchange(confine, (self._reach, self._writes, code), _START_UP_S)
+                extensions = {Path(path).parent for path, _ in files}
+                self._exchange(confine, (self._reach | extensions, self._writes), _START_UP_S)
             if files:  # first: the factory may use their definitions
                 self._exchange(load_same, (files,), _START_UP_S)
             if self._factory is not None:

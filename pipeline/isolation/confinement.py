@@ -11,7 +11,7 @@ import mimetypes
 import os
 import site
 import sys
-from collections.abc import Callable, Iterable
+from collections.abc import Iterable
 from pathlib import Path
 from typing import Literal, cast, get_args
 
@@ -113,21 +113,12 @@ def _warn(missing: str) -> None:
     )  # fmt: skip
 
 
-def code_of(*functions: Callable[..., object]) -> frozenset[Path]:
-    """Return the top-level packages or files that a child imports to call these functions."""
-    tops = (sys.modules.get(function.__module__.partition(".")[0]) for function in functions)
-    files = (getattr(top, "__file__", None) for top in tops)
-    paths = (Path(file).resolve() for file in files if file is not None)
-    return frozenset(path.parent if path.name == "__init__.py" else path for path in paths)
-
-
-def confine(reads: Reach, writes: Reach, code: frozenset[Path]) -> None:
+def confine(reads: Reach, writes: Reach) -> None:
     """Confine this process by all features that the kernel supports; it must have one thread.
 
     Args:
-        reads: user files that stay accessible.
+        reads: user files and extensions that stay accessible.
         writes: folders in which files may be written.
-        code: Python files and packages that the process has to load.
 
     Raises:
         EnvironmentFailure: the kernel refuses a feature that it reports.
@@ -139,9 +130,9 @@ def confine(reads: Reach, writes: Reach, code: frozenset[Path]) -> None:
         if landlock_version():
             packages = [FILES_ROOT / name for name in _OWN_PACKAGES]
             restrict_files(
-                reads=[*_libraries(), *packages, *code, *reads],
+                reads=[*_libraries(), *packages, *reads],
                 writes=[*(Path(sink) for sink in _SINKS), *writes],
-                lists=[FILES_ROOT, IMPORT_ROOT, *(path.parent for path in code)],
+                lists=[FILES_ROOT, IMPORT_ROOT],
             )
         if seccomp_works():
             refuse_calls()

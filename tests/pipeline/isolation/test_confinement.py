@@ -42,7 +42,8 @@ needs_seccomp = pytest.mark.skipif(not seccomp_works(), reason="no seccomp here"
 
 
 def confined(*allowed: Path, writes: Sequence[Path] = ()) -> IsolatedChild:
-    return IsolatedChild(limits=LIMITS, confined_to=reach(allowed), writes=writes)
+    code = ROOT / "tests"  # the functions that are called
+    return IsolatedChild(limits=LIMITS, confined_to=reach([code, *allowed]), writes=writes)
 
 
 @pytest.fixture(scope="module")
@@ -110,10 +111,11 @@ def test_each_wall_holds_what_the_page_says_of_it_and_no_more(place: Path) -> No
 
 
 TERMINAL = """
+import pathlib
 from pipeline.isolation import ChildLimits, IsolatedChild, reach
 from tests.pipeline.isolation import called, probes
 limits = ChildLimits(memory_bytes=2 << 30, wall_s=60, calls_per_child=9)
-child = IsolatedChild(limits=limits, confined_to=reach([]))
+child = IsolatedChild(limits=limits, confined_to=reach([pathlib.Path("tests")]))
 print("terminals:", child.call(probes.open_terminals))
 """
 
@@ -134,7 +136,7 @@ from pipeline.isolation import ChildLimits, IsolatedChild, reach
 from tests.pipeline.isolation import called, probes
 path = pathlib.Path(sys.argv[1])
 limits = ChildLimits(memory_bytes=2 << 30, wall_s=60, calls_per_child=9)
-files = reach([]) if len(sys.argv) > 2 else None
+files = reach([pathlib.Path("tests")]) if len(sys.argv) > 2 else None
 child = IsolatedChild(limits=limits, confined_to=files, writes=[path.parent])
 child.call(probes.stay, path, files is not None)
 """
