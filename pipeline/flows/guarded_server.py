@@ -48,7 +48,7 @@ def guard_requests(inner: "ASGIApp", names: Collection[str]) -> "ASGIApp":
     """
     ours = {"localhost", *(name.lower() for name in names)}
 
-    async def guarded(scope: "Scope", receive: "Receive", send: "Send") -> None:
+    async def serve_allowed(scope: "Scope", receive: "Receive", send: "Send") -> None:
         from starlette.responses import PlainTextResponse
         from starlette.websockets import WebSocketClose
 
@@ -65,7 +65,7 @@ def guard_requests(inner: "ASGIApp", names: Collection[str]) -> "ASGIApp":
             )
         await application(scope, receive, send_unframed)
 
-    return guarded
+    return serve_allowed
 
 
 def _refusal(headers: Collection[tuple[bytes, bytes]], ours: Collection[str]) -> str | None:
