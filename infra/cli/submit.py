@@ -163,23 +163,23 @@ def _submit_flow(
         if runs.no_watch:
             print_json(record)
             return
-        shown = ""
+        state_name = ""
         with Bars() as bars:
             bar = bars.add_task("percent", total=100, note="")
             for state, percent, tables in prefect.poll_run(client, run.id):
-                if state.name and state.name != shown:
-                    shown = state.name
-                    bars.console.print(shown)
+                if state.name and state.name != state_name:
+                    state_name = state.name
+                    bars.console.print(state_name)
                 scenes = tables.get("progress", {}).get("scenes in shards")
                 text = f"scenes {scenes}" if scenes else ""
                 bars.update(bar, completed=round(percent), note=text)
     summary = tables.get("summary", {})
     message = safe_text(state.message or "")
-    print_json({**record, "state": shown, "message": message, "summary": summary})
+    print_json({**record, "state": state_name, "message": message, "summary": summary})
     if not state.is_completed():
         raise TrilightError(
-            f"{name}: the run ended as {shown}: {message.rstrip('.') or 'no reason given'}. Its "
-            f"log is at {page}; the same command goes on with what is missing."
+            f"{name}: the run ended as {state_name}: {message.rstrip('.') or 'no reason given'}. "
+            f"Its log is at {page}; the same command goes on with what is missing."
         )
     print_rows(f"{name} finished", [*summary.items(), ("where", options.place)])
     if Path(options.place).is_dir():

@@ -128,21 +128,21 @@ def write_page(
     for old in sorted((folder / _PICTURES).glob("[0-9]" * 9 + "-*.png")):
         old.unlink()
     psnr_db: dict[str, list[float]] = {}
-    shown = []
+    rows = []
     for split, sample, pictures_rgb in scenes:
         for name, picture in pictures_rgb.items():
             psnr_db.setdefault(name, []).append(psnr_log_db(picture, sample.radiance_rgb[0]))
         last_db = {name: values[-1] for name, values in psnr_db.items()}
         template = sample.scene.provenance.get("template", "unknown")
         caption = f"{split}, {template}, {sample.scene.num_triangles} triangles"
-        shown.append((sample.key, caption, list(_pictures(folder, sample, pictures_rgb, last_db))))
+        rows.append((sample.key, caption, list(_pictures(folder, sample, pictures_rgb, last_db))))
     page = render_page(
         "release.html",
         _TITLE,
         explained=_EXPLAINED,
         about=about,
         medians=list(_medians(psnr_db)),
-        scenes=shown,
+        scenes=rows,
     )
     path = folder / "index.html"
     write_atomically(path, page)

@@ -128,14 +128,14 @@ def push(folder: Path, repository: str, kind: RepositoryKind, *, private: bool) 
     except TrilightError:
         raise
     except Exception as error:  # also of whichever HTTP library the package uses
-        refused = isinstance(error, HfHubHTTPError)
+        is_refusal = isinstance(error, HfHubHTTPError)
         status = getattr(getattr(error, "response", None), "status_code", 0)
-        if isinstance(error, LocalTokenNotFoundError) or (refused and status in (401, 403)):
+        if isinstance(error, LocalTokenNotFoundError) or (is_refusal and status in (401, 403)):
             raise TrilightError(
                 f"{repository}: the hub takes uploads from its owner alone; set HF_TOKEN to a "
                 "token that may write there, or run hf auth login."
             ) from error
-        what = "the hub refused" if refused else "the upload broke off"
+        what = "the hub refused" if is_refusal else "the upload broke off"
         said = (str(error).strip().splitlines() or [type(error).__name__])[0].rstrip(".")
         raise TrilightError(
             f"{repository}: {what} ({said}). What it has already is kept: run it again."
