@@ -33,10 +33,10 @@ from pipeline.isolation.answers import (
     encode_result,
     receive,
     send,
-    wait_forever,
 )
 from pipeline.isolation.call_failures import ChildFailed, Result, with_retries
 from pipeline.isolation.confinement import (
+    NO_FILES,
     Reach,
     confine,
     covers,
@@ -211,7 +211,7 @@ class IsolatedChild:
         wait = CallTime(self._process.pid, wall_s)
         try:
             send(file, [ForkingPickler.dumps((function, args, of_held))], wait)
-            answer = receive(file, wait, min(self._limits.memory_bytes, _MOST_BYTES))
+            answer = receive(file, min(self._limits.memory_bytes, _MOST_BYTES), wait)
             result: Result = decode_answer(answer, function)
             return result
         except MemoryError as error:
@@ -342,10 +342,12 @@ class ChildPool:
             self._free.put(child)
 
     @contextlib.contextmanager
-    def borrow(self) -> Iterator[IsolatedChild]:
-        """Lend a free child; wait while all are lent."""
+    def borrow(self, files: Reach = NO_FILES) -> Iterator[IsolatedChild]:
+        """Lend a free child that may read some files, too; wait while all are lent."""
         child = self._free.get()
         try:
+            if files:
+                child.allow_files(files)
             yield child
         finally:
             self._free.put(child)
@@ -410,7 +412,7 @@ def serve(connection: Connection, output: Connection, memory_bytes: int, cpu_s: 
     while True:
         try:
             # pickle: the child trusts its owner; the owner never unpickles a child's bytes
-            (message,) = receive(file, wait_forever, sys.maxsize)
+            (message,) = receive(file, sys.maxsize)
             function, args, of_held = ForkingPickler.loads(message.data)
         except EOFError:
             os._exit(0)  # the parent has died: skip the destructors of native libraries
@@ -419,7 +421,7 @@ def serve(connection: Connection, output: Connection, memory_bytes: int, cpu_s: 
             soft = math.ceil(used.ru_utime + used.ru_stime) + cpu_s
             hard = resource.getrlimit(resource.RLIMIT_CPU)[1]
             resource.setrlimit(resource.RLIMIT_CPU, (soft, hard))
-        send(file, _answer(function, (_held, *args) if of_held else args), wait_forever)
+        send(file, _answer(function, (_held, *args) if of_held else args))
 
 
 def _answer(function: Callable[..., Any], args: tuple[Any, ...]) -> list[bytes | memoryview]:
