@@ -55,13 +55,6 @@ class DatasetByArray(GenerateOptions):
     """Longest time without a new scene in hours, waiting in the queue included, after which the run
     fails; the array is left as it is."""
 
-    @property
-    def dataset(self) -> GenerateOptions:
-        """The options of the dataset alone, without those of the array."""
-        return GenerateOptions(
-            **{each.name: getattr(self, each.name) for each in dataclasses.fields(GenerateOptions)}
-        )
-
 
 @dataclass(frozen=True, kw_only=True)
 class ArrayJob:
@@ -114,8 +107,9 @@ def array_job(
             f"most {MAX_TASKS - 1}, which schedulers allow by default. {-(-planned // MAX_TASKS)}"
             " shards a task fit."
         )
-    options = dataclasses.replace(options, scenes=scenes, out=options.place, workers=None)
-    return ArrayJob(options=options, tasks=tasks, per_task=each, at_once=at_once)
+    fields = {name: getattr(options, name) for name in GenerateOptions.__dataclass_fields__}
+    dataset = GenerateOptions(**{**fields, "scenes": scenes, "out": options.place, "workers": None})
+    return ArrayJob(options=dataset, tasks=tasks, per_task=each, at_once=at_once)
 
 
 def _is_begun(folder: DatasetFolder) -> bool:

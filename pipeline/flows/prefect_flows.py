@@ -93,9 +93,7 @@ def make_by_array(**parameters: Any) -> None:
     options = options_of_form(parameters, DatasetByArray)
     page = RunPage(options.place)
     if (on := options.scheduler) != "none":
-        job = array_job(
-            options.dataset, per_task=options.shards_per_task, at_once=options.at_once, on=on
-        )
+        job = array_job(options, per_task=options.shards_per_task, at_once=options.at_once, on=on)
         if job.tasks:
             name = (
                 submit_slurm_array(job)[0]
