@@ -291,14 +291,10 @@ def buffer_names(path: Path, name: str) -> list[str]:
     except (OSError, Rejected):
         return []
     buffers = tree.get("buffers")
+    rows = [row for row in (buffers if isinstance(buffers, list) else ()) if isinstance(row, dict)]
+    inner = [_inner(row["uri"]) for row in rows if isinstance(row.get("uri"), str)]
     folder = posixpath.dirname(name)
-    names: dict[str, None] = {}
-    for buffer in buffers if isinstance(buffers, list) else ():
-        uri = buffer.get("uri") if isinstance(buffer, dict) else None
-        inner = _inner(uri) if isinstance(uri, str) else None
-        if inner is not None:
-            names[posixpath.join(folder, inner)] = None
-    return list(names)
+    return list(dict.fromkeys(posixpath.join(folder, each) for each in inner if each is not None))
 
 
 def _inner(uri: str) -> str | None:
@@ -321,11 +317,10 @@ def list_remote(url: RemoteUrl, licence: str | None) -> Listing:
             its catalogue is wrong, or there are a catalogue and a `licence`.
     """
     folder = RemoteFolder(url)
-    catalogue = only_catalogue(folder.has, licence)
-    if catalogue is None:
-        listing = _list_object_files(folder, licence)
+    if catalogue := only_catalogue(folder.has, licence):
+        listing = _list_catalogue(folder, catalogue)
     else:
-        listing = Listing(records=_list_catalogue(folder, catalogue))
+        listing = _list_object_files(folder, licence)
 
     def fetch(record: ObjectRecord) -> Path:
         name = folder.name_of(record)
@@ -339,17 +334,14 @@ def list_remote(url: RemoteUrl, licence: str | None) -> Listing:
     return dataclasses.replace(listing, fetch=fetch_some)
 
 
-def _list_catalogue(folder: RemoteFolder, catalogue: str) -> list[ObjectRecord]:
+def _list_catalogue(folder: RemoteFolder, catalogue: str) -> Listing:
     try:
         records = read_catalogue(folder.fetch(catalogue))
     except TransferFailed as error:
         raise unreadable(folder.url_of(catalogue), error) from error
-    return [
-        record
-        if record.source_url
-        else dataclasses.replace(record, source_url=folder.display_url(folder.name_of(record)))
-        for record in records
-    ]
+    urls = [record.source_url or folder.display_url(folder.name_of(record)) for record in records]
+    rows = zip(records, urls, strict=True)
+    return Listing(records=[dataclasses.replace(record, source_url=url) for record, url in rows])
 
 
 def _list_object_files(folder: RemoteFolder, licence: str | None) -> Listing:
