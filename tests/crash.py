@@ -1,4 +1,4 @@
-"""A crash of native code, for children that are confined: it imports nothing of the project."""
+"""A crash of native code, for children: it imports nothing of the project."""
 
 import os
 import signal

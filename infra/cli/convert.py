@@ -121,25 +121,27 @@ def push(options: PushOptions) -> None:
     from infra.release.push_to_hub import planned_upload
     from infra.release.push_to_hub import push as upload_all
 
-    upload = planned_upload(options.folder, options.repository)
+    folder = options.folder
+    repository = options.repository
+    kind, files, num_bytes = planned_upload(folder, repository)
     facts: dict[str, str | int] = {
-        "folder": str(upload.folder),
-        "repository": upload.repository,
-        "kind": upload.kind,
-        "files": upload.files,
-        "bytes": upload.num_bytes,
+        "folder": str(folder),
+        "repository": repository,
+        "kind": kind,
+        "files": files,
+        "bytes": num_bytes,
     }
     if not options.dry_run:
-        first_words(f"Uploading to {upload.repository}")
-        facts["address"] = upload_all(upload, private=options.private)
+        first_words(f"Uploading to {repository}")
+        facts["address"] = upload_all(folder, repository, kind, private=options.private)
     print_json(facts)
     rows = [(name, str(value)) for name, value in facts.items() if name != "bytes"]
     title = "Would be uploaded" if options.dry_run else "Uploaded"
-    print_rows(title, [*rows, ("size", f"{upload.num_bytes / 1e6:.1f} MB")])
+    print_rows(title, [*rows, ("size", f"{num_bytes / 1e6:.1f} MB")])
     if options.dry_run:
         private = ["--private"] if options.private else []
-        next_step(["push", str(options.folder), options.repository, *private])
-    elif upload.kind == "dataset":
-        next_step(["verify", f"hf://datasets/{upload.repository}"])
+        next_step(["push", str(folder), repository, *private])
+    elif kind == "dataset":
+        next_step(["verify", f"hf://datasets/{repository}"])
     else:
         suggest_look(f"Look at {facts['address']}")

@@ -1,9 +1,8 @@
 """`trilight submit`: runs `generate` by workers of a Prefect server, or as an array of tasks."""
 
 import shlex
-from collections.abc import Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import Annotated, Any
 
 from cyclopts import App, Group
 
@@ -23,22 +22,16 @@ from pipeline.executors.slurm_and_kubernetes import (
     DatasetByArray,
     KubernetesOptions,
     array_job,
-    create_command,
-    sbatch_command,
-    sbatch_environment,
     submit_job,
     submit_slurm_array,
-    write_job_file,
 )
 from pipeline.flows.prefect_server import load_prefect
 from pipeline.generation.generate_options import GenerateOptions
 from storage.errors import TrilightError
 from storage.number_ranges import number_ranges
+from storage.remote.url import safe_text
 from storage.settings.described import checked
 from storage.settings.ranges import Within
-
-if TYPE_CHECKING:
-    from pipeline.flows.submission import RunStatus, SubmittedRun
 
 app = App(
     name="submit",
@@ -155,29 +148,40 @@ def _submit_flow(
 
     values = prefect.parameters(with_base_settings(options, base))
     with prefect.server() as client:
-        run = prefect.submit(client, flow, runs.deployment, values)
-        console.print(f"Run {run.name} of {run.deployment}: {run.page}", soft_wrap=True)
+        deployment = prefect.find_deployment(client, flow, runs.deployment)
+        name = f"{flow}/{deployment.name}"
+        run = client.create_flow_run_from_deployment(deployment.id, parameters=values)
+        page = prefect.page_of(client, run.id)
+        console.print(f"Run {run.name} of {name}: {page}", soft_wrap=True)
         ends = f"prefect flow-run cancel {run.id} ends it"
         console.print(f"Ctrl-C here leaves it running; {ends}", soft_wrap=True)
-        if not prefect.workers_online(client, run.pool):
-            start = f"prefect worker start --pool {run.pool}"
-            text = f"no worker of the pool {run.pool} is online, and the run waits for one"
-            note(f"{text}: {start}")
+        pool = deployment.work_pool_name or ""
+        if not prefect.workers_online(client, pool):
+            start = f"prefect worker start --pool {pool}"
+            note(f"no worker of the pool {pool} is online, and the run waits for one: {start}")
+        record: dict[str, Any] = {"flow_run": str(run.id), "deployment": name}
         if runs.no_watch:
-            print_json({"flow_run": str(run.id), "deployment": run.deployment})
+            print_json(record)
             return
-        last: RunStatus | None = None
+        state_name = ""
         with Bars() as bars:
             bar = bars.add_task("percent", total=100, note="")
-            for look in prefect.poll_run(client, run.id):
-                if last is None or last.state != look.state:
-                    bars.console.print(look.state)
-                scenes = dict(look.tables.get("progress", ())).get("scenes in shards")
+            for state, percent, tables in prefect.poll_run(client, run.id):
+                if state.name and state.name != state_name:
+                    state_name = state.name
+                    bars.console.print(state_name)
+                scenes = tables.get("progress", {}).get("scenes in shards")
                 text = f"scenes {scenes}" if scenes else ""
-                bars.update(bar, completed=round(look.percent), note=text)
-                last = look
-    assert last is not None  # a run has at least one look
-    _report(run, last, options.place)
+                bars.update(bar, completed=round(percent), note=text)
+    summary = tables.get("summary", {})
+    message = safe_text(state.message or "")
+    print_json({**record, "state": state_name, "message": message, "summary": summary})
+    if not state.is_completed():
+        raise TrilightError(
+            f"{name}: the run ended as {state_name}: {message.rstrip('.') or 'no reason given'}. "
+            f"Its log is at {page}; the same command goes on with what is missing."
+        )
+    print_rows(f"{name} finished", [*summary.items(), ("where", options.place)])
     if Path(options.place).is_dir():
         next_step(["verify", options.place], ["inspect", options.place])
 
@@ -198,17 +202,12 @@ def submit_to_array(
         return
     numbers = number_ranges(job.tasks)
     record: dict[str, Any] = {"array": numbers, "shards_per_task": job.per_task}
+    name: str | None
     if isinstance(scheduler, SlurmOptions):
-        name = None if array.dry_run else submit_slurm_array(job, scheduler.sbatch)
-        variables = sbatch_environment(job).items()
-        words = sbatch_command(job, scheduler.sbatch)
-        set_all = [f"{name}={shlex.quote(value)}" for name, value in variables]
-        # without the folder of the logs all tasks fail
-        line = " ".join(["mkdir -p logs &&", *set_all, shlex.join(words)])
+        name, line = submit_slurm_array(job, scheduler.sbatch, dry_run=array.dry_run)
     else:
-        manifest = (write_job_file if array.dry_run else submit_job)(job, scheduler)
+        manifest, words = submit_job(job, scheduler, dry_run=array.dry_run)
         name = manifest.parent.name
-        words = create_command(manifest)
         line = shlex.join(words)
         record |= {"files": [str(manifest)], "commands": [words], "submitted": not array.dry_run}
     print_json({"job": name, **record})
@@ -220,23 +219,3 @@ def submit_to_array(
         return
     note("the same command submits again what is missing then, once no task is left in the queue")
     next_step(["status", options.place])
-
-
-def _report(run: "SubmittedRun", last: "RunStatus", where: str) -> None:
-    rows: Sequence[tuple[str, str]] = last.tables.get("summary", ())
-    print_json(
-        {
-            "flow_run": str(run.id),
-            "deployment": run.deployment,
-            "state": last.state,
-            "message": last.message,
-            "summary": dict(rows),
-        }
-    )
-    if not last.is_completed:
-        reason = last.message.rstrip(".") or "no reason given"
-        raise TrilightError(
-            f"{run.deployment}: the run ended as {last.state}: {reason}. Its log is "
-            f"at {run.page}; the same command goes on with what is missing."
-        )
-    print_rows(f"{run.deployment} finished", [*rows, ("where", where)])

@@ -9,8 +9,7 @@ traced, network, error and few samples side by side.
 
 import contextlib
 import shutil
-from collections.abc import Callable, Iterator, Mapping, Sequence
-from dataclasses import dataclass
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Annotated
 
@@ -39,6 +38,7 @@ from storage.errors import TrilightError
 from storage.markdown import front_matter
 from storage.metrics import psnr_log_db
 from storage.records.objects import read_objects_lock
+from storage.records.sample import Sample
 from storage.renderer import Camera, Renderer
 from train.evaluation.sheet import ERROR_WHITE, error_picture
 
@@ -67,15 +67,13 @@ def main(
     chosen = chosen_scenes(dataset, pictures)
     with Bars() as bars:
         task = bars.add_task("scenes", total=len(chosen), note="")
-        comparisons = list(
-            compare_scenes(dataset, chosen, checkpoint=_CHECKPOINT, done=lambda: bars.advance(task))
-        )
-    about = [
-        ("dataset", f"{dataset.manifest.build}, digest {dataset.digest}"),
-        ("network", _CHECKPOINT),
-        ("scenes", f"{len(comparisons)} of {dataset.manifest.num_samples}"),
-    ]
-    write_page(folder / "gallery", comparisons, about=about)
+        about = [
+            ("dataset", f"{dataset.manifest.build}, digest {dataset.digest}"),
+            ("network", _CHECKPOINT),
+            ("scenes", f"{len(chosen)} of {dataset.manifest.num_samples}"),
+        ]
+        scenes = compare_scenes(dataset, chosen, done=lambda: bars.advance(task))
+        write_page(folder / "gallery", scenes, about=about)
     _sum_and_say(folder)
 
 
@@ -112,42 +110,38 @@ RIVALS = (1, 4, 16)
 NETWORK = "network"
 
 
-@dataclass(frozen=True, kw_only=True, eq=False)
-class SceneComparison:
-    """First view of one scene, rendered by all methods."""
-
-    key: str
-    caption: str
-    """Split, layout and number of triangles as text."""
-    target_rgb: NDArray[np.float32]
-    """[R, R, 3] linear radiance of the dataset's picture."""
-    floor_db: float
-    """Stated error of the target as psnr_log_db."""
-    pictures_rgb: Mapping[str, NDArray[np.float32]]
-    """[R, R, 3] linear radiance by method."""
-    psnr_db: Mapping[str, float]
-    """psnr_log_db to the target by method."""
+ComparedScene = tuple[str, Sample, Mapping[str, NDArray[np.float32]]]
+"""Split and sample of a scene, and its first view as [R, R, 3] linear radiance by method."""
 
 
 def write_page(
-    folder: Path, comparisons: Sequence[SceneComparison], *, about: Sequence[tuple[str, str]]
+    folder: Path, scenes: Iterable[ComparedScene], *, about: Sequence[tuple[str, str]]
 ) -> Path:
     """Write `index.html`, its pictures and the README of a static space; return the page's path.
 
     Pictures of an earlier page, which would be uploaded, too, are deleted.
 
     Raises:
-        TrilightError: the folder cannot be written.
+        TrilightError: the folder cannot be written; or as `compare_scenes`.
     """
     for old in sorted((folder / _PICTURES).glob("[0-9]" * 9 + "-*.png")):
         old.unlink()
+    psnr_db: dict[str, list[float]] = {}
+    rows = []
+    for split, sample, pictures_rgb in scenes:
+        for name, picture in pictures_rgb.items():
+            psnr_db.setdefault(name, []).append(psnr_log_db(picture, sample.radiance_rgb[0]))
+        last_db = {name: values[-1] for name, values in psnr_db.items()}
+        template = sample.scene.provenance.get("template", "unknown")
+        caption = f"{split}, {template}, {sample.scene.num_triangles} triangles"
+        rows.append((sample.key, caption, list(_pictures(folder, sample, pictures_rgb, last_db))))
     page = render_page(
         "release.html",
         _TITLE,
         explained=_EXPLAINED,
         about=about,
-        medians=list(_medians(comparisons)),
-        scenes=[(each, list(_pictures(folder, each))) for each in comparisons],
+        medians=list(_medians(psnr_db)),
+        scenes=rows,
     )
     path = folder / "index.html"
     write_atomically(path, page)
@@ -163,29 +157,34 @@ _EXPLAINED = (
 )
 
 
-def _pictures(folder: Path, each: SceneComparison) -> Iterator[Figure]:
+def _pictures(
+    folder: Path,
+    sample: Sample,
+    pictures_rgb: Mapping[str, NDArray[np.float32]],
+    psnr_db: Mapping[str, float],
+) -> Iterator[Figure]:
     """Write the pictures of a scene, and yield them."""
-    error = error_picture(each.pictures_rgb[NETWORK], each.target_rgb)
-    pictures = [
-        ("traced", preview_srgb8(each.target_rgb), f"traced, stated error {each.floor_db:.1f} dB")
-    ]
-    for place, (name, radiance_rgb) in enumerate(each.pictures_rgb.items()):
-        caption = f"{name}, {each.psnr_db[name]:.1f} dB"
+    target = sample.radiance_rgb[0]
+    stated = f"traced, stated error {sample.views[0].noise_floor_db:.1f} dB"
+    pictures = [("traced", preview_srgb8(target), stated)]
+    for place, (name, radiance_rgb) in enumerate(pictures_rgb.items()):
+        caption = f"{name}, {psnr_db[name]:.1f} dB"
         pictures.append((str(place), preview_srgb8(radiance_rgb), caption))
         if name == NETWORK:
+            error = error_picture(radiance_rgb, target)
             pictures.append(("error", error, "error of the network"))
     for name, pixels, caption in pictures:
-        relative = f"{_PICTURES}/{each.key}-{name}.png"
+        relative = f"{_PICTURES}/{sample.key}-{name}.png"
         write_atomically(folder / relative, encode_png(pixels))
-        yield Figure(relative, f"{each.key}, {caption}", caption)
+        yield Figure(relative, f"{sample.key}, {caption}", caption)
 
 
-def _medians(comparisons: Sequence[SceneComparison]) -> Iterator[tuple[str, float, float, str]]:
+def _medians(psnr_db: Mapping[str, list[float]]) -> Iterator[tuple[str, float, float, str]]:
     """Yield each picture's name, median and worst PSNR, and how often it beats the network."""
-    for name in comparisons[0].psnr_db:
-        values = [each.psnr_db[name] for each in comparisons]
-        better = sum(each.psnr_db[name] > each.psnr_db[NETWORK] for each in comparisons)
-        beaten = "" if name == NETWORK else f"{better} of {len(comparisons)}"
+    network = psnr_db[NETWORK]
+    for name, values in psnr_db.items():
+        better = sum(one > other for one, other in zip(values, network, strict=True))
+        beaten = "" if name == NETWORK else f"{better} of {len(values)}"
         yield name, float(np.median(values)), min(values), beaten
 
 
@@ -206,12 +205,8 @@ def chosen_scenes(dataset: Dataset, count: int) -> list[tuple[ShardEntry, str]]:
 
 
 def compare_scenes(
-    dataset: Dataset,
-    chosen: Sequence[tuple[ShardEntry, str]],
-    *,
-    checkpoint: str,
-    done: Callable[[], None],
-) -> Iterator[SceneComparison]:
+    dataset: Dataset, chosen: Sequence[tuple[ShardEntry, str]], *, done: Callable[[], None]
+) -> Iterator[ComparedScene]:
     """Yield the comparison of each scene's first view.
 
     Raises:
@@ -224,27 +219,18 @@ def compare_scenes(
             if width not in by_width:
                 rivals = [PreviewSettings(resolution=width, spp=spp) for spp in RIVALS]
                 by_width[width] = [
-                    NetworkRenderer(name=NETWORK, checkpoint=checkpoint, resolution=width),
+                    NetworkRenderer(name=NETWORK, checkpoint=_CHECKPOINT, resolution=width),
                     *(
                         PathTracer(child, one, name=f"{samples_text(one.spp)}, filtered")
                         for one in rivals
                     ),
                 ]
             camera = Camera.of_scene(sample.scene, 0)
-            target = sample.radiance_rgb[0]
             pictures = {
                 each.name: each.load(sample.scene, sample.key).render(camera).radiance_rgb
                 for each in by_width[width]
             }
-            template = sample.scene.provenance.get("template", "unknown")
-            yield SceneComparison(
-                key=sample.key,
-                caption=f"{shard.split}, {template}, {sample.scene.num_triangles} triangles",
-                target_rgb=target,
-                floor_db=sample.views[0].noise_floor_db,
-                pictures_rgb=pictures,
-                psnr_db={name: psnr_log_db(picture, target) for name, picture in pictures.items()},
-            )
+            yield shard.split, sample, pictures
             done()
 
 

@@ -6,7 +6,6 @@ The hub's limits are from https://huggingface.co/docs/hub/storage-limits, "Repos
 
 import re
 from collections import Counter
-from dataclasses import dataclass
 from pathlib import Path
 from typing import Literal
 
@@ -23,10 +22,6 @@ _PART = r"(?!\S*(?:--|\.\.))\w(?:[\w.-]{0,94}\w)?"
 _REPOSITORY = re.compile(f"{_PART}/{_PART}", re.ASCII)
 """Names that huggingface_hub accepts; it would refuse others only later."""
 
-_NO_TOKEN = (
-    "{repository}: the hub takes uploads from its owner alone; set HF_TOKEN to a token that may "
-    "write there, or run hf auth login."
-)
 MOST_FILES = 100_000
 """Maximum number of files of a repository."""
 
@@ -35,19 +30,6 @@ MOST_ENTRIES = 10_000
 
 MOST_FILE_BYTES = 20_000_000_000
 """Maximum size of a file."""
-
-
-@dataclass(frozen=True, kw_only=True)
-class Upload:
-    """Planned upload of a folder."""
-
-    folder: Path
-    """Folder whose files are uploaded, except UNPUBLISHED ones."""
-    repository: str
-    """Name of the repository as USER/NAME."""
-    kind: RepositoryKind
-    files: int
-    num_bytes: int
 
 
 def kind_of(folder: Path) -> RepositoryKind:
@@ -65,8 +47,11 @@ def kind_of(folder: Path) -> RepositoryKind:
     )
 
 
-def planned_upload(folder: Path, repository: str) -> Upload:
-    """Return the planned upload of a folder, after checking the folder.
+def planned_upload(folder: Path, repository: str) -> tuple[RepositoryKind, int, int]:
+    """Return kind, files and bytes of the upload of a folder, after checking the folder.
+
+    Args:
+        repository: its name as USER/NAME.
 
     Raises:
         TrilightError: the repository's name is invalid, or the folder is no release: an unfinished
@@ -101,12 +86,11 @@ def planned_upload(folder: Path, repository: str) -> Upload:
             f"{folder / SUMS}: {stale[0]} is not as it says; expected sums of what is uploaded. "
             f"Delete {SUMS}, or write it again with make release."
         )
-    files, num_bytes = require_within_limits(folder)
-    return Upload(folder=folder, repository=repository, kind=kind, files=files, num_bytes=num_bytes)
+    return kind, *require_within_limits(folder)
 
 
-def push(upload: Upload, *, private: bool) -> str:
-    """Upload the files that a repository lacks, and return its URL.
+def push(folder: Path, repository: str, kind: RepositoryKind, *, private: bool) -> str:
+    """Upload the published files that a repository lacks, and return its URL.
 
     The token is that of HF_TOKEN or of `hf auth login`; the hub is HF_ENDPOINT or the usual one.
 
@@ -122,43 +106,41 @@ def push(upload: Upload, *, private: bool) -> str:
     hub = HfApi()
     try:
         made = hub.create_repo(
-            upload.repository,
-            repo_type=upload.kind,
+            repository,
+            repo_type=kind,
             private=private,
             exist_ok=True,
-            space_sdk="static" if upload.kind == "space" else None,
+            space_sdk="static" if kind == "space" else None,
         )
         # an existing repository is never changed
-        if private and not hub.repo_info(upload.repository, repo_type=upload.kind).private:
+        if private and not hub.repo_info(repository, repo_type=kind).private:
             raise TrilightError(
-                f"{upload.repository}: is there already and public; expected a private one. Make "
+                f"{repository}: is there already and public; expected a private one. Make "
                 "it private in its settings on the hub, or leave out --private."
             )
         hub.upload_folder(
-            repo_id=upload.repository,
-            repo_type=upload.kind,
-            folder_path=upload.folder,
+            repo_id=repository,
+            repo_type=kind,
+            folder_path=folder,
             ignore_patterns=list(UNPUBLISHED),
-            commit_message=f"Upload of {upload.files} files",
+            commit_message=f"Upload of {len(published_files(folder))} files",
         )
     except TrilightError:
         raise
-    except LocalTokenNotFoundError as error:
-        raise TrilightError(_NO_TOKEN.format(repository=upload.repository)) from error
-    except HfHubHTTPError as error:
-        if error.response is not None and error.response.status_code in (401, 403):
-            raise TrilightError(_NO_TOKEN.format(repository=upload.repository)) from error
-        raise _broken_off(upload, "the hub refused", error) from error
-    except Exception as error:  # of whichever HTTP library the package uses
-        raise _broken_off(upload, "the upload broke off", error) from error
+    except Exception as error:  # also of whichever HTTP library the package uses
+        is_refusal = isinstance(error, HfHubHTTPError)
+        status = getattr(getattr(error, "response", None), "status_code", 0)
+        if isinstance(error, LocalTokenNotFoundError) or (is_refusal and status in (401, 403)):
+            raise TrilightError(
+                f"{repository}: the hub takes uploads from its owner alone; set HF_TOKEN to a "
+                "token that may write there, or run hf auth login."
+            ) from error
+        what = "the hub refused" if is_refusal else "the upload broke off"
+        said = (str(error).strip().splitlines() or [type(error).__name__])[0].rstrip(".")
+        raise TrilightError(
+            f"{repository}: {what} ({said}). What it has already is kept: run it again."
+        ) from error
     return str(made.url)
-
-
-def _broken_off(upload: Upload, what: str, error: Exception) -> TrilightError:
-    said = (str(error).strip().splitlines() or [type(error).__name__])[0].rstrip(".")
-    return TrilightError(
-        f"{upload.repository}: {what} ({said}). What it has already is kept: run it again."
-    )
 
 
 def require_within_limits(folder: Path) -> tuple[int, int]:
@@ -167,7 +149,7 @@ def require_within_limits(folder: Path) -> tuple[int, int]:
     Raises:
         TrilightError: the folder is empty, or exceeds the hub's limits.
     """
-    files = list(published_files(folder))
+    files = published_files(folder).values()
     sizes = {path: path.stat().st_size for path in files}
     entries = Counter(path.parent for path in files).most_common(1)
     largest = max(sizes, key=lambda path: sizes[path], default=None)

@@ -146,7 +146,15 @@ def start(*, host: str, port: int, workers: int) -> str:
     shares = [_worker_environment(number, workers) for number in range(workers)]
     quiet_prefect()
     url = f"http://{'127.0.0.1' if host == '0.0.0.0' else host}:{port}/api"
-    environment = {**os.environ, **grant(url), **_shared_environment(host)}
+    environment = {**os.environ, **grant(url)}
+    environment |= {
+        _MARK: uuid.uuid4().hex,
+        NAMES: ",".join([host, socket.gethostname(), *os.environ.get(NAMES, "").split(",")]),
+        "TRILIGHT_CHECKOUT": str(ROOT),
+        "PREFECT_LOGGING_LEVEL": "INFO",
+        "PREFECT_SERVER_UI_SHOW_PROMOTIONAL_CONTENT": "false",
+    }
+    write_atomically(_mark_file(), environment[_MARK].encode())
     try:
         _say(f"starting Prefect's server at {url.removesuffix('/api')}; all takes about a minute")
         server = [*SERVER, "--host", host, "--port", str(port)]
@@ -166,20 +174,6 @@ def start(*, host: str, port: int, workers: int) -> str:
         stop()
         raise
     return url
-
-
-def _shared_environment(host: str) -> dict[str, str]:
-    """Return the environment variables of all processes, and write the mark file."""
-    mark = uuid.uuid4().hex
-    write_atomically(_mark_file(), mark.encode())
-    names = [host, socket.gethostname(), *os.environ.get(NAMES, "").split(",")]
-    return {
-        _MARK: mark,
-        NAMES: ",".join(names),
-        "TRILIGHT_CHECKOUT": str(ROOT),
-        "PREFECT_LOGGING_LEVEL": "INFO",
-        "PREFECT_SERVER_UI_SHOW_PROMOTIONAL_CONTENT": "false",
-    }
 
 
 def stop() -> int:

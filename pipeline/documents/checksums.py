@@ -4,7 +4,7 @@ Code that rewrites documents renews their lines. Lines of shards stay: a shard t
 must not get a new sum.
 """
 
-from collections.abc import Iterator, Mapping
+from collections.abc import Mapping
 from fnmatch import fnmatch
 from pathlib import Path
 from types import MappingProxyType
@@ -21,12 +21,15 @@ UNPUBLISHED = ("logs/*", ".staging/*", ".cache/*", "*.claim", "*.part", "*.tmp")
 _SHARD = ".tar"
 
 
-def published_files(folder: Path) -> Iterator[Path]:
-    """Yield the files of a folder that are published, in order."""
-    for path in sorted(folder.rglob("*")):
-        name = path.relative_to(folder).as_posix()
-        if path.is_file() and not any(fnmatch(name, pattern) for pattern in UNPUBLISHED):
-            yield path
+def published_files(folder: Path) -> dict[str, Path]:
+    """Return the files of a folder that are published, in order, by their names below it."""
+    every = sorted(path for path in folder.rglob("*") if path.is_file())
+    names = {path.relative_to(folder).as_posix(): path for path in every}
+    return {
+        name: path
+        for name, path in names.items()
+        if not any(fnmatch(name, pattern) for pattern in UNPUBLISHED)
+    }
 
 
 def write_sums(folder: Path, known: Mapping[str, str] = MappingProxyType({})) -> None:
@@ -35,8 +38,11 @@ def write_sums(folder: Path, known: Mapping[str, str] = MappingProxyType({})) ->
     Args:
         known: sums by name, which are not computed again.
     """
-    files = _files_by_name(folder)
-    lines = [f"{known.get(name) or sha256_of_file(files[name])}  {name}\n" for name in files]
+    lines = [
+        f"{known.get(name) or sha256_of_file(path)}  {name}\n"
+        for name, path in published_files(folder).items()
+        if name != SUMS
+    ]
     write_atomically(folder / SUMS, "".join(lines).encode())
 
 
@@ -60,21 +66,14 @@ def stale_sums(folder: Path) -> list[str]:
     if not (folder / SUMS).is_file():
         return []
     known = _read(folder)
-    files = _files_by_name(folder)
+    files = published_files(folder)
     return sorted(
         name
-        for name in known.keys() | files.keys()
+        for name in known.keys() | files.keys() - {SUMS}
         if name not in known
         or name not in files
         or (not name.endswith(_SHARD) and sha256_of_file(files[name]) != known[name])
     )
-
-
-def _files_by_name(folder: Path) -> dict[str, Path]:
-    """Return the files that have a sum, by name."""
-    files = {path.relative_to(folder).as_posix(): path for path in published_files(folder)}
-    files.pop(SUMS, None)
-    return files
 
 
 def _read(folder: Path) -> dict[str, str]:

@@ -225,21 +225,14 @@ def _colors(scene: Scene, row: int) -> NDArray[np.uint8]:
     return srgb8(scene.materials[used[:_MOST_SWATCHES], DIFFUSE])
 
 
-class ShownMap(NamedTuple):
-    """A texture or a sky, as a page shows it."""
+def shown_maps(scene: Scene) -> list[tuple[MapSource, str, str, Figure]]:
+    """Return the textures and the sky of a scene, if there are any.
 
-    source: MapSource
-    what: str
-    """Columns of the material that it gives, or whether cameras see the sky."""
-    size: str
-    """Width and height in texels."""
-    caption: str
-    picture: str | None
-    """Address of the picture; None beyond the most that are shown."""
-
-
-def shown_maps(scene: Scene) -> list[ShownMap]:
-    """Return the textures and the sky of a scene, if there are any."""
+    Returns:
+        The source of each; the columns of the material that it gives, or whether cameras see the
+        sky; its width and height in texels; and its picture, whose address is empty beyond the most
+        that are shown.
+    """
     maps = []
     for row, texture in enumerate(scene.textures):
         assert scene.material_textures is not None
@@ -248,9 +241,9 @@ def shown_maps(scene: Scene) -> list[ShownMap]:
         role = " and ".join(compress((*TEXTURED, NORMAL), used))
         name = texture.source.name
         caption = name if name.endswith(role) else f"{name} ({role})"
-        picture = png_uri(_texture_pixels(texture)) if row < _MOST_MAPS else None
-        size = _size(texture.texels)
-        maps.append(ShownMap(texture.source, f"texture: {role}", size, caption, picture))
+        picture = png_uri(_texture_pixels(texture)) if row < _MOST_MAPS else ""
+        figure = Figure(picture, caption, caption)
+        maps.append((texture.source, f"texture: {role}", _size(texture.texels), figure))
     if (sky := scene.environment) is not None:
         seen = "environment, seen" if sky.is_seen else "environment, hidden from cameras"
         facts = sky_facts(sky)
@@ -259,8 +252,8 @@ def shown_maps(scene: Scene) -> list[ShownMap]:
             f"{facts.peak:.3g} times that, half of the light from {facts.half_light_deg:.1f} "
             "degrees"
         )
-        picture = png_uri(_sky_pixels(sky, facts.mean_radiance))
-        maps.append(ShownMap(sky.source, seen, _size(sky.radiance_rgb), caption, picture))
+        figure = Figure(png_uri(_sky_pixels(sky, facts.mean_radiance)), caption, caption)
+        maps.append((sky.source, seen, _size(sky.radiance_rgb), figure))
     return maps
 
 

@@ -32,6 +32,7 @@ from pipeline.exchange.formats import (
 from pipeline.exchange.from_description import AlbedoOverOne, Cameras, LoadedMesh
 from pipeline.exchange.scene_files import load_mesh_file
 from pipeline.isolation import (
+    NO_FILES,
     ChildFailed,
     ChildLimits,
     IsolatedChild,
@@ -128,7 +129,7 @@ class SceneReader(contextlib.AbstractContextManager["SceneReader"]):
 
     def __init__(self, *, writes: Iterable[Path] = ()) -> None:
         """Create the reader, whose child may write into some folders; it starts with a call."""
-        self._child = IsolatedChild(limits=LIMITS, confined_to=reach(writes=writes))
+        self._child = IsolatedChild(limits=LIMITS, confined_to=NO_FILES, writes=writes)
 
     def scenes_of(self, source: SceneSource) -> list[SceneSource]:
         """Return a source for each scene of a file, in the order of the file.
@@ -206,7 +207,7 @@ class SceneReader(contextlib.AbstractContextManager["SceneReader"]):
         Raises:
             TrilightError: the file is not a usable mesh, or cannot be read.
         """
-        self._child.allow_files(reach(files=[path]))
+        self._child.allow_files(reach([path]))
         arguments = (path, path.name, path.name, AssetSettings(), licence)
         mesh = self.call(load_mesh_file, *arguments, name=path.name)
         if mesh.unread:
@@ -226,7 +227,7 @@ class SceneReader(contextlib.AbstractContextManager["SceneReader"]):
         Readers say the name alone, since others write what they say into datasets.
         """
         folders = [] if source.usd_folder is None else [source.usd_folder]
-        self._child.allow_files(reach(files=[source.path, *folders]))
+        self._child.allow_files(reach([source.path, *folders]))
         try:
             return self.call(function, source, *args, name=source.name)
         except TrilightError as error:

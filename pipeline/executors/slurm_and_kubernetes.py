@@ -12,6 +12,7 @@ with invalid options (exit status 2) fails at once. Finished indices are not run
 import dataclasses
 import json
 import os
+import shlex
 import shutil
 import subprocess
 import sys
@@ -53,13 +54,6 @@ class DatasetByArray(GenerateOptions):
     quiet_hours: Annotated[float, Within(0.0001, 1000.0, unit="hours")] = 6.0
     """Longest time without a new scene in hours, waiting in the queue included, after which the run
     fails; the array is left as it is."""
-
-    @property
-    def dataset(self) -> GenerateOptions:
-        """The options of the dataset alone, without those of the array."""
-        return GenerateOptions(
-            **{each.name: getattr(self, each.name) for each in dataclasses.fields(GenerateOptions)}
-        )
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -113,8 +107,9 @@ def array_job(
             f"most {MAX_TASKS - 1}, which schedulers allow by default. {-(-planned // MAX_TASKS)}"
             " shards a task fit."
         )
-    options = dataclasses.replace(options, scenes=scenes, out=options.place, workers=None)
-    return ArrayJob(options=options, tasks=tasks, per_task=each, at_once=at_once)
+    fields = {name: getattr(options, name) for name in GenerateOptions.__dataclass_fields__}
+    dataset = GenerateOptions(**{**fields, "scenes": scenes, "out": options.place, "workers": None})
+    return ArrayJob(options=dataset, tasks=tasks, per_task=each, at_once=at_once)
 
 
 def _is_begun(folder: DatasetFolder) -> bool:
@@ -125,18 +120,23 @@ SCRIPT = Path(__file__).parents[2] / "infra/slurm/generate.sbatch"
 _JOB = Path(__file__).parents[2] / "infra/kubernetes/array/job.yaml"
 
 
-def sbatch_command(job: ArrayJob, options: Sequence[str] = ()) -> list[str]:
-    """Return the command that submits an array, with further options of sbatch."""
+def submit_slurm_array(
+    job: ArrayJob, options: Sequence[str] = (), *, dry_run: bool = False
+) -> tuple[str | None, str]:
+    """Submit an array from the folder of this process, with further options of sbatch.
+
+    Returns:
+        The number of the array, None for a dry run; and a line of a shell that does the same.
+
+    Raises:
+        TrilightError: there is no sbatch here, or it refuses.
+    """
     limit = f"%{job.at_once}" if job.at_once else ""
     array = f"--array={number_ranges(job.tasks)}{limit}"
     rest = dataclasses.replace(job.options, scenes=None, objects=None)  # the script has these
     words = generate_words(rest)[2:]
-    return ["sbatch", "--parsable", array, *options, str(SCRIPT), *words]
-
-
-def sbatch_environment(job: ArrayJob) -> Mapping[str, str]:
-    """Return the environment variables that the script reads."""
-    return {
+    command = ["sbatch", "--parsable", array, *options, str(SCRIPT), *words]
+    variables = {
         "OUT": job.options.place,
         "BUILD": job.options.build,
         "SCENES": str(job.options.scenes),
@@ -144,18 +144,14 @@ def sbatch_environment(job: ArrayJob) -> Mapping[str, str]:
         "TRILIGHT": str(Path(sys.executable).with_name("trilight")),
         "OBJECTS": job.options.objects or "",  # also overrides a variable of this shell
     }
-
-
-def submit_slurm_array(job: ArrayJob, options: Sequence[str] = ()) -> str:
-    """Submit an array from the folder of this process and return its number.
-
-    Raises:
-        TrilightError: there is no sbatch here, or it refuses.
-    """
+    # without the folder of the logs all tasks fail
+    set_all = [f"{name}={shlex.quote(value)}" for name, value in variables.items()]
+    line = " ".join(["mkdir -p logs &&", *set_all, shlex.join(command)])
+    if dry_run:
+        return None, line
     _require_command("slurm", "sbatch", "a login node of a Slurm cluster")
-    Path("logs").mkdir(exist_ok=True)  # the script's tasks write their logs here
-    said = _submit("slurm", sbatch_command(job, options), sbatch_environment(job))
-    return said.strip().partition(";")[0]
+    Path("logs").mkdir(exist_ok=True)
+    return _submit("slurm", command, variables).strip().partition(";")[0], line
 
 
 def _require_command(on: str, command: str, expected: str) -> None:
@@ -228,36 +224,28 @@ def options_from_environment() -> KubernetesOptions:
     return from_record(KubernetesOptions, record)
 
 
-def write_job_file(job: ArrayJob, options: KubernetesOptions) -> Path:
-    """Write the manifest of a job, in a folder of its name, and return the file.
+def submit_job(
+    job: ArrayJob, options: KubernetesOptions, *, dry_run: bool = False
+) -> tuple[Path, list[str]]:
+    """Write the manifest of a job, in a folder of its name, and submit it unless `dry_run`.
+
+    Returns:
+        The file of the manifest, and the command that submits it.
 
     Raises:
-        TrilightError: a task would need a file of this machine, there is no image, or the folder
-            cannot be written.
+        TrilightError: as `job_manifest`; the folder cannot be written; there is no kubectl here, or
+            it refuses.
     """
     manifest = job_manifest(job, options)
     path = Path(options.files) / manifest["metadata"]["name"] / "job.yaml"
     write_atomically(path, yaml.safe_dump(manifest, sort_keys=False, width=100).encode())
-    return path
-
-
-def create_command(manifest: Path) -> list[str]:
-    """Return the command that submits a job, `kubectl` first."""
-    return ["kubectl", "create", "--filename", str(manifest)]
-
-
-def submit_job(job: ArrayJob, options: KubernetesOptions) -> Path:
-    """Submit a job and return its manifest.
-
-    Raises:
-        TrilightError: there is no kubectl here, or it refuses; or as `write_manifest`.
-    """
-    path = write_job_file(job, options)
-    expected = f"it installed and logged in. The manifest is written ({path})"
-    _require_command("kubernetes", "kubectl", expected)
-    hint = " Where a job of that name has ended, delete it, and submit again."
-    _submit("kubernetes", create_command(path), hint=hint)
-    return path
+    command = ["kubectl", "create", "--filename", str(path)]
+    if not dry_run:
+        expected = f"it installed and logged in. The manifest is written ({path})"
+        _require_command("kubernetes", command[0], expected)
+        hint = " Where a job of that name has ended, delete it, and submit again."
+        _submit("kubernetes", command, hint=hint)
+    return path, command
 
 
 def job_manifest(job: ArrayJob, options: KubernetesOptions) -> dict[str, Any]:

@@ -60,25 +60,23 @@ PLACE = "JOB_COMPLETION_INDEX"
 
 def make_slurm(options: GenerateOptions, address: str | None) -> Outcome:
     """Make the shards of a task of a Slurm array; raises as `shards_of_task` and `make_dataset`."""
-
-    def num_shards() -> int:
-        return prepare_dataset(options).publication.num_shards
-
-    return _make_part(options, "slurm", lambda: shards_of_task(os.environ, num_shards))
+    _require_whole(options, "slurm")
+    shards = shards_of_task(os.environ, lambda: prepare_dataset(options).publication.num_shards)
+    return make(dataclasses.replace(options, shards=shards), address)
 
 
 def make_kubernetes(options: GenerateOptions, address: str | None) -> Outcome:
     """Make the shards of a task of an indexed Job; as `shards_of_place` and `make_dataset`."""
-    return _make_part(options, "kubernetes", lambda: shards_of_place(os.environ))
+    _require_whole(options, "kubernetes")
+    return make(dataclasses.replace(options, shards=shards_of_place(os.environ)), address)
 
 
-def _make_part(options: GenerateOptions, runner: str, shards: Callable[[], str]) -> Outcome:
+def _require_whole(options: GenerateOptions, runner: str) -> None:
     if options.shards is not None:
         raise TrilightError(
             f"--range is {options.shards}; expected none with --runner {runner}: the task's place "
             "in the array says which shards are made. Omit one of the two."
         )
-    return make_dataset(dataclasses.replace(options, shards=shards()), ThreadRunner())
 
 
 def shards_of_task(environment: Mapping[str, str], num_shards: Callable[[], int]) -> str:

@@ -40,20 +40,15 @@ REQUEST_S = 15.0
 _UNFRAMED = (b"content-security-policy", b"frame-ancestors 'none'")
 
 
-class RequestGuard:
-    """An ASGI application that passes on allowed requests, and refuses all others."""
+def guard_requests(inner: "ASGIApp", names: Collection[str]) -> "ASGIApp":
+    """Return an ASGI application that passes on allowed requests, and refuses all others.
 
-    def __init__(self, inner: "ASGIApp", names: Collection[str]) -> None:
-        """Guard an application.
+    Args:
+        names: host names of this server, beside localhost and addresses.
+    """
+    ours = {"localhost", *(name.lower() for name in names)}
 
-        Args:
-            names: host names of this server, beside localhost and addresses.
-        """
-        self._inner = inner
-        self._names = {"localhost", *(name.lower() for name in names)}
-
-    async def __call__(self, scope: "Scope", receive: "Receive", send: "Send") -> None:
-        """Serve one connection, or refuse it."""
+    async def serve_allowed(scope: "Scope", receive: "Receive", send: "Send") -> None:
         from starlette.responses import PlainTextResponse
         from starlette.websockets import WebSocketClose
 
@@ -62,31 +57,35 @@ class RequestGuard:
                 message["headers"] = [*message.get("headers", ()), _UNFRAMED]
             await send(message)
 
-        application = self._inner
-        if scope["type"] != "lifespan" and (refusal := self._refusal(scope["headers"])):
+        application = inner
+        if scope["type"] != "lifespan" and (refusal := _refusal(scope["headers"], ours)):
             is_websocket = scope["type"] == "websocket"
             application = (
                 WebSocketClose(1008, refusal) if is_websocket else PlainTextResponse(refusal, 403)
             )
         await application(scope, receive, send_unframed)
 
-    def _refusal(self, headers: Collection[tuple[bytes, bytes]]) -> str | None:
-        """Return why a request is refused, or None."""
-        hosts, origins = (
-            [value.decode("latin-1").lower() for name, value in headers if name == header]
-            for header in (b"host", b"origin")
-        )
-        if len(hosts) != 1 or not self._is_ours(hosts[0]):
-            return f"this is no name of this server; set {NAMES} where it has others"
-        if any(origin.partition("://")[2] != hosts[0] for origin in origins):
-            return "pages of other origins are not answered"
-        return None
+    return serve_allowed
 
-    def _is_ours(self, host: str) -> bool:
-        with contextlib.suppress(ValueError):
-            name = urlsplit(f"//{host}").hostname or ""
-            return name in self._names or bool(ipaddress.ip_address(name))
-        return False
+
+def _refusal(headers: Collection[tuple[bytes, bytes]], ours: Collection[str]) -> str | None:
+    """Return why a request is refused, or None."""
+    hosts, origins = (
+        [value.decode("latin-1").lower() for name, value in headers if name == header]
+        for header in (b"host", b"origin")
+    )
+    if len(hosts) != 1 or not _is_ours(hosts[0], ours):
+        return f"this is no name of this server; set {NAMES} where it has others"
+    if any(origin.partition("://")[2] != hosts[0] for origin in origins):
+        return "pages of other origins are not answered"
+    return None
+
+
+def _is_ours(host: str, ours: Collection[str]) -> bool:
+    with contextlib.suppress(ValueError):
+        name = urlsplit(f"//{host}").hostname or ""
+        return name in ours or bool(ipaddress.ip_address(name))
+    return False
 
 
 def request_timeout_protocol() -> type[asyncio.Protocol]:
@@ -145,7 +144,7 @@ def serve(host: str, port: int) -> None:
 
     settings = get_current_settings()
     uvicorn.run(
-        RequestGuard(create_app(final=True), names),
+        guard_requests(create_app(final=True), names),
         http=request_timeout_protocol(),
         host=host,
         port=port,

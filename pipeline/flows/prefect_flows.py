@@ -93,14 +93,12 @@ def make_by_array(**parameters: Any) -> None:
     options = options_of_form(parameters, DatasetByArray)
     page = RunPage(options.place)
     if (on := options.scheduler) != "none":
-        job = array_job(
-            options.dataset, per_task=options.shards_per_task, at_once=options.at_once, on=on
-        )
+        job = array_job(options, per_task=options.shards_per_task, at_once=options.at_once, on=on)
         if job.tasks:
             name = (
-                submit_slurm_array(job)
+                submit_slurm_array(job)[0]
                 if on == "slurm"
-                else submit_job(job, options_from_environment()).parent.name
+                else submit_job(job, options_from_environment())[0].parent.name
             )
             get_run_logger().info(
                 "%s has %s: tasks %s of %d shards", on, name, number_ranges(job.tasks), job.per_task

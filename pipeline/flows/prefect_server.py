@@ -250,15 +250,13 @@ def wait_until_healthy(
     load_prefect()  # raises if a setting made the server fail
     lines = log.read_text(errors="replace").splitlines() if log.exists() else []
     said = safe_text(lines[-1]) if lines else "without a word"
-    if server.poll() is not None:
-        raise TrilightError(
-            f"Prefect: the server did not start: it ended ({said}); see {log}, and try "
-            "`trilight doctor`."
-        )
-    raise TrilightError(
-        f"Prefect: the server did not start: it did not answer within {_START_UP_S:.0f} s "
-        f"({said}); see {log}, and repeat the command when this machine is less busy."
+    ended = f"it ended ({said}); see {log}, and try `trilight doctor`."
+    silent = (
+        f"it did not answer within {_START_UP_S:.0f} s ({said}); see {log}, and repeat the command "
+        "when this machine is less busy."
     )
+    why = silent if server.poll() is None else ended
+    raise TrilightError(f"Prefect: the server did not start: {why}")
 
 
 def run_to_end(command: Sequence[str], say: Callable[[str], None]) -> tuple[int, str]:

@@ -106,10 +106,10 @@ class ObjectLock:
             writer.fetch_lock()
             if writer.frozen_objects() is None:
                 listed = self._list_source()
-                announce_objects(writer.folder, len(listed.allowed))
+                announce_objects(writer.folder, len(listed.records))
         if listed:  # together with the other workers, so without the lock
             index = writer.folder.staged_index
-            self._prepare(listed, listed.allowed, should_stop=lambda: writer.is_published(index))
+            self._prepare(listed, listed.records, should_stop=lambda: writer.is_published(index))
         with writer.hold_lock("objects"):  # one worker freezes, and the others load it
             return self.load() or self._freeze(
                 listed or self._list_source(), retry_transient=listed is None
@@ -145,7 +145,7 @@ class ObjectLock:
         folder = self.writer.folder
         frozen = self.writer.frozen_objects()
         maps = self.accept_maps()
-        selected = listed.allowed
+        selected = listed.records
         if frozen is not None:
             maps = replace(maps, rows=tuple(row for row in maps.rows if row[0].uid in frozen))
             of_maps = {uid: entry for uid, entry in frozen.items() if entry.kind != OBJECT}
@@ -157,12 +157,15 @@ class ObjectLock:
             announce_objects(folder, len(selected))
         prepared, rejected = self._prepare(listed, selected, retry_transient=retry_transient)
         lost = [failure for failure in rejected if failure.stage == "objects"]
-        listed.require_some(len(selected) - len(lost), [*listed.refused, *lost])
+        listed.require_some(len(selected) - len(lost), [*listed.failures, *lost])
         if frozen is not None:
             prepared = [one for one in prepared if one.record.uid in frozen]
             rejected = [failure for failure in rejected if failure.item in frozen]
         accepted = self.freeze_prepared(
-            prepared, [*listed.refused, *rejected], listed.num_found, maps
+            prepared,
+            [*listed.failures, *rejected],
+            len(listed.records) + len(listed.failures),
+            maps,
         )
         shutil.rmtree(folder.staged_batches, ignore_errors=True)
         return accepted
@@ -334,9 +337,7 @@ class ObjectLock:
         work = ObjectWork(
             settings=self.settings.mesh_settings,
             writer=self.writer,
-            fetch=None
-            if listed.listing.fetch is None
-            else lambda of_batch: listed.fetch(of_batch, announce),
+            fetch=listed.fetch and (lambda of_batch: listed.fetch(of_batch, announce)),
         )
         return prepare_in_batches(
             sorted(records, key=attrgetter("uid")),
@@ -383,7 +384,7 @@ def _prepare_maps(
     scenes = settings.scenes
     workers = available_cores()
     size = scenes.textures.surfaces.size if kind == TEXTURE else scenes.skies.maps.height
-    all_files = reach(files=(path for user_map in maps for path in user_map.files.values()))
+    all_files = reach(path for user_map in maps for path in user_map.files.values())
 
     def prepare(user_map: FoundMap) -> tuple[LockedObject, Path] | Failure:
         try:

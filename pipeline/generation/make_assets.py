@@ -241,7 +241,7 @@ def _pairs(
         for name, indices in groups.items():
             for i in indices:
                 path = prepared[i].record.path
-                child.allow_files(reach(files=[Path(path)]))
+                child.allow_files(reach([Path(path)]))
                 with contextlib.suppress(ChildFailed):  # a missing picture must not stop the run
                     source, result = call_with_retries(
                         child, preview_source_and_level, path, settings, levels[i], _WIDTH_PX

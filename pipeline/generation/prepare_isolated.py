@@ -3,6 +3,7 @@
 import contextlib
 import json
 from collections.abc import Callable, Iterator, Mapping
+from functools import partial
 from pathlib import Path
 
 from pipeline.assets.asset_store import AssetStore
@@ -60,14 +61,8 @@ def mesh_stage(settings: AssetSettings, workers: int) -> Iterator[Prepare]:
 
     def prepare(records: list[ObjectRecord], done: Callable[[], None]) -> PrepareResult:
         paths = {path for one in records for path in (one.path, one.root) if path}
-        all_files = reach(files=map(Path, sorted(paths)))
-
-        @contextlib.contextmanager
-        def borrow() -> Iterator[IsolatedChild]:
-            with pool.borrow() as child:
-                child.allow_files(all_files)  # all files at once: each new file replaces the child
-                yield child
-
+        # all files at once: each new file replaces the child
+        borrow = partial(pool.borrow, reach(map(Path, sorted(paths))))
         return prepare_assets(
             records, settings, asset_store(), borrow_child=borrow, workers=workers, done=done
         )

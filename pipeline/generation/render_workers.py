@@ -46,7 +46,7 @@ class _JobChildren:
         self.renderers = _render_pool(job)
         self.readers: ChildPool | None = None
         if isinstance(files := job.accepted.origin, SceneFiles):
-            folder = reach(files=[files.root])
+            folder = reach([files.root])
             self.readers = ChildPool(lambda _: asset_child(folder), job.num_at_once)
 
     def close(self) -> None:

@@ -351,7 +351,7 @@ def _build_all(
     sha256: dict[str, str] = {}
     notes: list[str] = []
     unusable = dict(folder.unusable)
-    with contextlib.closing(asset_child(reach(files=[folder.root]))) as child:
+    with contextlib.closing(asset_child(reach([folder.root]))) as child:
         for name in folder.names:
             if name not in unusable:
                 try:

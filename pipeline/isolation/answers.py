@@ -128,12 +128,9 @@ LOOKS_BEFORE_KILL = 60
 _LENGTH = np.dtype("<u8")
 MOST_PARTS = 1 << 17
 
-Wait = Callable[[int, int], None]
-"""Waits until a file can be read or written: takes its number and an event of `select.poll`."""
-
-
-def wait_forever(file: int, event: int) -> None:
-    """Return at once: reads and writes of a blocking file wait by themselves."""
+Wait = Callable[[int, int], None] | None
+"""Waits until a file can be read or written: takes its number and an event of `select.poll`. None
+is for a blocking file, whose reads and writes wait by themselves."""
 
 
 class CallTime:
@@ -187,21 +184,18 @@ def _is_stopped(process_id: int) -> bool:
     return line.rpartition(")")[2].split()[0] == "T"
 
 
-class TooLong(Exception):
-    """A message claims to be longer than the memory that a child may have."""
-
-
-def send(file: int, parts: Sequence[bytes | memoryview], wait: Wait) -> None:
+def send(file: int, parts: Sequence[bytes | memoryview], wait: Wait = None) -> None:
     """Write one message; raises OSError if the other side has ended."""
     table = np.array([len(parts), *map(len, parts)], _LENGTH).tobytes()
     for part in (table, *parts):
         view = memoryview(part)
         while view:
-            wait(file, select.POLLOUT)
+            if wait:
+                wait(file, select.POLLOUT)
             view = view[os.write(file, view) :]
 
 
-def receive(file: int, wait: Wait, most: int) -> list[NDArray[np.uint8]]:
+def receive(file: int, most: int, wait: Wait = None) -> list[NDArray[np.uint8]]:
     """Return the parts of one message, each in memory of its own.
 
     Args:
@@ -209,15 +203,17 @@ def receive(file: int, wait: Wait, most: int) -> list[NDArray[np.uint8]]:
 
     Raises:
         EOFError: the other side has ended.
-        TooLong: the message claims more bytes, or more parts than `MOST_PARTS`.
+        ChildFailed: `nonsense`, if the message claims more bytes, or more parts than `MOST_PARTS`.
         MemoryError: this process has no memory for it.
     """
     (count,) = _receive_bytes(file, _LENGTH.itemsize, wait).view(_LENGTH).tolist()
     if count > MOST_PARTS:
-        raise TooLong(f"{count} parts; expected at most {MOST_PARTS}")
+        said = f"{count} parts; expected at most {MOST_PARTS}"
+        raise ChildFailed("nonsense", f"its answer would have {said}")
     lengths = _receive_bytes(file, count * _LENGTH.itemsize, wait).view(_LENGTH).tolist()
     if sum(lengths) > most:
-        raise TooLong(f"{sum(lengths)} bytes; expected at most {most}")
+        said = f"{sum(lengths)} bytes; expected at most {most}"
+        raise ChildFailed("nonsense", f"its answer would have {said}")
     return [_receive_bytes(file, length, wait) for length in lengths]
 
 
@@ -225,7 +221,8 @@ def _receive_bytes(file: int, count: int, wait: Wait) -> NDArray[np.uint8]:
     data = np.zeros(count, np.uint8)  # lazy: memory is used only as it is filled
     rest = data.data
     while rest:
-        wait(file, select.POLLIN)
+        if wait:
+            wait(file, select.POLLIN)
         read = os.readv(file, [rest])
         if not read:
             raise EOFError

@@ -18,7 +18,7 @@ import sys
 import tempfile
 import threading
 import traceback
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass
 from multiprocessing.connection import Connection
 from multiprocessing.reduction import ForkingPickler
@@ -28,16 +28,21 @@ from typing import Any
 
 from pipeline.isolation.answers import (
     CallTime,
-    TooLong,
     decode_answer,
     encode_error,
     encode_result,
     receive,
     send,
-    wait_forever,
 )
 from pipeline.isolation.call_failures import ChildFailed, Result, with_retries
-from pipeline.isolation.confinement import Reach, code_of, confine, should_confine
+from pipeline.isolation.confinement import (
+    NO_FILES,
+    Reach,
+    confine,
+    covers,
+    merge_folders,
+    should_confine,
+)
 from storage.errors import EnvironmentFailure, Rejected, TrilightError
 from storage.extensions import load_same, loaded_files, mistake_in_extension
 from storage.installation import child_environment, order_installed_first
@@ -84,6 +89,7 @@ class IsolatedChild:
         factory: Callable[..., object] | None = None,
         args: tuple[Any, ...] = (),
         confined_to: Reach | None = None,
+        writes: Iterable[Path] = (),
     ) -> None:
         """Configure the child; the first call starts it.
 
@@ -91,8 +97,9 @@ class IsolatedChild:
             factory: an importable class or function that makes the object which a new child
                 holds, for `call_method`; it may also load a library.
             args: picklable arguments of `factory`.
-            confined_to: files that the child may use beside libraries, if the machine can confine
-                children; `may` adds to them. None for an unconfined child.
+            confined_to: files that the child may read beside libraries, if the machine can confine
+                children; `allow_files` adds to them. None for an unconfined child.
+            writes: existing folders in which a confined child may also read and write.
 
         Raises:
             TrilightError: TRILIGHT_CONFINE has an unknown value, or requires a missing feature.
@@ -104,16 +111,18 @@ class IsolatedChild:
         self._connection: Connection | None = None
         self._calls_left = 0
         self._closed = False
-        self._reach = confined_to if confined_to is not None and should_confine() else None
-        self._code = frozenset[Path]()
+        self._writes = frozenset(Path(path).resolve() for path in writes)
+        self._reach: Reach | None = None
+        if confined_to is not None and should_confine():
+            self._reach = confined_to | self._writes
 
     def allow_files(self, more: Reach) -> None:
-        """Extend the files that a confined child may use; not while another thread calls.
+        """Extend the files that a confined child may read; not while another thread calls.
 
         A running child without that access is replaced: the kernel cannot loosen a confinement.
         """
-        if self._reach is not None and not self._reach.covers(more):
-            self._reach = self._reach.with_all_of(more)
+        if self._reach is not None and not covers(self._reach, more):
+            self._reach = merge_folders(self._reach | more)
             self.retire()
 
     def call(self, function: Callable[..., Result], *args: Any, of_held: bool = False) -> Result:
@@ -130,9 +139,6 @@ class IsolatedChild:
         """
         if self._closed:
             raise ChildClosed
-        if self._reach is not None and not (code := code_of(function)) <= self._code:
-            self._code |= code
-            self.retire()
         try:
             if self._calls_left == 0:
                 try:
@@ -171,10 +177,8 @@ class IsolatedChild:
         try:
             files = loaded_files()
             if self._reach is not None:  # before it starts threads
-                code = self._code | {Path(path).parent for path, _ in files}
-                if self._factory is not None:
-                    code |= code_of(self._factory)
-                self._exchange(confine, (self._reach, code), _START_UP_S)
+                extensions = {Path(path).parent for path, _ in files}
+                self._exchange(confine, (self._reach | extensions, self._writes), _START_UP_S)
             if files:  # first: the factory may use their definitions
                 self._exchange(load_same, (files,), _START_UP_S)
             if self._factory is not None:
@@ -207,11 +211,9 @@ class IsolatedChild:
         wait = CallTime(self._process.pid, wall_s)
         try:
             send(file, [ForkingPickler.dumps((function, args, of_held))], wait)
-            answer = receive(file, wait, min(self._limits.memory_bytes, _MOST_BYTES))
+            answer = receive(file, min(self._limits.memory_bytes, _MOST_BYTES), wait)
             result: Result = decode_answer(answer, function)
             return result
-        except TooLong as error:
-            raise ChildFailed("nonsense", f"its answer would have {error}") from error
         except MemoryError as error:
             raise ChildFailed("out_of_memory", "this process has no memory for the call") from error
         except (EOFError, OSError) as error:
@@ -340,10 +342,12 @@ class ChildPool:
             self._free.put(child)
 
     @contextlib.contextmanager
-    def borrow(self) -> Iterator[IsolatedChild]:
-        """Lend a free child; wait while all are lent."""
+    def borrow(self, files: Reach = NO_FILES) -> Iterator[IsolatedChild]:
+        """Lend a free child that may read some files, too; wait while all are lent."""
         child = self._free.get()
         try:
+            if files:
+                child.allow_files(files)
             yield child
         finally:
             self._free.put(child)
@@ -408,7 +412,7 @@ def serve(connection: Connection, output: Connection, memory_bytes: int, cpu_s: 
     while True:
         try:
             # pickle: the child trusts its owner; the owner never unpickles a child's bytes
-            (message,) = receive(file, wait_forever, sys.maxsize)
+            (message,) = receive(file, sys.maxsize)
             function, args, of_held = ForkingPickler.loads(message.data)
         except EOFError:
             os._exit(0)  # the parent has died: skip the destructors of native libraries
@@ -417,7 +421,7 @@ def serve(connection: Connection, output: Connection, memory_bytes: int, cpu_s: 
             soft = math.ceil(used.ru_utime + used.ru_stime) + cpu_s
             hard = resource.getrlimit(resource.RLIMIT_CPU)[1]
             resource.setrlimit(resource.RLIMIT_CPU, (soft, hard))
-        send(file, _answer(function, (_held, *args) if of_held else args), wait_forever)
+        send(file, _answer(function, (_held, *args) if of_held else args))
 
 
 def _answer(function: Callable[..., Any], args: tuple[Any, ...]) -> list[bytes | memoryview]:

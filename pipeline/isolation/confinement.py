@@ -11,8 +11,7 @@ import mimetypes
 import os
 import site
 import sys
-from collections.abc import Callable, Iterable
-from dataclasses import dataclass
+from collections.abc import Iterable
 from pathlib import Path
 from typing import Literal, cast, get_args
 
@@ -45,37 +44,16 @@ _SYSTEM = (
 _SINKS = ("/dev/null", "/dev/zero")
 
 
-@dataclass(frozen=True, kw_only=True)
-class Reach:
-    """User files that a confined child may use; all paths are absolute, without links."""
-
-    reads: frozenset[Path] = frozenset()
-    """Files and folders that the child may read."""
-    writes: frozenset[Path] = frozenset()
-    """Folders that the child may read and write."""
-
-    def covers(self, other: "Reach") -> bool:
-        """Return True if this reach includes all files of another."""
-        return _all_below(other.writes, self.writes) and _all_below(
-            other.reads, self.reads | self.writes
-        )
-
-    def with_all_of(self, other: "Reach") -> "Reach":
-        """Return the union of two reaches, merged to parent folders if there are very many."""
-        writes = self.writes | other.writes
-        return Reach(reads=_merge_folders(self.reads | other.reads), writes=writes)
+Reach = frozenset[Path]
+"""User files and folders that a confined child may read; absolute paths without links."""
+NO_FILES: Reach = frozenset()
 
 
-NO_FILES = Reach()
+def reach(files: Iterable[Path]) -> Reach:
+    """Return the reach of a child that reads some files or folders.
 
-
-def reach(*, files: Iterable[Path] = (), writes: Iterable[Path] = ()) -> Reach:
-    """Return the reach of a child that reads some files with their folders, and writes others.
-
-    Args:
-        files: files or folders to read. A file's folder is included: meshes and scenes refer to
-            their textures, and never to files above or beside their folder.
-        writes: existing folders to write.
+    A file's folder is included: meshes and scenes refer to their textures, and never to files above
+    or beside their folder. Very many folders are merged to their parent folders.
     """
     folders: set[Path] = set()
     for path in files:
@@ -84,9 +62,12 @@ def reach(*, files: Iterable[Path] = (), writes: Iterable[Path] = ()) -> Reach:
             folders.add(absolute.resolve())
         else:  # also a link's target: USD resolves paths from its folder
             folders |= {absolute.parent.resolve(), absolute.resolve().parent}
-    return Reach(
-        reads=_merge_folders(folders), writes=frozenset(Path(path).resolve() for path in writes)
-    )
+    return merge_folders(folders)
+
+
+def covers(allowed: Reach, more: Reach) -> bool:
+    """Return True if a reach includes all files of another one."""
+    return all(path in allowed or not allowed.isdisjoint(path.parents) for path in more)
 
 
 def confinement_mode() -> Mode:
@@ -132,20 +113,12 @@ def _warn(missing: str) -> None:
     )  # fmt: skip
 
 
-def code_of(*functions: Callable[..., object]) -> frozenset[Path]:
-    """Return the top-level packages or files that a child imports to call these functions."""
-    tops = (sys.modules.get(function.__module__.partition(".")[0]) for function in functions)
-    files = (getattr(top, "__file__", None) for top in tops)
-    paths = (Path(file).resolve() for file in files if file is not None)
-    return frozenset(path.parent if path.name == "__init__.py" else path for path in paths)
-
-
-def confine(allowed: Reach, code: frozenset[Path]) -> None:
+def confine(reads: Reach, writes: Reach) -> None:
     """Confine this process by all features that the kernel supports; it must have one thread.
 
     Args:
-        allowed: user files that stay accessible.
-        code: Python files and packages that the process has to load.
+        reads: user files and extensions that stay accessible.
+        writes: folders in which files may be written.
 
     Raises:
         EnvironmentFailure: the kernel refuses a feature that it reports.
@@ -157,9 +130,9 @@ def confine(allowed: Reach, code: frozenset[Path]) -> None:
         if landlock_version():
             packages = [FILES_ROOT / name for name in _OWN_PACKAGES]
             restrict_files(
-                reads=[*_libraries(), *packages, *code, *allowed.reads],
-                writes=[*(Path(sink) for sink in _SINKS), *allowed.writes],
-                lists=[FILES_ROOT, IMPORT_ROOT, *(path.parent for path in code)],
+                reads=[*_libraries(), *packages, *reads],
+                writes=[*(Path(sink) for sink in _SINKS), *writes],
+                lists=[FILES_ROOT, IMPORT_ROOT],
             )
         if seccomp_works():
             refuse_calls()
@@ -181,11 +154,7 @@ def _libraries() -> list[Path]:
     return [Path(name) for name in (*python, *_SYSTEM, *more, *mimetypes.knownfiles)]
 
 
-def _all_below(paths: frozenset[Path], by: frozenset[Path]) -> bool:
-    return all(path in by or not by.isdisjoint(path.parents) for path in paths)
-
-
-def _merge_folders(paths: Iterable[Path]) -> frozenset[Path]:
+def merge_folders(paths: Iterable[Path]) -> Reach:
     """Return at most MOST_FOLDERS folders that contain all paths, never the file system's root."""
     folders = frozenset(paths)
     while len(folders) > MOST_FOLDERS:

@@ -62,17 +62,17 @@ def assign_uids(names: Iterable[str]) -> tuple[dict[str, str], list[Failure]]:
 
 def fetch_all(
     records: list[ObjectRecord],
-    fetch: Callable[[ObjectRecord], Path],
     downloaded: CountDone,
+    fetch: Callable[[ObjectRecord], Path],
     cancel: Callable[[], object] = lambda: None,
 ) -> Fetched:
     """Fetch every object; a TransferFailed of `fetch` is a failure of that object alone.
 
     Args:
         records: what to fetch.
-        fetch: returns the local path of a record's file; called in THREADS threads.
         downloaded: called in this thread with the number of finished objects, failed ones
             included, and the total.
+        fetch: returns the local path of a record's file; called in THREADS threads.
         cancel: called where the run ends early, so that `fetch` may give up.
 
     Raises:

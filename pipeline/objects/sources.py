@@ -106,17 +106,11 @@ _DOWNLOAD_REASONS = ("download_failed", "too_large_bytes", "too_many_buffers", "
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
-class ListedObjects:
-    """The listing of a source, split by licence; files are downloaded on demand."""
+class ListedObjects(Listing):
+    """The objects of a source with an allowed licence; `failures` holds all others."""
 
     source: str
     """The source as the user wrote it."""
-    listing: Listing
-    """The source's own listing, before the licence check."""
-    allowed: list[ObjectRecord]
-    """Objects with an allowed licence."""
-    refused: list[Failure]
-    """Failures: objects with a refused licence, and objects that are unusable anyway."""
 
     def fetch_selected(
         self,
@@ -141,26 +135,16 @@ class ListedObjects:
         Raises:
             TrilightError: none of the selected objects could be downloaded.
         """
-        records = [record for record in self.allowed if is_selected(record.uid)]
-        failures = [failure for failure in self.refused if is_selected(failure.item)]
-        fetched, lost = self.fetch(records, downloaded)
-        self.require_some(len(fetched), [*failures, *lost])
+        records = [record for record in self.records if is_selected(record.uid)]
+        failures = [failure for failure in self.failures if is_selected(failure.item)]
+        if self.fetch is not None:
+            records, lost = self.fetch(records, downloaded)
+            failures += lost
+        self.require_some(len(records), failures)
         return Listing(
-            records=sorted(fetched, key=attrgetter("uid")),
-            failures=sorted([*failures, *lost], key=attrgetter("item")),
+            records=sorted(records, key=attrgetter("uid")),
+            failures=sorted(failures, key=attrgetter("item")),
         )
-
-    @property
-    def num_found(self) -> int:
-        """Number of objects in the source."""
-        return len(self.allowed) + len(self.refused)
-
-    def fetch(self, records: list[ObjectRecord], downloaded: CountDone) -> Fetched:
-        """Download some of the allowed objects, as `Listing.fetch`; local files stay in place."""
-        if self.listing.fetch is None:
-            return records, []
-        with _resolve_source(self.source):
-            return self.listing.fetch(records, downloaded)
 
     def require_some(self, num_here: int, failures: Sequence[Failure]) -> None:
         """Raise TrilightError where downloads were tried and all failed."""
@@ -204,8 +188,18 @@ def list_objects(
     with _resolve_source(source) as value:
         listing = _list_some(*_choose_source(value, work_dir, licence, allowed_licences))
     allowed, refused = refuse_licences(listing.records, allowed_licences)
+    fetch = listing.fetch
+
+    def fetch_resolved(records: list[ObjectRecord], downloaded: CountDone) -> Fetched:
+        assert fetch is not None
+        with _resolve_source(source):
+            return fetch(records, downloaded)
+
     return ListedObjects(
-        source=source, listing=listing, allowed=allowed, refused=[*listing.failures, *refused]
+        source=source,
+        records=allowed,
+        failures=[*listing.failures, *refused],
+        fetch=None if fetch is None else fetch_resolved,
     )
 
 

@@ -316,7 +316,7 @@ def scene(folder: Path) -> Path:
 
 def gallery(folder: Path) -> Path:
     digest = f"smoke, digest {'0123456789abcdef' * 4}"
-    shown = [beside("000000001", 31.0), beside("000000002", 28.0)]
+    shown = [beside(1), beside(2)]
     return write_page(folder, shown, about=[("dataset", digest), ("network", "builtin:hits")])
 
 

@@ -1,6 +1,7 @@
 """A stand-in for a child process that runs its calls here: imports and kernels are paid once."""
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
+from pathlib import Path
 from typing import Any, cast
 
 import numpy as np
@@ -23,6 +24,7 @@ class ChildHere:
         factory: Callable[..., object] | None = None,
         args: tuple[Any, ...] = (),
         confined_to: Reach | None = None,
+        writes: Iterable[Path] = (),
     ) -> None:
         self._factory = factory
         self._args = args

@@ -209,38 +209,28 @@ def file_text(path: Path) -> str:
 
 
 def list_folder(folder: Path, licence: str | None) -> Listing:
-    """Return the objects of a folder; nothing is loaded.
+    """Return the objects of a folder: the rows of its catalogue, or the object files at any depth.
+
+    Nothing is loaded. Hidden files are left out (macOS writes `._name.obj` next to `name.obj`), and
+    linked folders are not entered. A link out of the folder is a failure `link_outside` of that
+    object.
 
     Args:
         folder: with a catalogue or object files.
         licence: the user's licence for files without a statement.
 
     Raises:
-        TrilightError: the folder is missing or not a folder, its catalogue is wrong, it has two
-            catalogues, or a catalogue and a `licence`.
+        TrilightError: the folder is missing, not a folder, or cannot be read, its catalogue is
+            wrong, it has two catalogues, or a catalogue and a `licence`.
     """
-    display_path = printable(str(folder))
     if not folder.is_dir():
         problem = "is not a folder" if folder.exists() else "does not exist"
         raise TrilightError(
-            f"objects {display_path!r} {problem}; expected a folder of {' '.join(SUFFIXES)} "
-            "files, or procedural: for built-in objects."
+            f"objects {printable(str(folder))!r} {problem}; expected a folder of "
+            f"{' '.join(SUFFIXES)} files, or procedural: for built-in objects."
         )
-    catalogue = only_catalogue(lambda name: (folder / name).exists(), licence)
-    if catalogue is None:
-        return _scan_folder(folder, licence)
-    return Listing(records=read_catalogue(folder / catalogue))
-
-
-def _scan_folder(folder: Path, licence: str | None) -> Listing:
-    """Return a record for every object file below `folder`, at any depth.
-
-    Hidden files are left out (macOS writes `._name.obj` next to `name.obj`), and linked folders are
-    not entered. A link out of the folder is a failure `link_outside` of that object.
-
-    Raises:
-        TrilightError: a folder cannot be read.
-    """
+    if catalogue := only_catalogue(lambda name: (folder / name).exists(), licence):
+        return Listing(records=read_catalogue(folder / catalogue))
     root = Path(os.path.realpath(folder))
 
     def locate(name: str) -> dict[str, str]:

@@ -11,11 +11,12 @@ import os
 import re
 import zlib
 from collections.abc import Mapping, Sequence
+from functools import partial
 from pathlib import Path
 from typing import Any
 
 from pipeline.objects.licences import UNKNOWN, refuse_licences
-from pipeline.objects.listing import CountDone, Fetched, Listing, failure, fetch_all
+from pipeline.objects.listing import Listing, failure, fetch_all
 from pipeline.objects.local.folder import file_text
 from storage.atomic import atomic_writer
 from storage.errors import TrilightError
@@ -116,11 +117,8 @@ def list_objaverse(source: str, allowed: Sequence[str]) -> Listing:
         if uid not in paths
     ]
     records, lost = _records(paths, allowed, count)
-
-    def fetch(chosen: list[ObjectRecord], downloaded: CountDone) -> Fetched:
-        files = {f"objaverse/{uid}": path for uid, path in paths.items()}
-        return fetch_all(chosen, lambda record: _fetch_file(files[record.uid]), downloaded)
-
+    files = {f"objaverse/{uid}": path for uid, path in paths.items()}
+    fetch = partial(fetch_all, fetch=lambda record: _fetch_file(files[record.uid]))
     return Listing(records=records, failures=[*failures, *lost], fetch=fetch)
 
 

@@ -6,6 +6,7 @@ file is not downloaded again. The files that a glTF names are downloaded with it
 or not at all. Nothing is written on the server.
 """
 
+import contextlib
 import dataclasses
 import errno
 import html
@@ -21,7 +22,7 @@ from urllib.parse import unquote
 
 from pipeline.foreign.gltf.document import read_container
 from pipeline.foreign.material_files import is_elsewhere
-from pipeline.objects.listing import CountDone, Fetched, Listing, fetch_all
+from pipeline.objects.listing import Listing, fetch_all
 from pipeline.objects.local.folder import (
     CATALOGUE_NAMES,
     list_files,
@@ -42,7 +43,6 @@ from storage.remote.transfers import (
     with_tries,
 )
 from storage.remote.url import RemoteUrl, printable, safe_url, shared_driver
-from storage.typed_json import read_json
 
 _MAX_NAME_BYTES = 220
 """File systems allow 255; the rest is for the name of an unfinished file."""
@@ -223,9 +223,10 @@ class RemoteFolder:
         version = version_of(facts)
         if size is not None:
             version["size"] = str(size)
+        record = json.dumps(version, sort_keys=True).encode()
         versions = self.files.parent / "versions"
         note = versions / f"{sha256_hex(os.fsencode(name))}.json"
-        if not version or not _is_here(path, note, version):
+        if not version or not _is_here(path, note, record, size):
             try:
                 with atomic_writer(path) as stream:
                     target = cast(BinaryIO, _StoppableStream(stream, self.stop))
@@ -235,7 +236,7 @@ class RemoteFolder:
                     message = f"the name {printable(name)[:100]!r} clashes with another one here"
                     raise TransferFailed("unsafe_name", message) from error
                 raise
-            write_atomically(note, json.dumps(version, sort_keys=True).encode())
+            write_atomically(note, record)
         return path
 
     def _check_size(self, size: int) -> None:
@@ -269,14 +270,10 @@ class _StoppableStream:
         return getattr(self._stream, name)
 
 
-def _is_here(path: Path, note: Path, version: dict[str, str]) -> bool:
-    try:
-        known = read_json(note.read_bytes(), dict[str, str], str(note))
-        return known == version and str(path.stat().st_size) == known.get(
-            "size", str(path.stat().st_size)
-        )
-    except (OSError, ValueError):
-        return False
+def _is_here(path: Path, note: Path, version: bytes, size: int | None) -> bool:
+    with contextlib.suppress(OSError):
+        return note.read_bytes() == version and size in (None, path.stat().st_size)
+    return False
 
 
 def buffer_names(path: Path, name: str) -> list[str]:
@@ -294,14 +291,10 @@ def buffer_names(path: Path, name: str) -> list[str]:
     except (OSError, Rejected):
         return []
     buffers = tree.get("buffers")
+    rows = [row for row in (buffers if isinstance(buffers, list) else ()) if isinstance(row, dict)]
+    inner = [_inner(row["uri"]) for row in rows if isinstance(row.get("uri"), str)]
     folder = posixpath.dirname(name)
-    names: dict[str, None] = {}
-    for buffer in buffers if isinstance(buffers, list) else ():
-        uri = buffer.get("uri") if isinstance(buffer, dict) else None
-        inner = _inner(uri) if isinstance(uri, str) else None
-        if inner is not None:
-            names[posixpath.join(folder, inner)] = None
-    return list(names)
+    return list(dict.fromkeys(posixpath.join(folder, each) for each in inner if each is not None))
 
 
 def _inner(uri: str) -> str | None:
@@ -324,25 +317,31 @@ def list_remote(url: RemoteUrl, licence: str | None) -> Listing:
             its catalogue is wrong, or there are a catalogue and a `licence`.
     """
     folder = RemoteFolder(url)
-    catalogue = only_catalogue(folder.has, licence)
-    if catalogue is None:
-        listing = _list_object_files(folder, licence)
+    if catalogue := only_catalogue(folder.has, licence):
+        listing = _list_catalogue(folder, catalogue)
     else:
-        listing = Listing(records=_list_catalogue(folder, catalogue))
-    return dataclasses.replace(listing, fetch=partial(_fetch, folder))
+        listing = _list_object_files(folder, licence)
+
+    def fetch(record: ObjectRecord) -> Path:
+        name = folder.name_of(record)
+        try:
+            return folder.fetch_object(name)
+        except TransferFailed as error:
+            message = f"{folder.display_url(name)}: {error.message}"
+            raise TransferFailed(error.reason, message) from error
+
+    fetch_some = partial(fetch_all, fetch=fetch, cancel=folder.stop.set)
+    return dataclasses.replace(listing, fetch=fetch_some)
 
 
-def _list_catalogue(folder: RemoteFolder, catalogue: str) -> list[ObjectRecord]:
+def _list_catalogue(folder: RemoteFolder, catalogue: str) -> Listing:
     try:
         records = read_catalogue(folder.fetch(catalogue))
     except TransferFailed as error:
         raise unreadable(folder.url_of(catalogue), error) from error
-    return [
-        record
-        if record.source_url
-        else dataclasses.replace(record, source_url=folder.display_url(folder.name_of(record)))
-        for record in records
-    ]
+    urls = [record.source_url or folder.display_url(folder.name_of(record)) for record in records]
+    rows = zip(records, urls, strict=True)
+    return Listing(records=[dataclasses.replace(record, source_url=url) for record, url in rows])
 
 
 def _list_object_files(folder: RemoteFolder, licence: str | None) -> Listing:
@@ -358,15 +357,3 @@ def _list_object_files(folder: RemoteFolder, licence: str | None) -> Listing:
         licence,
         lambda name: {"path": str(folder.path(name)), "source_url": folder.display_url(name)},
     )
-
-
-def _fetch(folder: RemoteFolder, records: list[ObjectRecord], downloaded: CountDone) -> Fetched:
-    def fetch(record: ObjectRecord) -> Path:
-        name = folder.name_of(record)
-        try:
-            return folder.fetch_object(name)
-        except TransferFailed as error:
-            message = f"{folder.display_url(name)}: {error.message}"
-            raise TransferFailed(error.reason, message) from error
-
-    return fetch_all(records, fetch, downloaded, folder.stop.set)

@@ -7,15 +7,16 @@ import subprocess
 import time
 from collections.abc import Callable
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any, NamedTuple
 from unittest import mock
 from uuid import UUID
 
 import pytest
+from prefect.states import Completed, Crashed, Pending, Running, State
 
 from pipeline.executors import slurm_and_kubernetes as arrays
 from pipeline.flows import submission
-from pipeline.flows.submission import RunStatus, SubmittedRun
 from tests.command_line import expect_json, trilight
 from tests.conftest import ROOT
 from tests.infra.slurm.fake_slurm import commands_in
@@ -202,46 +203,44 @@ def test_status_prints_what_any_scheduler_needs(
     }  # fmt: skip
 
 
-RUN = SubmittedRun(
-    id=UUID(int=1),
-    name="a-run",
-    deployment="generate-scenes/local",
-    pool="local",
-    page="http://page",
-)
+RUN = SimpleNamespace(id=UUID(int=1), name="a-run")
 
 
-def seen(state: str, **more: Any) -> RunStatus:
-    plain: dict[str, Any] = {"message": "", "percent": 50.0, "tables": {}}
-    told = {**plain, "is_completed": state == "Completed", **more}
-    return RunStatus(state=state, **told)
+def seen(state: State, **tables: dict[str, str]) -> tuple[State, float, dict[str, dict[str, str]]]:
+    return state, 50.0, tables
 
 
 @pytest.fixture
 def asked(monkeypatch: pytest.MonkeyPatch) -> mock.Mock:
-    """What the server is asked for; its run is seen in `looks`, without any by default."""
-    submit = mock.Mock(return_value=RUN)
-    monkeypatch.setattr(submission, "server", contextlib.nullcontext)
-    monkeypatch.setattr(submission, "submit", submit)
+    """What asks for a run of the deployment that has the name of its flow."""
+    create = mock.Mock(return_value=RUN)
+    client = SimpleNamespace(create_flow_run_from_deployment=create)
+
+    def find(client: Any, flow: str, name: str | None) -> SimpleNamespace:
+        return SimpleNamespace(id=flow, name=name or "local", work_pool_name="local")
+
+    monkeypatch.setattr(submission, "server", lambda: contextlib.nullcontext(client))
+    monkeypatch.setattr(submission, "find_deployment", find)
+    monkeypatch.setattr(submission, "page_of", lambda client, run: "http://page")
     monkeypatch.setattr(submission, "workers_online", lambda client, pool: 1)
-    return submit
+    return create
 
 
 def test_a_run_is_watched_to_its_end_and_one_that_crashed_is_a_mistake_with_its_reason(
     asked: mock.Mock, monkeypatch: pytest.MonkeyPatch, tmp_path: Path
 ) -> None:
-    looks = [seen("Pending"), seen("Running"), seen("Running")]
-    looks.append(seen("Completed", tables={"summary": [("scenes", "2")]}))
+    looks = [seen(Pending()), seen(Running()), seen(Running())]
+    looks.append(seen(Completed(), summary={"scenes": "2"}))
     monkeypatch.setattr(submission, "poll_run", lambda client, run: iter(looks))
     words = ["submit", "generate-scenes", "smoke", "--scenes", "2", "--out", str(tmp_path)]
     told = trilight(words).stdout
     given = {"build": "smoke", "scenes": 2, "out": str(tmp_path)}
-    asked.assert_called_once_with(mock.ANY, "generate-scenes", None, given)
+    asked.assert_called_once_with("generate-scenes", parameters=given)
     for line in ("Run a-run of generate-scenes/local: http://page", "Pending", "scenes  2"):
         assert told.count(line) == 1, told
     assert f"Next: trilight verify {tmp_path}" in told
     assert json.loads(trilight([*words, "--json"]).stdout)["summary"] == {"scenes": "2"}
-    ended = seen("Crashed", message="it was killed.")
+    ended = seen(Crashed(message="it was killed."))
     monkeypatch.setattr(submission, "poll_run", lambda client, run: iter([ended]))
     failed = trilight(words)
     assert "ended as Crashed: it was killed. Its log is at http://page" in failed.stderr
@@ -249,5 +248,7 @@ def test_a_run_is_watched_to_its_end_and_one_that_crashed_is_a_mistake_with_its_
 
 def test_who_does_not_watch_gets_the_run(asked: mock.Mock) -> None:
     words = ["submit", "generate-scenes", "smoke", "--no-watch", "--deployment", "cluster"]
-    assert json.loads(trilight([*words, "--json"]).stdout)["flow_run"] == str(RUN.id)
-    assert asked.call_args.args[1:3] == ("generate-scenes", "cluster")
+    assert json.loads(trilight([*words, "--json"]).stdout) == {
+        "flow_run": str(RUN.id), "deployment": "generate-scenes/cluster",
+    }  # fmt: skip
+    assert asked.call_count == 1

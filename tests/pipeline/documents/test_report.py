@@ -257,7 +257,7 @@ def test_a_texture_is_shown_as_it_lies() -> None:
     texture = Texture(texels=texels, is_srgb=True, source=MapSource(name=HARM))
     number = Texture(texels=np.full((1, 1, 1), 128, np.uint8))
     scene = textured_scene(0, texture, number, environment=sky())
-    pictures = [pixels_of(shown.picture or "") for shown in shown_maps(scene)]
+    pictures = [pixels_of(shown.source) for *_, shown in shown_maps(scene)]
     assert pictures[0].tolist() == [[[0] * 3] * 2, [[0] * 3, [200, 100, 50]]]
     assert pictures[2].shape == (112, 224, 3) and pictures[2].max() == 255
     page = read(encode_scene_page(sample(0, scene.with_provenance({})), "train", (), NO_LINKS))

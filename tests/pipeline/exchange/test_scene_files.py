@@ -234,7 +234,7 @@ def test_a_run_reads_files_in_a_confined_child(
             (children,) = render_workers._jobs.values()
             assert children.readers is not None
             (child,) = children.readers._children
-            assert child._reach is not None and child._reach.reads == {folder.resolve()}
+            assert child._reach == {folder.resolve()}
     finally:
         render_workers.close_children()
     job.accepted.origin = NO_OBJECTS.origin

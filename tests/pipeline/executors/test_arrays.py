@@ -20,8 +20,7 @@ from pipeline.executors.slurm_and_kubernetes import (
     KubernetesOptions,
     array_job,
     job_manifest,
-    sbatch_command,
-    sbatch_environment,
+    submit_slurm_array,
 )
 from pipeline.executors.threads import PLACE, shards_of_place, shards_of_task
 from pipeline.generation.generate_options import GenerateOptions
@@ -154,11 +153,13 @@ def test_an_array_fits_the_cluster_and_covers_every_shard_of_what_was_ordered(
     order = GenerateOptions(build="smoke", scenes=64, changes=changes, objects="my objects")
     job = array_job(order, per_task=2, at_once=3)
     assert job.tasks == [0, 1, 2, 3]
-    words = sbatch_command(job)
+    name, line = submit_slurm_array(job, dry_run=True)
+    assert name is None
+    words = shlex.split(line)
+    assert {"OBJECTS=my objects", "SCENES=64"} <= set(words)
+    words = words[words.index("sbatch") :]
     assert words[:3] == ["sbatch", "--parsable", "--array=0-3%3"]
     assert words[4:] == ["--set", "splits.scenes_per_shard=8"]
-    given = sbatch_environment(job)
-    assert given["OBJECTS"] == "my objects" and given["SCENES"] == "64"
 
 
 def test_tasks_that_died_are_all_that_is_submitted_again(

@@ -399,7 +399,7 @@ def cluster(monkeypatch: pytest.MonkeyPatch) -> list[list[int]]:
     monkeypatch.setattr("pipeline.executors.threads.ThreadRunner", Undocumented)
     arrays: list[list[int]] = []
 
-    def submit(job: ArrayJob) -> str:
+    def submit(job: ArrayJob) -> tuple[str, str]:
         def work() -> None:
             for task in job.tasks:
                 monkeypatch.setenv("SHARDS_PER_TASK", str(job.per_task))
@@ -409,7 +409,7 @@ def cluster(monkeypatch: pytest.MonkeyPatch) -> list[list[int]]:
 
         arrays.append(list(job.tasks))
         threading.Thread(target=work).start()
-        return "4711"
+        return "4711", "sbatch"
 
     monkeypatch.setattr(prefect_flows, "submit_slurm_array", submit)
     return arrays

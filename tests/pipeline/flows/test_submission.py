@@ -22,14 +22,21 @@ from prefect.settings import PREFECT_API_URL, temporary_settings
 from prefect.states import Completed, Failed, Running, Scheduled, State
 
 from pipeline.flows import guarded_server
-from pipeline.flows.guarded_server import RequestGuard
+from pipeline.flows.guarded_server import guard_requests
 from pipeline.flows.prefect_flows import generate_scenes
 from pipeline.flows.prefect_server import (
     name_prefect_failures,
     prefect_server,
     wait_until_healthy,
 )
-from pipeline.flows.submission import parameters, poll_run, server, submit, workers_online
+from pipeline.flows.submission import (
+    find_deployment,
+    page_of,
+    parameters,
+    poll_run,
+    server,
+    workers_online,
+)
 from pipeline.generation.generate_options import GenerateOptions
 from storage.cache import open_private, private_folder
 from storage.errors import TrilightError
@@ -48,16 +55,11 @@ class Server:
             for name in deployments
         ]
         self.states = list(states)
-        self.asked: list[tuple[UUID, dict[str, Any]]] = []
         self.artifacts: list[Any] = []
 
     def read_deployments(self, *, flow_filter: Any) -> list[Any]:
         assert flow_filter.name.any_ == ["generate-scenes"]
         return self.deployments
-
-    def create_flow_run_from_deployment(self, place: UUID, *, parameters: Any) -> Any:
-        self.asked.append((place, parameters))
-        return SimpleNamespace(id=uuid4(), name="a-run")
 
     def read_flow_run(self, run: UUID) -> FlowRun:
         return FlowRun(id=run, flow_id=uuid4(), state=self.states.pop(0))
@@ -70,22 +72,22 @@ class Server:
 
 
 def test_the_deployment_of_make_serve_comes_first_then_the_only_one_or_one_that_is_named() -> None:
-    served = Server(["cluster", "local"])
-    run = submit(served, "generate-scenes", None, {"scenes": 3})  # type: ignore[arg-type]
-    assert (run.deployment, run.pool) == ("generate-scenes/local", "pool of local")
-    assert served.asked == [(served.deployments[1].id, {"scenes": 3})]
-    assert run.page.endswith(f"/runs/flow-run/{run.id}")
-    assert workers_online(served, run.pool) == 2  # type: ignore[arg-type]
+    served: Any = Server(["cluster", "local"])
+    assert find_deployment(served, "generate-scenes", None) is served.deployments[1]
+    run = uuid4()
+    assert page_of(served, run).endswith(f"/runs/flow-run/{run}")
+    assert workers_online(served, "pool of local") == 2
     for deployments, wanted in ((["cluster"], None), (["a", "b"], "b")):
-        run = submit(Server(deployments), "generate-scenes", wanted, {})  # type: ignore[arg-type]
-        assert run.deployment == f"generate-scenes/{deployments[-1]}"
+        served = Server(deployments)
+        assert find_deployment(served, "generate-scenes", wanted) is served.deployments[-1]
     for deployments, wanted, complaint in (
         ([], None, "no deployment of the flow generate-scenes. Run make serve"),
         (["a", "b"], None, "--deployment is None; expected one of a, b"),
         (["local"], "other", "--deployment is 'other'; expected one of local"),
     ):
+        served = Server(deployments)
         with case(complaint), pytest.raises(TrilightError, match=complaint):
-            submit(Server(deployments), "generate-scenes", wanted, {})  # type: ignore[arg-type]
+            find_deployment(served, "generate-scenes", wanted)
 
 
 def test_parameters_are_what_the_flow_takes() -> None:
@@ -116,14 +118,15 @@ def test_a_run_is_looked_at_until_it_has_ended_and_one_that_failed_is_no_success
     ]
     slept: list[float] = []
     seen = list(poll_run(served, uuid4(), slept.append))  # type: ignore[arg-type]
-    assert [look.state for look in seen] == ["Scheduled", "Running", "Completed"]
-    assert seen[-1].is_completed and seen[-1].message == "all there"
-    assert seen[-1].percent == 75.0
-    assert seen[-1].tables == {"progress": [("scenes in shards", "3 of 4")]}
+    assert [state.name for state, _, _ in seen] == ["Scheduled", "Running", "Completed"]
+    state, percent, tables = seen[-1]
+    assert state.is_completed() and state.message == "all there"
+    assert percent == 75.0
+    assert tables == {"progress": {"scenes in shards": "3 of 4"}}
     assert len(slept) == 2
     served = Server(["local"], (Failed(message="no space"),))
-    (last,) = poll_run(served, uuid4())  # type: ignore[arg-type]
-    assert (last.is_completed, last.message) == (False, "no space")
+    ((state, *_),) = poll_run(served, uuid4())  # type: ignore[arg-type]
+    assert (state.is_completed(), state.message) == (False, "no space")
 
 
 def test_no_server_a_closed_port_and_a_password() -> None:
@@ -180,7 +183,8 @@ def _answer(kind: str = "http", **headers: str) -> list[MutableMapping[str, Any]
 
     raw = [(name.encode(), value.encode()) for name, value in headers.items()]
     scope = {"type": kind, "headers": raw, "path": "/api/deployments/filter"}
-    asyncio.run(RequestGuard(_application, ["server", "My-Host"])(scope, receive, send))
+    guarded: Any = guard_requests(_application, ["server", "My-Host"])
+    asyncio.run(guarded(scope, receive, send))
     return sent
 
 

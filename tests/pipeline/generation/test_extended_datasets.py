@@ -18,7 +18,7 @@ from pipeline.generation.freeze_objects import ObjectLock
 from pipeline.generation.generate_options import GenerateOptions
 from pipeline.generation.pipeline import make_dataset, make_task, prepare_dataset
 from pipeline.generation.scene_origins import AcceptedObjects
-from pipeline.isolation import NO_FILES, IsolatedChild, call_with_retries
+from pipeline.isolation import NO_FILES, IsolatedChild, call_with_retries, reach
 from pipeline.presets.registry import DATASET_PRESETS, preset_settings, resolve_dataset_preset
 from pipeline.shards.pack_shards import PublishedShards
 from scene_templates.families import FAMILIES
@@ -30,6 +30,7 @@ from storage.dataset.verify import verify_dataset
 from storage.errors import TrilightError, removal_message
 from storage.extensions import load_extension, mistake_in_extension
 from tests.command_line import trilight
+from tests.conftest import ROOT
 from tests.extensions_kit import EXAMPLES, loaded, parts_of, room_for_extensions, written
 from tests.for_each import case, for_each
 from tests.pipeline.documents.dataset_by_hand import edit_manifest
@@ -73,7 +74,7 @@ def test_the_manifest_records_what_had_part_in_a_dataset_and_nothing_else(tmp_pa
 
 def test_children_know_what_is_registered() -> None:
     """Also those of a fork server that was started before."""
-    with closing(IsolatedChild(limits=LIMITS, confined_to=NO_FILES)) as child:
+    with closing(IsolatedChild(limits=LIMITS, confined_to=reach([ROOT / "tests"]))) as child:
         with pytest.raises(TrilightError, match="template 'corridor' is unknown"):
             child.call(parts_of, "corridor")
         child.retire()

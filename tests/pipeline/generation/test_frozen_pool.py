@@ -200,7 +200,7 @@ def test_an_object_that_is_away_is_brought_back_for_the_same_attempt() -> None:
 def test_an_object_that_is_there_again_is_found(tmp_path: Path) -> None:
     """A worker that lives long has listed the source before."""
     source = ("builtin:4", None, tmp_path / "objects", ("MIT", "CC0-1.0"))
-    uid = render_workers._list_source(*source).allowed[0].uid
+    uid = render_workers._list_source(*source).records[0].uid
     shutil.rmtree(tmp_path / "objects")
     record = render_workers.find_object(*source, uid)
     assert record is not None and Path(record.path).exists()

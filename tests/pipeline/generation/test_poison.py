@@ -67,6 +67,7 @@ def test_a_mesh_that_crashes_its_child_is_one_failure(
 ) -> None:
     """The other objects are used, and the dataset is the one without it."""
     monkeypatch.setattr("pipeline.assets.stage.attempt_in_child", poison.prepare_or_crash)
+    monkeypatch.setenv("TRILIGHT_CONFINE", "off")  # a confined child reads no function of tests
     poisoned = write_obj(workshop / "objects" / poison.OBJECT, knot(segments=64))
     try:
         outcome = make(workshop, tmp_path / "set")

@@ -129,7 +129,7 @@ def build(wall: str, inside: Path) -> None:
     """Confine this process by one wall alone."""
     name, _, version = wall.partition(" ")
     if name == "all":
-        confinement.confine(confinement.reach(files=[inside]), frozenset([ROOT]))
+        confinement.confine(confinement.reach([inside, ROOT]), frozenset())
     elif name == "rights":
         system_calls.give_up_privileges()
     elif name:

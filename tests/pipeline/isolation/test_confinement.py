@@ -7,7 +7,7 @@ import signal
 import subprocess
 import sys
 import time
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import closing
 from pathlib import Path
 from types import SimpleNamespace
@@ -20,7 +20,6 @@ from pipeline.isolation import (
     ChildFailed,
     ChildLimits,
     IsolatedChild,
-    Reach,
     call_failures,
     call_with_retries,
     confinement,
@@ -29,6 +28,7 @@ from pipeline.isolation import (
     system_calls,
 )
 from pipeline.isolation.call_failures import ENDS, with_retries
+from pipeline.isolation.confinement import covers
 from pipeline.isolation.system_calls import landlock_version, seccomp_works
 from storage.errors import EnvironmentFailure, TrilightError
 from tests.conftest import ROOT
@@ -41,8 +41,9 @@ needs_landlock = pytest.mark.skipif(not landlock_version(), reason="no Landlock 
 needs_seccomp = pytest.mark.skipif(not seccomp_works(), reason="no seccomp here")
 
 
-def confined(allowed: Reach) -> IsolatedChild:
-    return IsolatedChild(limits=LIMITS, confined_to=allowed)
+def confined(*allowed: Path, writes: Sequence[Path] = ()) -> IsolatedChild:
+    code = ROOT / "tests"  # the functions that are called
+    return IsolatedChild(limits=LIMITS, confined_to=reach([code, *allowed]), writes=writes)
 
 
 @pytest.fixture(scope="module")
@@ -58,8 +59,7 @@ def place(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 @needs_landlock
 def test_inputs_are_read_outputs_written_and_nothing_outside(place: Path) -> None:
-    files = reach(files=[place / "in" / "file"], writes=[place / "out"])
-    with closing(confined(files)) as child:
+    with closing(confined(place / "in" / "file", writes=[place / "out"])) as child:
         assert child.call(called.read, place / "in" / "file") == "in"
         child.call(called.write, place / "out" / "new")
         child.call(called.replace, place / "out" / "file", place / "out" / "new")
@@ -111,10 +111,11 @@ def test_each_wall_holds_what_the_page_says_of_it_and_no_more(place: Path) -> No
 
 
 TERMINAL = """
+import pathlib
 from pipeline.isolation import ChildLimits, IsolatedChild, reach
 from tests.pipeline.isolation import called, probes
 limits = ChildLimits(memory_bytes=2 << 30, wall_s=60, calls_per_child=9)
-child = IsolatedChild(limits=limits, confined_to=reach())
+child = IsolatedChild(limits=limits, confined_to=reach([pathlib.Path("tests")]))
 print("terminals:", child.call(probes.open_terminals))
 """
 
@@ -135,8 +136,8 @@ from pipeline.isolation import ChildLimits, IsolatedChild, reach
 from tests.pipeline.isolation import called, probes
 path = pathlib.Path(sys.argv[1])
 limits = ChildLimits(memory_bytes=2 << 30, wall_s=60, calls_per_child=9)
-files = reach(writes=[path.parent]) if len(sys.argv) > 2 else None
-child = IsolatedChild(limits=limits, confined_to=files)
+files = reach([pathlib.Path("tests")]) if len(sys.argv) > 2 else None
+child = IsolatedChild(limits=limits, confined_to=files, writes=[path.parent])
 child.call(probes.stay, path, files is not None)
 """
 
@@ -162,11 +163,11 @@ def _until(happened: Callable[[], bool], most_s: float) -> None:
 
 @needs_landlock
 def test_another_folder_costs_a_fresh_child_and_the_same_one_none(place: Path) -> None:
-    with closing(confined(reach(files=[place / "in"]))) as child:
+    with closing(confined(place / "in")) as child:
         first = child.call(called.process_id)
-        child.allow_files(reach(files=[place / "in" / "file"]))
+        child.allow_files(reach([place / "in" / "file"]))
         assert child.call(called.process_id) == first
-        child.allow_files(reach(files=[place / "outside" / "file"]))
+        child.allow_files(reach([place / "outside" / "file"]))
         assert child.call(called.read, place / "outside" / "file") == "outside"
         assert child.call(called.read, place / "in" / "file") == "in"
         assert child.call(called.process_id) != first
@@ -181,7 +182,7 @@ def test_packages_that_a_path_of_pythons_names_are_read_and_its_other_folders_no
         folder.mkdir(parents=True)
         (folder / "file").write_text("found")
         monkeypatch.syspath_prepend(str(folder))
-    with closing(confined(reach())) as child:
+    with closing(confined()) as child:
         assert child.call(called.read, packages / "file") == "found"
         with pytest.raises(ChildFailed, match="PermissionError"):
             child.call(called.read, other / "file")
@@ -189,7 +190,7 @@ def test_packages_that_a_path_of_pythons_names_are_read_and_its_other_folders_no
 
 def test_off_confines_nothing(place: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv(confinement.VARIABLE, "off")
-    with closing(confined(reach(files=[place / "in"]))) as child:
+    with closing(confined(place / "in")) as child:
         assert child.call(called.read, place / "outside" / "file") == "outside"
 
 
@@ -224,13 +225,13 @@ def test_an_unknown_word_is_refused_at_once_by_every_command() -> None:
 
 
 def test_very_many_folders_become_those_above_and_never_the_whole_disk() -> None:
-    many = reach(files=(Path(f"/models/{number % 9}/{number}/a.obj") for number in range(900)))
-    assert len(many.reads) <= confinement.MOST_FOLDERS
-    assert all(path.is_relative_to("/models") for path in many.reads)
-    assert many.covers(reach(files=[Path("/models/3/12/a.obj")]))
-    assert not many.covers(reach(files=[Path("/other/a.obj")]))
-    wide = reach(files=(Path(f"/{number}/a.obj") for number in range(900)))
-    assert Path("/") not in wide.reads
+    many = reach(Path(f"/models/{number % 9}/{number}/a.obj") for number in range(900))
+    assert len(many) <= confinement.MOST_FOLDERS
+    assert all(path.is_relative_to("/models") for path in many)
+    assert covers(many, reach([Path("/models/3/12/a.obj")]))
+    assert not covers(many, reach([Path("/other/a.obj")]))
+    wide = reach(Path(f"/{number}/a.obj") for number in range(900))
+    assert Path("/") not in wide
 
 
 def _decide(machine: str, call: int, argument: int = 0) -> int:
