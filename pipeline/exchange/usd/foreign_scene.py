@@ -23,7 +23,6 @@ from pxr import UsdGeom, UsdLux
 
 from pipeline.exchange.from_description import SMOOTH_ANGLE_DEG
 from pipeline.exchange.part_materials import Part, PartConverter, drop_empty, unit_normals
-from pipeline.exchange.pictures import MAX_BYTES, decode_pixels, decode_values
 from pipeline.exchange.textured_triangles import (
     SceneParts,
     TexturedTriangles,
@@ -36,7 +35,13 @@ from pipeline.exchange.textured_triangles import (
 from pipeline.exchange.usd import layout
 from pipeline.exchange.usd.held_materials import HeldMaterial, keep_exact, read_columns
 from pipeline.foreign.numbers import FINITE, read_number, read_numbers
-from pipeline.foreign.picture import Picture
+from pipeline.foreign.picture import (
+    MAX_BYTES,
+    MAX_PIXELS,
+    Picture,
+    decode_image,
+    read_linear_picture,
+)
 from pipeline.foreign.usd.materials import MeshMaterials
 from pipeline.foreign.usd.object_source import read_stage_materials
 from pipeline.foreign.usd.placed import DOMES, SOLIDS, PlacedPrim, placed_prims
@@ -46,7 +51,7 @@ from pipeline.foreign.usd.stage import OpenedStage
 from pipeline.foreign.usd.texture_nodes import asset_bytes, convert_to_rec709
 from pipeline.objects.licences import USER_PROVIDED
 from pipeline.scenes.shading_normals import smooth_shaded
-from storage.errors import TrilightError
+from storage.errors import Rejected, TrilightError
 from storage.records.material import EMISSION, column_places
 from storage.records.scene import Scene, SceneObject
 from storage.records.texture import Environment, MapSource, Texture
@@ -123,7 +128,6 @@ class StageReader:
 
         Raises:
             Rejected: a picture is outside of the folder, or too large.
-            TrilightError: a picture has too many pixels.
         """
         self._time = time
         self._lost = opened.lost
@@ -136,7 +140,7 @@ class StageReader:
         self._extras: list[tuple[str, dict[str, Any], dict[str, Texture] | None]] = []
         self._looks = MeshMaterials(
             read_stage_materials(meshes, time, _MAX_PICTURE_BYTES, self._read),
-            lambda data, name: decode_values(data, name, self._lost),
+            lambda data, name: decode_image(data, name, MAX_PIXELS, self._lost, of_scene=True),
             time,
             emission=True,
             notes=self._lost,
@@ -486,7 +490,8 @@ def _read_dome(
     `to_world` [4, 4] is its transform.
 
     Raises:
-        TrilightError: the map file is outside the folder or on the network.
+        Rejected: the map has more pixels than MAX_PIXELS.
+        TrilightError: its file is outside the folder or on the network.
     """
     prim_path = str(prim.GetPath())
     radiance = _read_map(prim, time, opened)
@@ -562,11 +567,20 @@ def _read_map(prim: Any, time: Any, opened: OpenedStage) -> NDArray[np.float64] 
     if data is None:
         opened.lost.append(f"{prim_path}: map {asset.path!r:.100} is missing")
         return None
-    pixels = decode_pixels(data, asset.path, opened.lost)
-    if pixels is None:
-        opened.lost.append(
-            f"{prim_path}: map {asset.path!r:.100} is not read; its light was left out"
-        )
+    try:
+        picture = read_linear_picture(data, MAX_PIXELS)
+        if picture is None:
+            pixels = decode_image(data, asset.path, MAX_PIXELS, opened.lost, of_scene=True)[::-1]
+        else:
+            pixels = picture.values
+            opened.lost += [f"{asset.path!r:.100}: {sentence}" for sentence in picture.unread]
+    except Rejected as error:
+        if error.reason in ("too_many_pixels", "texture_too_large"):
+            raise
+        opened.lost += [
+            f"{asset.path!r:.100}: {error.message}",
+            f"{prim_path}: map {asset.path!r:.100} is not read; its light was left out",
+        ]
         return None
     linear = Picture(values=pixels, is_srgb=pixels.dtype == np.uint8).linear(pixels)
     rgb = linear[..., :3] if linear.shape[2] >= 3 else np.repeat(linear[..., :1], 3, axis=2)

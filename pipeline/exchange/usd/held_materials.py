@@ -15,7 +15,6 @@ import numpy as np
 from numpy.typing import NDArray
 from pxr import UsdShade
 
-from pipeline.exchange.pictures import MAX_BYTES
 from pipeline.exchange.textured_triangles import (
     EXCESS,
     NO_TEXTURES,
@@ -33,6 +32,7 @@ from pipeline.exchange.usd.write_materials import (
     decode_texture,
     openpbr_inputs,
 )
+from pipeline.foreign.picture import MAX_BYTES
 from pipeline.foreign.usd.shaders import (
     DEFAULTS,
     IOR_OF_CONSTANT_ALBEDOS,

@@ -20,7 +20,6 @@ import numpy as np
 from numpy.typing import NDArray
 from pxr import Usd
 
-from pipeline.exchange.pictures import MAX_BYTES
 from pipeline.exchange.textured_triangles import LoadedScene
 from pipeline.exchange.usd import layout
 from pipeline.exchange.usd.foreign_scene import StageReader
@@ -38,6 +37,7 @@ from pipeline.exchange.usd.write_usd import (
     new_layer,
     sum_positions,
 )
+from pipeline.foreign.picture import MAX_BYTES
 from pipeline.foreign.usd.stage import OpenedStage, read_quietly
 from pipeline.foreign.usd.texture_nodes import asset_bytes
 from storage.conventions import require_readable
