@@ -88,16 +88,16 @@ def _smooth(positions: NDArray[np.float32], cut: CutMesh) -> NDArray[np.float32]
     return shaded.normals[shaded.faces]
 
 
-def _stated_normals(prim: Any, time: Any) -> tuple[NDArray[np.float64], str] | None:
-    mesh = UsdGeom.Mesh(prim)
+def _stated_normals(placed: PlacedPrim) -> tuple[NDArray[np.float64], str] | None:
+    mesh = UsdGeom.Mesh(placed.prim)
     if not mesh:
         return None
     primvar = UsdGeom.PrimvarsAPI(mesh).GetPrimvar("normals")
     if primvar and primvar.HasValue():
-        values = primvar.ComputeFlattened(time)
+        values = primvar.ComputeFlattened(placed.time)
         interpolation = str(primvar.GetInterpolation())
     else:
-        values = mesh.GetNormalsAttr().Get(time)
+        values = mesh.GetNormalsAttr().Get(placed.time)
         interpolation = str(mesh.GetNormalsInterpolation())
     if values is None or len(values) == 0:
         return None
@@ -118,7 +118,6 @@ class StageReader:
     def __init__(
         self,
         stage: Any,
-        time: Any,
         opened: OpenedStage,
         written: Mapping[str, Mapping[str, NDArray[np.float32]]],
     ) -> None:
@@ -129,19 +128,17 @@ class StageReader:
         Raises:
             Rejected: a picture is outside of the folder, or too large.
         """
-        self._time = time
         self._lost = opened.lost
         self._opened = opened
         self._written = written
         self._converter = PartConverter(self._lost)
-        self._placed = sorted(placed_prims(stage, time, self._lost), key=_read_row)
+        self._placed = sorted(placed_prims(stage, opened.time, self._lost), key=_read_row)
         meshes = [each for each in self._placed if each.prim.GetTypeName() in _MESHES]
         # of each material: name of its prim, added columns, and exact columns if Trilight wrote it
         self._extras: list[tuple[str, dict[str, Any], dict[str, Texture] | None]] = []
         self._looks = MeshMaterials(
-            read_stage_materials(meshes, time, _MAX_PICTURE_BYTES, self._read),
+            read_stage_materials(meshes, _MAX_PICTURE_BYTES, self._read),
             lambda data, name: decode_image(data, name, MAX_PIXELS, self._lost, of_scene=True),
-            time,
             emission=True,
             notes=self._lost,
         )
@@ -154,7 +151,7 @@ class StageReader:
             TrilightError: a count exceeds its maximum, arrays contradict each other, or the stage
                 lacks triangles or light.
         """
-        time = self._time
+        time = self._opened.time
         numbers = itertools.count()
         parts = SceneParts(self._opened.path.name)
         cameras = []
@@ -168,14 +165,14 @@ class StageReader:
             elif kind == "Camera":
                 cameras.append(self._read_camera(each))
             elif kind not in DOMES:
-                lamp = _light_triangles(each, time, self._lost)
+                lamp = _light_triangles(each)
                 if lamp is not None:
-                    radiance = _compute_radiance(each, lamp, time, self._lost)
+                    radiance = _compute_radiance(each, lamp)
                     parts.add(self._entry(each.prim), build_lamp(lamp, radiance), is_lamp=True)
             elif sky is not None:
                 self._note(each.prim, "a second dome; a scene has one environment")
             else:
-                sky = _read_dome(each.prim, each.to_world, time, self._opened)
+                sky = _read_dome(each, self._opened)
         is_lit = sky is not None and sky.radiance_rgb.any()
         if not is_lit and not parts.has_emitters:
             raise TrilightError(
@@ -199,7 +196,7 @@ class StageReader:
 
     def _read_camera(self, placed: PlacedPrim) -> tuple[NDArray[np.float64], float] | None:
         """Return pose [4, 4] and full angle in degrees of a camera; None for an unusable one."""
-        time = self._time
+        time = placed.time
         camera = UsdGeom.Camera(placed.prim)
         names = ("focalLength", "horizontalAperture", "verticalAperture")
         lens = map(placed.prim.GetAttribute, names)
@@ -226,7 +223,7 @@ class StageReader:
     ) -> NDArray[np.float32]:
         """Return normals [T, 3, 3] at the corners [T, 3, 3] of triangles with normals [T, 3]."""
         placed = cut.placed
-        stated = None if placed.skin is not None else _stated_normals(cut.prim, self._time)
+        stated = None if placed.skin is not None else _stated_normals(placed)
         if stated is None:
             if not (cut.is_smooth or placed.skin is not None):
                 return unit_normals(None, flat)
@@ -250,7 +247,7 @@ class StageReader:
         Raises:
             TrilightError: the arrays of the mesh contradict each other, or are not finite.
         """
-        cut = cut_mesh(placed, self._time)
+        cut = cut_mesh(placed)
         positions, flat, has_area = drop_empty(cut.world_points[cut.indices[cut.corners]])
         if not has_area.all():
             self._note(cut.prim, f"{int((~has_area).sum())} triangles without an area")
@@ -275,8 +272,8 @@ class StageReader:
     def _add_light(self, placed: PlacedPrim, triangles: TexturedTriangles) -> None:
         """Multiply the emission of a mesh with that of its light, or replace it."""
         rows = triangles.rows
-        light = _compute_radiance(placed, triangles.positions, self._time, self._lost)
-        mode = placed.prim.GetAttribute("light:materialSyncMode").Get(self._time)
+        light = _compute_radiance(placed, triangles.positions)
+        mode = placed.prim.GetAttribute("light:materialSyncMode").Get(placed.time)
         glows = rows[:, EMISSION].any()
         tints = mode == "materialGlowTintsLight" and glows
         rows[:, EMISSION] = rows[:, EMISSION] * light if tints else light
@@ -298,7 +295,7 @@ class StageReader:
 
         def coordinates(number: int) -> NDArray[np.float64] | None:
             primvar = self._looks.primvars[number]
-            uv = cut.read_coordinates(primvar, self._time)
+            uv = cut.read_coordinates(primvar)
             if not np.isfinite(uv).all():
                 self._lost.append(f"{where}: no coordinates {primvar!r:.60}")
                 return None
@@ -322,12 +319,12 @@ class StageReader:
 
     def _read(self, material: Any) -> StatedMaterial | None:
         """Return the inputs of a material; None, with a note, where none are understood."""
-        columns = read_columns(material.GetPrim(), self._time, self._lost)
+        columns = read_columns(material.GetPrim(), self._opened)
         held = None
         if columns.keys() >= layout.MATERIAL_ATTRIBUTES.keys():
-            held = HeldMaterial(material, columns, self._written, self._time, self._opened)
+            held = HeldMaterial(material, columns, self._written, self._opened)
         known = () if held is None else ("specular",)  # Blender writes its specular level there
-        stated = read_material(material, self._time, self._opened, known)
+        stated = read_material(material, self._opened, known)
         exact = None
         if held is not None:
             self._lost.append(_HELD)
@@ -360,44 +357,45 @@ _OLD_NAMES = ("intensity", "exposure", "color", "normalize", "radius", "width", 
 _EXPOSURES = Within(-1000, 1000, unit="stops")
 
 
-def _light_triangles(placed: PlacedPrim, time: Any, lost: list[str]) -> NDArray[np.float32] | None:
+def _light_triangles(placed: PlacedPrim) -> NDArray[np.float32] | None:
     """Return the world-space triangles [T, 3, 3] of a light; None where it has no area."""
     prim = placed.prim
     kind = str(prim.GetTypeName())
     shape, sizes = _SHAPES[kind]
-    scale = [_read(prim.GetAttribute(f"inputs:{name}"), time) for name in sizes]
+    scale = [_read(prim.GetAttribute(f"inputs:{name}"), placed.time) for name in sizes]
     world = np.einsum("ij,tcj->tci", placed.to_world[:3, :3], shape() * np.array([*scale, 1.0][:3]))
     world = world + placed.to_world[:3, 3]
     area = sum_area(world)
     if not area > 0 or not np.isfinite(area):
-        lost.append(f"{prim.GetPath()}: a light without an area")
+        placed.lost.append(f"{prim.GetPath()}: a light without an area")
         return None
     if kind in ("RectLight", "DiskLight"):
-        lost.append(f"{prim.GetPath()}: emits to one side in USD, and to both sides in a scene")
+        placed.lost.append(
+            f"{prim.GetPath()}: emits to one side in USD, and to both sides in a scene"
+        )
     return world.astype(np.float32)
 
 
-def _compute_radiance(
-    placed: PlacedPrim, triangles: NDArray[np.float32], time: Any, lost: list[str]
-) -> NDArray[np.float32]:
+def _compute_radiance(placed: PlacedPrim, triangles: NDArray[np.float32]) -> NDArray[np.float32]:
     """Return the radiance [3] that the light API of a prim states.
 
     The prim is a light, or a mesh with the light API; its triangles [T, 3, 3] in meters have the
     area.
     """
-    emitted = _read_light_color(placed.prim, time, lost)
-    if placed.prim.GetAttribute("inputs:normalize").Get(time):
+    emitted = _read_light_color(placed)
+    if placed.prim.GetAttribute("inputs:normalize").Get(placed.time):
         area = sum_area(triangles) / placed.meters_per_unit**2
         emitted = emitted / max(area, 1e-30)
     if (emitted < 0).any():
-        lost.append(f"{placed.prim.GetPath()}: negative radiance; the light emits nothing")
+        placed.lost.append(f"{placed.prim.GetPath()}: negative radiance; the light emits nothing")
     emitted = np.maximum(emitted, 0)
     return np.where(np.isfinite(emitted), emitted, 0).astype(np.float32)
 
 
-def _read_light_color(prim: Any, time: Any, lost: list[str]) -> NDArray[np.float64]:
+def _read_light_color(placed: PlacedPrim) -> NDArray[np.float64]:
     """Return intensity x 2^exposure x color [3] of a light, tinted by its temperature."""
-    light = UsdLux.LightAPI(prim)
+    time = placed.time
+    light = UsdLux.LightAPI(placed.prim)
     strength = _read(light.GetIntensityAttr(), time)
     strength *= 2.0 ** _read(light.GetExposureAttr(), time, _EXPOSURES)
     stated = light.GetColorAttr()
@@ -407,7 +405,7 @@ def _read_light_color(prim: Any, time: Any, lost: list[str]) -> NDArray[np.float
     # Blender enables temperature on every light but sets none; the USD default would tint by 4 %
     if light.GetEnableColorTemperatureAttr().Get(time) and kelvin.HasAuthoredValue():
         color = color * np.array(UsdLux.BlackbodyTemperatureAsRgb(_read(kelvin, time)))
-    _note_losses(prim, time, lost)
+    _note_losses(placed)
     return np.asarray(strength * color)
 
 
@@ -415,14 +413,16 @@ def _read(attribute: Any, time: Any, within: Within = FINITE) -> float:
     return read_number(attribute.Get(time), str(attribute.GetPath()), within)
 
 
-def _note_losses(prim: Any, time: Any, lost: list[str]) -> None:
+def _note_losses(placed: PlacedPrim) -> None:
+    prim = placed.prim
+    lost = placed.lost
     where = prim.GetPath()
     files = {"inputs:texture:file", "inputs:shaping:ies:file"}
     if "Dome" in str(prim.GetTypeName()):
         files.remove(layout.MAP_PATH)
     for attribute in prim.GetAuthoredAttributes():
         name = attribute.GetName()
-        value = attribute.Get(time)
+        value = attribute.Get(placed.time)
         is_lost = value is not None and value != _NEUTRAL.get(name, value)
         if is_lost or (name in files and value and value.path):
             lost.append(f"{where}.{name}: has no place here")
@@ -482,23 +482,20 @@ _SHAPES: Mapping[str, tuple[Callable[[], NDArray[np.float64]], Sequence[str]]] =
 """Shape of each light, and its sizes along the axes of the light."""
 
 
-def _read_dome(
-    prim: Any, to_world: NDArray[np.float64], time: Any, opened: OpenedStage
-) -> Environment | None:
+def _read_dome(placed: PlacedPrim, opened: OpenedStage) -> Environment | None:
     """Read the environment of any DomeLight; return None, with a note, where it is unusable.
-
-    `to_world` [4, 4] is its transform.
 
     Raises:
         Rejected: the map has more pixels than MAX_PIXELS.
         TrilightError: its file is outside the folder or on the network.
     """
+    prim = placed.prim
     prim_path = str(prim.GetPath())
-    radiance = _read_map(prim, time, opened)
+    radiance = _read_map(prim, opened)
     if radiance is None:
         return None
-    tinted = radiance * _read_light_color(prim, time, opened.lost)
-    left_basis, _, right_basis = np.linalg.svd(to_world[:3, :3] @ _pole_rotation(prim))
+    tinted = radiance * _read_light_color(placed)
+    left_basis, _, right_basis = np.linalg.svd(placed.to_world[:3, :3] @ _pole_rotation(prim))
     rotation = left_basis @ right_basis
     if np.linalg.det(rotation) < 0:
         opened.lost.append(f"{prim_path}: a mirrored dome; its light was left out")
@@ -507,7 +504,7 @@ def _read_dome(
     sky = Environment(
         radiance_rgb=tinted.astype(np.float32),
         rotation=(rotation @ layout.TO_OUR_AXES.T).astype(np.float32),
-        is_seen=bool(visibility and visibility.Get(time)),
+        is_seen=bool(visibility and visibility.Get(placed.time)),
         source=MapSource(name=prim.GetName(), licence=USER_PROVIDED),
     )
     try:
@@ -515,18 +512,19 @@ def _read_dome(
     except TrilightError as error:
         opened.lost.append(f"{prim_path}: {error}; its light was left out")
         return None
-    return _take_held(sky, prim, time)
+    return _take_held(sky, placed)
 
 
-def _take_held(sky: Environment, dome: Any, time: Any) -> Environment:
+def _take_held(sky: Environment, placed: PlacedPrim) -> Environment:
     """Return an environment with the values that Trilight wrote on the prim of the scene."""
+    dome = placed.prim
     stage = dome.GetStage()
     holder = next((prim for prim in stage.Traverse() if prim.HasAttribute(layout.SKY_SOURCE)), None)
     if holder is None:
         return sky
 
     def read_value(name: str) -> Any:
-        return holder.GetAttribute(name).Get(time)
+        return holder.GetAttribute(name).Get(placed.time)
 
     held = layout.parse_map_text(read_value(layout.SKY_SOURCE))
     if held is None or held[0] != sky.sha256:
@@ -550,18 +548,18 @@ def _pole_rotation(prim: Any) -> NDArray[np.float64]:
     return np.array([[1, 0, 0], [0, 0, -1], [0, 1, 0]]) if is_turned else np.eye(3)
 
 
-def _read_map(prim: Any, time: Any, opened: OpenedStage) -> NDArray[np.float64] | None:
+def _read_map(prim: Any, opened: OpenedStage) -> NDArray[np.float64] | None:
     """Return the map [H, 2 H, 3] of a dome; uniform radiance 1 where it names no file."""
     prim_path = str(prim.GetPath())
     attribute = prim.GetAttribute(layout.MAP_PATH)
-    asset = attribute.Get(time) if attribute else None
+    asset = attribute.Get(opened.time) if attribute else None
     if asset is None or not asset.path:
         return np.ones((1, 2, 3))
-    projection = prim.GetAttribute("inputs:texture:format").Get(time)
+    projection = prim.GetAttribute("inputs:texture:format").Get(opened.time)
     if projection not in (None, "automatic", "latlong"):
         opened.lost.append(f"{prim_path}: a picture of format {projection}; expected latlong")
         return None
-    specs = attribute.GetPropertyStack(time)
+    specs = attribute.GetPropertyStack(opened.time)
     resolved = opened.resolve(specs[0].layer if specs else opened.root, asset.path)
     data = None if resolved is None else asset_bytes(resolved, MAX_BYTES)
     if data is None:

@@ -120,8 +120,9 @@ def _read_foreign(opened: OpenedStage, key: str | None) -> LoadedScene:
     chosen = key or (frames[0] if frames else "")
     if frames and key is None:
         opened.lost.append(f"time codes other than {chosen} of {len(frames)}")
-    time = Usd.TimeCode(float(chosen)) if chosen else Usd.TimeCode.EarliestTime()
-    scene = StageReader(stage, time, opened, _read_written_columns(opened)).scene()
+    if chosen:
+        opened.time = Usd.TimeCode(float(chosen))
+    scene = StageReader(stage, opened, _read_written_columns(opened)).scene()
     return LoadedScene(scene=scene, notes=opened.notes)
 
 

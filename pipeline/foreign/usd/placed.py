@@ -138,6 +138,7 @@ class PlacedPrim:
 
     prim: Any  # the Usd.Prim; several instances may share one
     to_world: NDArray[np.float64]  # [4, 4] for column vectors, to meters with +Z up
+    time: Any  # the Usd.TimeCode of its values
     meters_per_unit: float = 1.0  # length of a unit of the stage
     skin: BoundSkin | None = None  # the skin that poses a mesh
     lost: list[str] = field(default_factory=list)  # receives notes on contents that are not read
@@ -186,6 +187,7 @@ def placed_prims(
                 PlacedPrim(
                     prim=prim,
                     to_world=visit.to_world,
+                    time=time,
                     meters_per_unit=meters_per_unit,
                     skin=find_skin(skins, prim),
                     lost=lost,

@@ -75,7 +75,7 @@ class CutMesh:
             return None
         return values[where]
 
-    def read_primvar(self, name: str, time: Any) -> NDArray | None:
+    def read_primvar(self, name: str) -> NDArray | None:
         """Return a primvar of the mesh, or an inherited one, at corners [T, 3, ...].
 
         None where there is none, or not for every corner.
@@ -83,7 +83,7 @@ class CutMesh:
         primvar = UsdGeom.PrimvarsAPI(self.prim).FindPrimvarWithInheritance(name)
         if not primvar or not primvar.HasValue():
             return None
-        values = np.array(primvar.ComputeFlattened(time))
+        values = np.array(primvar.ComputeFlattened(self.placed.time))
         spread = str(primvar.GetInterpolation())
         if values.ndim == 0 or values.dtype.kind not in "fiu":
             return None
@@ -96,16 +96,16 @@ class CutMesh:
             )
         return fitting
 
-    def read_coordinates(self, primvar: str, time: Any) -> NDArray[np.float64]:
+    def read_coordinates(self, primvar: str) -> NDArray[np.float64]:
         """Return texture coordinates [T, 3, 2], perhaps not finite; NaN where one is missing."""
-        values = self.read_primvar(primvar, time)
+        values = self.read_primvar(primvar)
         if values is None or values.ndim != 3 or values.shape[2] < 2:
             return np.full((len(self.corners), 3, 2), np.nan)
         return np.asarray(values[..., :2], np.float64)
 
 
-def cut_mesh(placed: PlacedPrim, time: Any, max_faces: int | None = None) -> CutMesh:
-    """Return the triangles of a mesh or solid at a time, posed by its skeleton, without its holes.
+def cut_mesh(placed: PlacedPrim, max_faces: int | None = None) -> CutMesh:
+    """Return the triangles of a mesh or solid, posed by its skeleton, without its holes.
 
     A mirroring transform reverses the order of corners. More than `max_faces` triangles are not
     cut.
@@ -115,6 +115,7 @@ def cut_mesh(placed: PlacedPrim, time: Any, max_faces: int | None = None) -> Cut
         TrilightError: its arrays contradict each other, or are not finite.
     """
     prim = placed.prim
+    time = placed.time
     holes = as_array(None, np.int64, (-1,))
     if prim.GetTypeName() in SOLIDS:
         points, counts, indices, is_smooth = _build_solid(prim, time)

@@ -48,18 +48,18 @@ class TextureNode:
     """[4] RGBA value used without a picture; None where none is stated."""
 
 
-def read_texture_node(shader: Any, output: str, time: Any, opened: OpenedStage) -> TextureNode:
+def read_texture_node(shader: Any, output: str, opened: OpenedStage) -> TextureNode:
     """Return the inputs of a UsdUVTexture shader.
 
     Args:
         shader: the node.
         output: name of the connected output.
-        time: time of the values.
         opened: the file, which resolves paths and receives notes.
 
     Raises:
         TrilightError: its picture is outside of the folder, or on the network, or Malformed.
     """
+    time = opened.time
     sources = find_sources(shader, "file")
     attribute = sources[0] if sources else None
     asset = attribute.Get(time) if attribute else None
