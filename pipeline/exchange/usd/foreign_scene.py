@@ -48,7 +48,7 @@ from pipeline.foreign.usd.placed import DOMES, SOLIDS, PlacedPrim, placed_prims
 from pipeline.foreign.usd.polygons import CutMesh, as_array, cut_mesh
 from pipeline.foreign.usd.shaders import StatedMaterial, read_material
 from pipeline.foreign.usd.stage import OpenedStage
-from pipeline.foreign.usd.texture_nodes import asset_bytes, convert_to_rec709
+from pipeline.foreign.usd.texture_nodes import asset_bytes, convert_to_rec709, resolve_file
 from pipeline.objects.licences import USER_PROVIDED
 from pipeline.scenes.shading_normals import smooth_shaded
 from storage.errors import Rejected, TrilightError
@@ -170,7 +170,7 @@ class StageReader:
                     radiance = _compute_radiance(each, lamp)
                     parts.add(self._entry(each.prim), build_lamp(lamp, radiance), is_lamp=True)
             elif sky is not None:
-                self._note(each.prim, "a second dome; a scene has one environment")
+                each.note("a second dome; a scene has one environment")
             else:
                 sky = _read_dome(each, self._opened)
         is_lit = sky is not None and sky.radiance_rgb.any()
@@ -183,9 +183,6 @@ class StageReader:
         provenance = {"template": "usd", "file": self._opened.path.name, "time_code": code}
         return parts.build(cameras, sky, provenance, self._lost)
 
-    def _note(self, prim: Any, text: str) -> None:
-        self._lost.append(f"{prim.GetPath()}: {text}")
-
     def _entry(self, prim: Any) -> SceneObject:
         """Return the object entry of a prim: values that Trilight wrote on it, or its name."""
         fields = layout.OBJECT_TEXTS.items()
@@ -196,25 +193,21 @@ class StageReader:
 
     def _read_camera(self, placed: PlacedPrim) -> tuple[NDArray[np.float64], float] | None:
         """Return pose [4, 4] and full angle in degrees of a camera; None for an unusable one."""
-        time = placed.time
-        camera = UsdGeom.Camera(placed.prim)
         names = ("focalLength", "horizontalAperture", "verticalAperture")
-        lens = map(placed.prim.GetAttribute, names)
-        focal, wide, high = (read_number(each.Get(time), str(each.GetPath())) for each in lens)
+        focal, wide, high = (_read(placed, name) for name in names)
         pose = rigid_pose(placed.to_world)
-        if camera.GetProjectionAttr().Get(time) != "perspective" or pose is None or not focal > 0:
-            self._note(placed.prim, "no perspective camera with a focal length")
+        if placed.value("projection") != "perspective" or pose is None or not focal > 0:
+            placed.note("no perspective camera with a focal length")
             return None
         angle = math.degrees(2 * math.atan(wide / (2 * focal)))
-        held = placed.prim.GetAttribute(layout.FOV_DEG).Get(time)
+        held = placed.value(layout.FOV_DEG)
         is_held = isinstance(held, float) and math.isclose(held, angle, rel_tol=layout.SAME_VALUE)
         if not is_held and not math.isclose(wide, high, rel_tol=1e-4):
-            self._note(placed.prim, "pictures are square; its horizontal angle was used")
-        if any(a.Get(time) for a in (camera.GetHorizontalApertureOffsetAttr(),
-                                     camera.GetVerticalApertureOffsetAttr())):  # fmt: skip
-            self._note(placed.prim, "its shift has no place here")
-        if camera.GetFStopAttr().Get(time):
-            self._note(placed.prim, "depth of field has no place here")
+            placed.note("pictures are square; its horizontal angle was used")
+        if any(placed.value(f"{axis}ApertureOffset") for axis in ("horizontal", "vertical")):
+            placed.note("its shift has no place here")
+        if placed.value("fStop"):
+            placed.note("depth of field has no place here")
         angle = held if is_held else angle
         return (pose, angle) if 0 < angle < 180 else None
 
@@ -228,13 +221,13 @@ class StageReader:
             if not (cut.is_smooth or placed.skin is not None):
                 return unit_normals(None, flat)
             if placed.skin is not None:
-                self._note(cut.prim, "posed by bones; its normals are those of its faces")
+                placed.note("posed by bones; its normals are those of its faces")
             elif cut.prim.GetTypeName() == "Mesh":
-                self._note(cut.prim, "subdivision; its cage was read, with smooth normals")
+                placed.note("subdivision; its cage was read, with smooth normals")
             return _smooth(positions, cut)
         normals = cut.per_corner(*stated)
         if normals is None:
-            self._note(cut.prim, "the number of normals does not match")
+            placed.note("the number of normals does not match")
             return unit_normals(None, flat)
         normal_matrix = np.linalg.inv(placed.to_world[:3, :3]).T
         return unit_normals(np.einsum("ij,tcj->tci", normal_matrix, normals), flat)
@@ -250,9 +243,9 @@ class StageReader:
         cut = cut_mesh(placed)
         positions, flat, has_area = drop_empty(cut.world_points[cut.indices[cut.corners]])
         if not has_area.all():
-            self._note(cut.prim, f"{int((~has_area).sum())} triangles without an area")
+            placed.note(f"{int((~has_area).sum())} triangles without an area")
         if not len(positions):
-            self._note(cut.prim, "no triangle with an area")
+            placed.note("no triangle with an area")
             return None
         cut = cut.select(has_area)
         normals = self._normals(cut, positions, flat)
@@ -273,13 +266,12 @@ class StageReader:
         """Multiply the emission of a mesh with that of its light, or replace it."""
         rows = triangles.rows
         light = _compute_radiance(placed, triangles.positions)
-        mode = placed.prim.GetAttribute("light:materialSyncMode").Get(placed.time)
+        mode = placed.value("light:materialSyncMode")
         glows = rows[:, EMISSION].any()
         tints = mode == "materialGlowTintsLight" and glows
         rows[:, EMISSION] = rows[:, EMISSION] * light if tints else light
         if mode == "materialGlowTintsLight" and not glows:
-            text = "its material emits nothing; the radiance of the light is used"
-            self._note(placed.prim, text)
+            placed.note("its material emits nothing; the radiance of the light is used")
 
     def _convert_row(
         self,
@@ -330,7 +322,9 @@ class StageReader:
             self._lost.append(_HELD)
             stated, exact = held.restore(stated)
         if stated is None:
-            self._note(material, "no supported shader; its display color is used")
+            self._lost.append(
+                f"{material.GetPath()}: no supported shader; its display color is used"
+            )
             return None
         added = {name: columns[name] for name in columns.keys() - layout.MATERIAL_ATTRIBUTES.keys()}
         self._extras.append((stated.name, added, exact))
@@ -359,20 +353,17 @@ _EXPOSURES = Within(-1000, 1000, unit="stops")
 
 def _light_triangles(placed: PlacedPrim) -> NDArray[np.float32] | None:
     """Return the world-space triangles [T, 3, 3] of a light; None where it has no area."""
-    prim = placed.prim
-    kind = str(prim.GetTypeName())
+    kind = str(placed.prim.GetTypeName())
     shape, sizes = _SHAPES[kind]
-    scale = [_read(prim.GetAttribute(f"inputs:{name}"), placed.time) for name in sizes]
+    scale = [_read(placed, f"inputs:{name}") for name in sizes]
     world = np.einsum("ij,tcj->tci", placed.to_world[:3, :3], shape() * np.array([*scale, 1.0][:3]))
     world = world + placed.to_world[:3, 3]
     area = sum_area(world)
     if not area > 0 or not np.isfinite(area):
-        placed.lost.append(f"{prim.GetPath()}: a light without an area")
+        placed.note("a light without an area")
         return None
     if kind in ("RectLight", "DiskLight"):
-        placed.lost.append(
-            f"{prim.GetPath()}: emits to one side in USD, and to both sides in a scene"
-        )
+        placed.note("emits to one side in USD, and to both sides in a scene")
     return world.astype(np.float32)
 
 
@@ -383,34 +374,34 @@ def _compute_radiance(placed: PlacedPrim, triangles: NDArray[np.float32]) -> NDA
     area.
     """
     emitted = _read_light_color(placed)
-    if placed.prim.GetAttribute("inputs:normalize").Get(placed.time):
+    if placed.value("inputs:normalize"):
         area = sum_area(triangles) / placed.meters_per_unit**2
         emitted = emitted / max(area, 1e-30)
     if (emitted < 0).any():
-        placed.lost.append(f"{placed.prim.GetPath()}: negative radiance; the light emits nothing")
+        placed.note("negative radiance; the light emits nothing")
     emitted = np.maximum(emitted, 0)
     return np.where(np.isfinite(emitted), emitted, 0).astype(np.float32)
 
 
 def _read_light_color(placed: PlacedPrim) -> NDArray[np.float64]:
     """Return intensity x 2^exposure x color [3] of a light, tinted by its temperature."""
-    time = placed.time
     light = UsdLux.LightAPI(placed.prim)
-    strength = _read(light.GetIntensityAttr(), time)
-    strength *= 2.0 ** _read(light.GetExposureAttr(), time, _EXPOSURES)
+    strength = _read(placed, "inputs:intensity")
+    strength *= 2.0 ** _read(placed, "inputs:exposure", _EXPOSURES)
     stated = light.GetColorAttr()
-    rgb = read_numbers(stated.Get(time), 3, str(stated.GetPath()))
+    rgb = read_numbers(stated.Get(placed.time), 3, str(stated.GetPath()))
     color = convert_to_rec709(stated, np.array(rgb))
-    kelvin = light.GetColorTemperatureAttr()
     # Blender enables temperature on every light but sets none; the USD default would tint by 4 %
-    if light.GetEnableColorTemperatureAttr().Get(time) and kelvin.HasAuthoredValue():
-        color = color * np.array(UsdLux.BlackbodyTemperatureAsRgb(_read(kelvin, time)))
+    is_stated = light.GetColorTemperatureAttr().HasAuthoredValue()
+    if placed.value("inputs:enableColorTemperature") and is_stated:
+        kelvin = _read(placed, "inputs:colorTemperature")
+        color = color * np.array(UsdLux.BlackbodyTemperatureAsRgb(kelvin))
     _note_losses(placed)
     return np.asarray(strength * color)
 
 
-def _read(attribute: Any, time: Any, within: Within = FINITE) -> float:
-    return read_number(attribute.Get(time), str(attribute.GetPath()), within)
+def _read(placed: PlacedPrim, name: str, within: Within = FINITE) -> float:
+    return read_number(placed.value(name), f"{placed.prim.GetPath()}.{name}", within)
 
 
 def _note_losses(placed: PlacedPrim) -> None:
@@ -489,36 +480,32 @@ def _read_dome(placed: PlacedPrim, opened: OpenedStage) -> Environment | None:
         Rejected: the map has more pixels than MAX_PIXELS.
         TrilightError: its file is outside the folder or on the network.
     """
-    prim = placed.prim
-    prim_path = str(prim.GetPath())
-    radiance = _read_map(prim, opened)
-    if radiance is None:
-        return None
-    tinted = radiance * _read_light_color(placed)
-    left_basis, _, right_basis = np.linalg.svd(placed.to_world[:3, :3] @ _pole_rotation(prim))
-    rotation = left_basis @ right_basis
-    if np.linalg.det(rotation) < 0:
-        opened.lost.append(f"{prim_path}: a mirrored dome; its light was left out")
-        return None
-    visibility = prim.GetAttribute(layout.VISIBLE_TO_CAMERA)
-    sky = Environment(
-        radiance_rgb=tinted.astype(np.float32),
-        rotation=(rotation @ layout.TO_OUR_AXES.T).astype(np.float32),
-        is_seen=bool(visibility and visibility.Get(placed.time)),
-        source=MapSource(name=prim.GetName(), licence=USER_PROVIDED),
-    )
     try:
-        sky.check()
-    except TrilightError as error:
-        opened.lost.append(f"{prim_path}: {error}; its light was left out")
+        tinted = _read_map(placed, opened) * _read_light_color(placed)
+        left, _, right = np.linalg.svd(placed.to_world[:3, :3] @ _pole_rotation(placed.prim))
+        if np.linalg.det(left @ right) < 0:
+            raise Rejected("mirrored", "a mirrored dome")
+        sky = Environment(
+            radiance_rgb=tinted.astype(np.float32),
+            rotation=(left @ right @ layout.TO_OUR_AXES.T).astype(np.float32),
+            is_seen=bool(placed.value(layout.VISIBLE_TO_CAMERA)),
+            source=MapSource(name=placed.prim.GetName(), licence=USER_PROVIDED),
+        )
+        try:
+            sky.check()
+        except TrilightError as error:
+            raise Rejected("law_broken", str(error)) from error
+    except Rejected as error:
+        if error.reason in ("too_many_pixels", "texture_too_large"):
+            raise
+        placed.note(f"{error.message}; its light was left out")
         return None
     return _take_held(sky, placed)
 
 
 def _take_held(sky: Environment, placed: PlacedPrim) -> Environment:
     """Return an environment with the values that Trilight wrote on the prim of the scene."""
-    dome = placed.prim
-    stage = dome.GetStage()
+    stage = placed.prim.GetStage()
     holder = next((prim for prim in stage.Traverse() if prim.HasAttribute(layout.SKY_SOURCE)), None)
     if holder is None:
         return sky
@@ -530,7 +517,7 @@ def _take_held(sky: Environment, placed: PlacedPrim) -> Environment:
     if held is None or held[0] != sky.sha256:
         return sky
     sky = dataclasses.replace(sky, source=held[1])
-    if not dome.HasAttribute(layout.VISIBLE_TO_CAMERA):
+    if not placed.prim.HasAttribute(layout.VISIBLE_TO_CAMERA):
         sky = dataclasses.replace(sky, is_seen=bool(read_value(layout.SKY_VISIBLE)))
     rows = list(map(read_value, layout.SKY_ROWS))
     if None in rows or not np.allclose(rows, sky.rotation, atol=layout.SAME_VALUE):
@@ -548,38 +535,31 @@ def _pole_rotation(prim: Any) -> NDArray[np.float64]:
     return np.array([[1, 0, 0], [0, 0, -1], [0, 1, 0]]) if is_turned else np.eye(3)
 
 
-def _read_map(prim: Any, opened: OpenedStage) -> NDArray[np.float64] | None:
-    """Return the map [H, 2 H, 3] of a dome; uniform radiance 1 where it names no file."""
-    prim_path = str(prim.GetPath())
-    attribute = prim.GetAttribute(layout.MAP_PATH)
-    asset = attribute.Get(opened.time) if attribute else None
-    if asset is None or not asset.path:
+def _read_map(placed: PlacedPrim, opened: OpenedStage) -> NDArray[np.float64]:
+    """Return the map [H, 2 H, 3] of a dome; uniform radiance 1 where it names no file.
+
+    Raises:
+        Rejected: the map is missing, no picture that is read, or of another projection.
+    """
+    named, resolved = resolve_file(placed.prim.GetAttribute(layout.MAP_PATH), opened)
+    if not named:
         return np.ones((1, 2, 3))
-    projection = prim.GetAttribute("inputs:texture:format").Get(opened.time)
+    projection = placed.value("inputs:texture:format")
     if projection not in (None, "automatic", "latlong"):
-        opened.lost.append(f"{prim_path}: a picture of format {projection}; expected latlong")
-        return None
-    specs = attribute.GetPropertyStack(opened.time)
-    resolved = opened.resolve(specs[0].layer if specs else opened.root, asset.path)
+        raise Rejected("projection", f"a picture of format {projection}; expected latlong")
     data = None if resolved is None else asset_bytes(resolved, MAX_BYTES)
     if data is None:
-        opened.lost.append(f"{prim_path}: map {asset.path!r:.100} is missing")
-        return None
+        raise Rejected("missing_file", f"map {named!r:.100} is missing")
     try:
         picture = read_linear_picture(data, MAX_PIXELS)
         if picture is None:
-            pixels = decode_image(data, asset.path, MAX_PIXELS, opened.lost, of_scene=True)[::-1]
+            pixels = decode_image(data, named, MAX_PIXELS, opened.lost, of_scene=True)[::-1]
         else:
             pixels = picture.values
-            opened.lost += [f"{asset.path!r:.100}: {sentence}" for sentence in picture.unread]
+            opened.lost += [f"{named!r:.100}: {sentence}" for sentence in picture.unread]
     except Rejected as error:
-        if error.reason in ("too_many_pixels", "texture_too_large"):
-            raise
-        opened.lost += [
-            f"{asset.path!r:.100}: {error.message}",
-            f"{prim_path}: map {asset.path!r:.100} is not read; its light was left out",
-        ]
-        return None
+        text = error.message.removeprefix(f"{named!r:.80}: ")
+        raise Rejected(error.reason, f"map {named!r:.100} is not read: {text}") from error
     linear = Picture(values=pixels, is_srgb=pixels.dtype == np.uint8).linear(pixels)
     rgb = linear[..., :3] if linear.shape[2] >= 3 else np.repeat(linear[..., :1], 3, axis=2)
     return rgb.astype(np.float64)

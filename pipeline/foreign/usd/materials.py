@@ -161,10 +161,7 @@ class MeshMaterials:
         table = np.concatenate(list(means.values()), axis=1)
         distinct, index = np.unique(table, axis=0, return_inverse=True)
         if len(distinct) > _MOST_VARIED:
-            names = ", ".join(means)
-            cut.placed.lost.append(
-                f"{cut.prim.GetPath()}: many values of {names}: their mean is taken"
-            )
+            cut.placed.note(f"many values of {', '.join(means)}: their mean is taken")
             distinct = table.mean(axis=0, keepdims=True)
             index = np.zeros(len(table), np.int64)
         rows = []

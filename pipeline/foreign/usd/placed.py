@@ -143,6 +143,14 @@ class PlacedPrim:
     skin: BoundSkin | None = None  # the skin that poses a mesh
     lost: list[str] = field(default_factory=list)  # receives notes on contents that are not read
 
+    def value(self, name: str) -> Any:
+        """Return the value of an attribute of the prim; None without one."""
+        return self.prim.GetAttribute(name).Get(self.time)
+
+    def note(self, text: str) -> None:
+        """Note something of the prim that is not read."""
+        self.lost.append(f"{self.prim.GetPath()}: {text}")
+
 
 def placed_prims(
     stage: Any, time: Any, lost: list[str], kinds: Collection[str] = SCENE_KINDS

@@ -150,9 +150,7 @@ class StatedMaterial:
         primvar = self.primvars[name]
         values = read_colors(cut, primvar)
         if values is None:
-            cut.placed.lost.append(
-                f"{cut.prim.GetPath()}: no primvar {primvar!r:.60}; its fallback taken"
-            )
+            cut.placed.note(f"no primvar {primvar!r:.60}; its fallback taken")
         return values
 
 
