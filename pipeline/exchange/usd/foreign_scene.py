@@ -34,7 +34,7 @@ from pipeline.exchange.textured_triangles import (
 )
 from pipeline.exchange.usd import layout
 from pipeline.exchange.usd.held_materials import HeldMaterial, keep_exact, read_columns
-from pipeline.foreign.numbers import FINITE, read_number, read_numbers
+from pipeline.foreign.numbers import read_numbers
 from pipeline.foreign.picture import (
     MAX_BYTES,
     MAX_PIXELS,
@@ -194,7 +194,7 @@ class StageReader:
     def _read_camera(self, placed: PlacedPrim) -> tuple[NDArray[np.float64], float] | None:
         """Return pose [4, 4] and full angle in degrees of a camera; None for an unusable one."""
         names = ("focalLength", "horizontalAperture", "verticalAperture")
-        focal, wide, high = (_read(placed, name) for name in names)
+        focal, wide, high = map(placed.number, names)
         pose = rigid_pose(placed.to_world)
         if placed.value("projection") != "perspective" or pose is None or not focal > 0:
             placed.note("no perspective camera with a focal length")
@@ -355,7 +355,7 @@ def _light_triangles(placed: PlacedPrim) -> NDArray[np.float32] | None:
     """Return the world-space triangles [T, 3, 3] of a light; None where it has no area."""
     kind = str(placed.prim.GetTypeName())
     shape, sizes = _SHAPES[kind]
-    scale = [_read(placed, f"inputs:{name}") for name in sizes]
+    scale = [placed.number(f"inputs:{name}") for name in sizes]
     world = np.einsum("ij,tcj->tci", placed.to_world[:3, :3], shape() * np.array([*scale, 1.0][:3]))
     world = world + placed.to_world[:3, 3]
     area = sum_area(world)
@@ -386,22 +386,18 @@ def _compute_radiance(placed: PlacedPrim, triangles: NDArray[np.float32]) -> NDA
 def _read_light_color(placed: PlacedPrim) -> NDArray[np.float64]:
     """Return intensity x 2^exposure x color [3] of a light, tinted by its temperature."""
     light = UsdLux.LightAPI(placed.prim)
-    strength = _read(placed, "inputs:intensity")
-    strength *= 2.0 ** _read(placed, "inputs:exposure", _EXPOSURES)
+    strength = placed.number("inputs:intensity")
+    strength *= 2.0 ** placed.number("inputs:exposure", _EXPOSURES)
     stated = light.GetColorAttr()
     rgb = read_numbers(stated.Get(placed.time), 3, str(stated.GetPath()))
     color = convert_to_rec709(stated, np.array(rgb))
     # Blender enables temperature on every light but sets none; the USD default would tint by 4 %
     is_stated = light.GetColorTemperatureAttr().HasAuthoredValue()
     if placed.value("inputs:enableColorTemperature") and is_stated:
-        kelvin = _read(placed, "inputs:colorTemperature")
+        kelvin = placed.number("inputs:colorTemperature")
         color = color * np.array(UsdLux.BlackbodyTemperatureAsRgb(kelvin))
     _note_losses(placed)
     return np.asarray(strength * color)
-
-
-def _read(placed: PlacedPrim, name: str, within: Within = FINITE) -> float:
-    return read_number(placed.value(name), f"{placed.prim.GetPath()}.{name}", within)
 
 
 def _note_losses(placed: PlacedPrim) -> None:

@@ -251,5 +251,5 @@ def _place_meshes(opened: OpenedStage, limits: ReadLimits) -> list[PlacedPrim]:
             raise Rejected("unsupported_primitive", f"{where!r:.100} is a {kind}; make it a mesh")
         scheme = each.prim.GetAttribute("subdivisionScheme")
         if scheme and scheme.Get() != "none":
-            opened.lost.append(f"{where}: subdivision; its cage was read")
+            each.note("subdivision; its cage was read")
     return placed

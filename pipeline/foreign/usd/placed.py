@@ -147,6 +147,10 @@ class PlacedPrim:
         """Return the value of an attribute of the prim; None without one."""
         return self.prim.GetAttribute(name).Get(self.time)
 
+    def number(self, name: str, within: Within = FINITE) -> float:
+        """Return the value of an attribute that is a number; raises Malformed for another one."""
+        return read_number(self.value(name), f"{self.prim.GetPath()}.{name}", within)
+
     def note(self, text: str) -> None:
         """Note something of the prim that is not read."""
         self.lost.append(f"{self.prim.GetPath()}: {text}")

@@ -13,7 +13,6 @@ import numpy as np
 from numpy.typing import NDArray
 from pxr import UsdGeom
 
-from pipeline.foreign.numbers import read_number
 from pipeline.foreign.polygons import triangulate
 from pipeline.foreign.usd.placed import SOLIDS, PlacedPrim
 from pipeline.foreign.usd.texture_nodes import convert_to_rec709
@@ -115,20 +114,17 @@ def cut_mesh(placed: PlacedPrim, max_faces: int | None = None) -> CutMesh:
         TrilightError: its arrays contradict each other, or are not finite.
     """
     prim = placed.prim
-    time = placed.time
     holes = as_array(None, np.int64, (-1,))
     if prim.GetTypeName() in SOLIDS:
-        points, counts, indices, is_smooth = _build_solid(prim, time)
+        points, counts, indices, is_smooth = _build_solid(placed)
     else:
-        mesh = UsdGeom.Mesh(prim)
-        stated = mesh.GetPointsAttr().Get(time)
+        stated = placed.value("points")
         points = as_array(stated, np.float64, (-1, 3))
         if placed.skin is not None and len(points):
-            points = placed.skin.pose(prim, stated, time)
-        counts = as_array(mesh.GetFaceVertexCountsAttr().Get(time), np.int64, (-1,))
-        indices = as_array(mesh.GetFaceVertexIndicesAttr().Get(time), np.int64, (-1,))
-        holes = as_array(mesh.GetHoleIndicesAttr().Get(time), np.int64, (-1,))
-        is_smooth = mesh.GetSubdivisionSchemeAttr().Get() != "none"
+            points = placed.skin.pose(prim, stated, placed.time)
+        names = ("faceVertexCounts", "faceVertexIndices", "holeIndices")
+        counts, indices, holes = (as_array(placed.value(name), np.int64, (-1,)) for name in names)
+        is_smooth = placed.value("subdivisionScheme") != "none"
     _check(prim, points, counts, indices)
     num_faces = int(np.maximum(counts - 2, 0).sum())
     if max_faces is not None and num_faces > max_faces:
@@ -183,20 +179,17 @@ Polygons = tuple[NDArray[np.float64], NDArray[np.int64], NDArray[np.int64], bool
 """Points [P, 3], corner counts [F], point indices of corners, and whether the solid is round."""
 
 
-def _build_solid(prim: Any, time: Any) -> Polygons:
-    """Return the polygons at a time of a prim whose type is in SOLIDS."""
-    kind = str(prim.GetTypeName())
-
-    def read_size(name: str) -> float:
-        return read_number(prim.GetAttribute(name).Get(time), f"{prim.GetPath()}.{name}")
-
+def _build_solid(placed: PlacedPrim) -> Polygons:
+    """Return the polygons of a prim whose type is in SOLIDS."""
+    kind = str(placed.prim.GetTypeName())
+    read_size = placed.number
     if kind == "TetMesh":
-        return _read_tetrahedra(prim, time)
+        return _read_tetrahedra(placed)
     if kind == "Cube":
         corners = np.array([[x, y, z] for z in (-1, 1) for y in (-1, 1) for x in (-1, 1)])
         sides = [[0, 2, 3, 1], [4, 5, 7, 6], [0, 1, 5, 4], [2, 6, 7, 3], [0, 4, 6, 2], [1, 3, 7, 5]]
         return corners * read_size("size") / 2, np.full(6, 4), np.ravel(sides), False
-    axis = "Z" if kind == "Sphere" else str(prim.GetAttribute("axis").Get())
+    axis = "Z" if kind == "Sphere" else str(placed.prim.GetAttribute("axis").Get())
     if kind == "Plane":
         wide = read_size("width") / 2
         long = read_size("length") / 2
@@ -250,11 +243,10 @@ def _revolve(
     return np.concatenate(rings), counts[counts > 0], sides[is_corner]
 
 
-def _read_tetrahedra(prim: Any, time: Any) -> Polygons:
-    mesh = UsdGeom.TetMesh(prim)
-    faces = mesh.GetSurfaceFaceVertexIndicesAttr().Get(time)
+def _read_tetrahedra(placed: PlacedPrim) -> Polygons:
+    faces = placed.value("surfaceFaceVertexIndices")
     if not faces:
-        faces = UsdGeom.TetMesh.ComputeSurfaceFaces(mesh, time)
-    points = np.array(mesh.GetPointsAttr().Get(time) or np.zeros((0, 3)), np.float64)
+        faces = UsdGeom.TetMesh.ComputeSurfaceFaces(UsdGeom.TetMesh(placed.prim), placed.time)
+    points = np.array(placed.value("points") or np.zeros((0, 3)), np.float64)
     sides = np.array(faces or np.zeros((0, 3)), np.int64).reshape(-1, 3)
     return points, np.full(len(sides), 3), sides.ravel(), False
