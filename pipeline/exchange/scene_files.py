@@ -216,14 +216,12 @@ def load_mesh_file(
         raise TrilightError(f"{display_name}: {rejection}; expected a usable mesh.") from rejection
     except OSError as error:
         raise TrilightError(f"{display_name}: cannot be read ({error.strerror}).") from error
-    centre = raw.positions.mean(axis=0)
     return LoadedMesh(
         uid=uid,
         licence=licence,
         positions=mesh.positions,
         faces=mesh.faces,
-        centre=centre,
-        reach=float(np.sqrt(np.sum(np.square(raw.positions - centre), axis=1).max())),
+        stated=raw.positions,
         unread=source.unread,
         sha256=source.sha256,
     )
