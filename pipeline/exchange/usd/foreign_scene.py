@@ -478,12 +478,15 @@ def _read_dome(placed: PlacedPrim, opened: OpenedStage) -> Environment | None:
     """
     try:
         tinted = _read_map(placed, opened) * _read_light_color(placed)
-        left, _, right = np.linalg.svd(placed.to_world[:3, :3] @ _pole_rotation(placed.prim))
-        if np.linalg.det(left @ right) < 0:
+        first_basis, _, last_basis = np.linalg.svd(
+            placed.to_world[:3, :3] @ _pole_rotation(placed.prim)
+        )
+        rotation = first_basis @ last_basis
+        if np.linalg.det(rotation) < 0:
             raise Rejected("mirrored", "a mirrored dome")
         sky = Environment(
             radiance_rgb=tinted.astype(np.float32),
-            rotation=(left @ right @ layout.TO_OUR_AXES.T).astype(np.float32),
+            rotation=(rotation @ layout.TO_OUR_AXES.T).astype(np.float32),
             is_seen=bool(placed.value(layout.VISIBLE_TO_CAMERA)),
             source=MapSource(name=placed.prim.GetName(), licence=USER_PROVIDED),
         )

@@ -109,7 +109,7 @@ def _open(path: Path, folder: Path | None) -> Iterator[OpenedStage]:
 
 
 def _read_foreign(opened: OpenedStage, key: str | None) -> LoadedScene:
-    """Read a stage that Trilight did not write, or not so, at a time code or the first."""
+    """Read a stage as any other file, at a time code or the first one."""
     stage = opened.compose()
     frames = list(_frames(stage))
     if _find_root(opened.root, None) is not None:

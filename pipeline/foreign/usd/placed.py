@@ -213,7 +213,7 @@ def _stage_to_world(stage: Any, meters_per_unit: float) -> NDArray[np.float64]:
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class _Visit(PlacedPrim):
-    """A prim with the state that it inherits from its ancestors; first, their transform alone."""
+    """A prim with what it inherits; `to_world` is its parent's until its own one is applied."""
 
     origin: NDArray[np.float64]  # start of `!resetXformStack!`: of the stage, or of an instance
     purpose: str = "default"

@@ -82,7 +82,7 @@ def read_texture_node(shader: Any, output: str, opened: OpenedStage) -> TextureN
 
 
 def resolve_file(attribute: Any, opened: OpenedStage) -> tuple[str, str | None]:
-    """Return the path in an attribute, or an empty one; and the resolved path of a file there.
+    """Return the path that an attribute states, or an empty one; and the resolved path, if any.
 
     Raises:
         TrilightError: the file is outside of the folder, or on the network.
