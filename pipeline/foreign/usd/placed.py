@@ -35,18 +35,15 @@ class BoundSkin:
     skeleton: Any  # UsdSkel.SkeletonQuery
     binding: Any  # UsdSkel.SkinningQuery
 
-    def pose(self, prim: Any, stated: Any, time: Any) -> NDArray[np.float64]:
+    def pose(self, placed: "PlacedPrim") -> NDArray[np.float64]:
         """Return the posed points [P, 3] of a mesh in its own space.
-
-        Args:
-            prim: the mesh.
-            stated: unposed points as a USD array.
-            time: time of the pose.
 
         Raises:
             UnposedMesh: joints, weights and points contradict each other.
         """
-        points = Vt.Vec3fArray(stated)
+        prim = placed.prim
+        time = placed.time
+        points = Vt.Vec3fArray(placed.value("points"))
         if self.binding.HasBlendShapes():
             _blend_shapes(self.skeleton, self.binding, prim, points, time)
         if not self.binding.HasJointInfluences():

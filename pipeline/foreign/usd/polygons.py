@@ -118,10 +118,9 @@ def cut_mesh(placed: PlacedPrim, max_faces: int | None = None) -> CutMesh:
     if prim.GetTypeName() in SOLIDS:
         points, counts, indices, is_smooth = _build_solid(placed)
     else:
-        stated = placed.value("points")
-        points = as_array(stated, np.float64, (-1, 3))
+        points = as_array(placed.value("points"), np.float64, (-1, 3))
         if placed.skin is not None and len(points):
-            points = placed.skin.pose(prim, stated, placed.time)
+            points = placed.skin.pose(placed)
         names = ("faceVertexCounts", "faceVertexIndices", "holeIndices")
         counts, indices, holes = (as_array(placed.value(name), np.int64, (-1,)) for name in names)
         is_smooth = placed.value("subdivisionScheme") != "none"
