@@ -31,13 +31,13 @@ from model.inference import NeuralRenderer
 from model.open import find_network
 from model.weights import network_digest
 from pipeline.exchange.exports.export import picture_name
-from pipeline.exchange.pictures import MAX_BYTES, decode_pixels
+from pipeline.foreign.picture import MAX_BYTES, MAX_PIXELS, read_linear_picture
 from pipeline.renders.mitsuba_variant import choose_variant
 from pipeline.renders.preview import MOST_SPP, PreviewSettings
 from storage.atomic import write_atomically
 from storage.dataset.training_data import TrainingData, open_training_data
 from storage.digests import sha256_hex
-from storage.errors import TrilightError
+from storage.errors import Rejected, TrilightError
 from storage.machine import processor
 from storage.records.safe_read import name_unreadable, read_plain
 from storage.records.sample import Sample
@@ -538,20 +538,25 @@ def _read_picture(path: Path, widths: Sequence[int]) -> tuple[bytes, NDArray[np.
         if path.stat().st_size > MAX_BYTES:
             raise TrilightError(f"{path.name}: expected a picture of at most {MAX_BYTES} bytes.")
         data = read_plain(path)
-    pixels = decode_pixels(data, path.name, [])
-    if pixels is None or pixels.dtype != np.float32 or pixels.shape[2] < 3:
+    try:
+        linear = read_linear_picture(data, MAX_PIXELS)
+    except Rejected as error:
+        if error.reason == "too_many_pixels":
+            raise TrilightError(f"{path.name}: {error.message}.") from error
+        linear = None
+    if linear is None or linear.values.shape[2] < 3:
         raise TrilightError(
             f"{path.name}: no readable OpenEXR picture of channels R, G and B; expected linear "
             "radiance as `trilight export SET --form exr` writes it."
         )
-    height, width = pixels.shape[:2]
+    height, width = linear.values.shape[:2]
     if height != width or width not in widths:
         expected = " or ".join(f"{each} x {each}" for each in widths)
         raise TrilightError(
             f"{path.name}: {width} x {height} pixels; expected {expected}. Render it at that size, "
             "or choose another width."
         )
-    radiance_rgb = np.asarray(pixels[..., :3], np.float32)
+    radiance_rgb = linear.values[..., :3].copy()
     illegal = ~(np.isfinite(radiance_rgb) & (radiance_rgb >= _LEAST))
     if illegal.any():
         row, column, channel = (int(place) for place in np.argwhere(illegal)[0])

@@ -86,15 +86,8 @@ def mesh_of_arrays(positions: ArrayLike, faces: ArrayLike, *, uid: str, licence:
             f"{uid}: triangles name vertices {rows.min()} to {rows.max()}; expected 0 to "
             f"{len(points) - 1}."
         )
-    centre = points.mean(axis=0)
-    reach = float(np.sqrt(np.sum(np.square(points - centre), axis=1).max()))
     return LoadedMesh(
-        uid=uid,
-        licence=licence,
-        positions=points,
-        faces=rows.astype(np.int64),
-        centre=centre,
-        reach=reach,
+        uid=uid, licence=licence, positions=points, faces=rows.astype(np.int64), stated=points
     )
 
 
@@ -164,7 +157,8 @@ class SceneBuilder:
             loaded = (path, licence)
         if size is not None and not 0 < size < np.inf:
             raise TrilightError(f"{name}: size is {size}; expected meters above 0.")
-        if size is not None and isinstance(loaded, LoadedMesh) and loaded.reach == 0:
+        is_point = isinstance(loaded, LoadedMesh) and not np.ptp(loaded.positions, axis=0).any()
+        if size is not None and is_point:
             raise TrilightError(f"{name}: all vertices are one point; expected a mesh.")
         scale = 1.0 if size is None else float(size)
         transform = DescribedTransform(

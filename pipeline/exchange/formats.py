@@ -15,11 +15,11 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from pipeline.assets.settings import AssetSettings
-from pipeline.exchange.from_description import AlbedoOverOne, Cameras, scaled_albedo_notes
+from pipeline.exchange.from_description import AlbedoOverOne, Cameras
 from pipeline.exchange.gltf import read_gltf, write_gltf
 from pipeline.exchange.renderformer_h5 import read_renderformer_h5, write_renderformer_h5
 from pipeline.exchange.renderformer_json import write_renderformer_json
-from pipeline.exchange.scene_files import build_scene, read_scene_cameras, read_scene_description
+from pipeline.exchange.scene_files import build_scene, read_scene_cameras
 from pipeline.exchange.textured_triangles import LoadedScene as LoadedScene
 from pipeline.exchange.textured_triangles import Pictures as Pictures
 from pipeline.foreign.limits import WRITTEN_USD_SUFFIXES
@@ -124,19 +124,14 @@ def _write_usd_shard(target: Path, scenes: Iterable[tuple[str, Scene]]) -> None:
 
 
 def _read_json(source: SceneSource, pictures: bool) -> LoadedScene:
-    root = source.path.parent.resolve()
-    name = source.path.name
-    description = read_scene_description(root, name)
-    notes = [f"unknown field {field}" for field in description.unknown_fields]
-    scene, _ = build_scene(
-        root,
-        name,
+    loaded, _ = build_scene(
+        source.path.parent.resolve(),
+        source.path.name,
         AssetSettings(),
         licence=USER_PROVIDED,
         albedo_over_one=source.albedo_over_one,
-        notes=notes,
     )
-    return LoadedScene(scene=scene, notes=(*notes, *scaled_albedo_notes(scene)))
+    return loaded
 
 
 def _write_scene_file(target: Path, scene: Scene, pictures: Pictures) -> Iterable[str]:

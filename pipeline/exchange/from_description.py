@@ -153,8 +153,7 @@ class LoadedMesh:
     licence: str  # SPDX identifier, or `LicenseRef-...`
     positions: NDArray[np.float64]  # [V, 3] in the units of the file
     faces: NDArray[np.int64]  # [F, 3]
-    centre: NDArray[np.float64]  # [3] mean of the vertices in the file
-    reach: float  # distance of the farthest vertex from `centre`
+    stated: NDArray[np.float64]  # [N, 3] vertices of the file, whose sphere is normalized
     unread: tuple[str, ...] = ()  # parts of the file that were ignored
     sha256: str = ""  # digest of the file, in hex
 
@@ -221,7 +220,9 @@ def _pieces(
     transform = described.transform
     points = mesh.positions
     if transform.normalize:
-        points = (points - mesh.centre) / (2 * mesh.reach)
+        centre = mesh.stated.mean(axis=0)
+        reach = float(np.sqrt(np.sum(np.square(mesh.stated - centre), axis=1).max()))
+        points = (points - centre) / (2 * reach)
     rotated = rotate_points(points, rotation_xyz(transform.rotation))
     world = rotated * np.array(transform.scale) + np.array(transform.translation)
     positions = world.astype(np.float32)

@@ -26,7 +26,6 @@ from numpy.typing import NDArray
 
 from pipeline.documents.png import encode_png
 from pipeline.exchange.part_materials import Part, PartConverter, drop_empty, unit_normals
-from pipeline.exchange.pictures import decode_values
 from pipeline.exchange.textured_triangles import (
     LoadedScene,
     Map,
@@ -49,6 +48,7 @@ from pipeline.foreign.gltf.nodes import PlacedNode, entry, extension, placed_nod
 from pipeline.foreign.gltf.primitives import PlacedPrimitive, placed_primitives
 from pipeline.foreign.limits import ReadLimits
 from pipeline.foreign.numbers import read_number, read_numbers
+from pipeline.foreign.picture import MAX_PIXELS, decode_image
 from pipeline.foreign.source_file import read_source
 from pipeline.objects.licences import USER_PROVIDED
 from storage.atomic import write_atomically
@@ -96,7 +96,7 @@ class _GltfReader:
         self._converter = PartConverter(self.lost)
         self._materials = GltfMaterials(
             document,
-            lambda data, name: decode_values(data, name, self.lost),
+            lambda data, name: decode_image(data, name, MAX_PIXELS, self.lost, of_scene=True),
             emission=True,
             notes=self.lost,
         )

@@ -18,11 +18,12 @@ from pipeline.exchange.from_description import (
     CameraFile,
     Cameras,
     LoadedMesh,
-    SceneDescription,
     build_cameras,
+    scaled_albedo_notes,
     scene_from_description,
 )
 from pipeline.exchange.renderformer_json import MAX_BYTES, read_record, read_renderformer_json
+from pipeline.exchange.textured_triangles import LoadedScene
 from pipeline.foreign.material_files import find_in_any_case
 from storage.digests import sha256_hex
 from storage.errors import EnvironmentFailure, Rejected, TrilightError
@@ -88,7 +89,7 @@ class SceneFiles:
         name = self.names[scene_index]
         if (why := self.unusable.get(name)) is not None:
             raise Rejected("unusable_scene_file", why)
-        scene, digests = build_scene(
+        loaded, digests = build_scene(
             self.root,
             name,
             assets,
@@ -104,12 +105,7 @@ class SceneFiles:
                     f"{uid}: has changed while the dataset was being made; restore it and run the "
                     "same command again."
                 )
-        return scene
-
-
-def read_scene_description(root: Path, name: str) -> SceneDescription:
-    """Read and parse a scene file of the folder `root`; raises TrilightError."""
-    return read_renderformer_json(_read_scene_file(root, name), name)
+        return loaded.scene
 
 
 def read_scene_cameras(root: Path, name: str) -> Cameras:
@@ -132,12 +128,11 @@ def build_scene(
     scene_index: int = 0,
     seed: int = 0,
     albedo_over_one: AlbedoOverOne = "scale",
-    notes: list[str] | None = None,
-) -> tuple[Scene, Mapping[str, str]]:
+) -> tuple[LoadedScene, Mapping[str, str]]:
     """Build the scene of one file; only child processes call this, since it reads meshes.
 
-    `num_views` cameras are taken, or all; index and seed stand in the provenance only. `notes`
-    receives a sentence for each ignored part of a mesh file. The scene comes with the sha256 of
+    `num_views` cameras are taken, or all; index and seed stand in the provenance only. Notes name
+    what was ignored in any file, and objects that became darker. The scene comes with the sha256 of
     each of its files by path below `root`, a folder whose links are resolved.
 
     Raises:
@@ -148,6 +143,7 @@ def build_scene(
     objects = description.objects.values()
     num_views = len(description.cameras) if num_views is None else num_views
     digests = {name: sha256_hex(data)}
+    notes = [f"unknown field {field}" for field in description.unknown_fields]
     meshes: dict[tuple[str, int | None], LoadedMesh] = {}
     for described in objects:
         key = (described.mesh_path, described.remesh_faces)
@@ -160,8 +156,7 @@ def build_scene(
                 path, uid, display_name, settings, licence, described.remesh_faces
             )
             digests[uid] = meshes[key].sha256
-            if notes is not None:
-                notes += (f"{uid}: {text}" for text in meshes[key].unread)
+            notes += (f"{uid}: {text}" for text in meshes[key].unread)
     scene = scene_from_description(
         description,
         [meshes[described.mesh_path, described.remesh_faces] for described in objects],
@@ -181,7 +176,7 @@ def build_scene(
             },
         },
     )
-    return scene, digests
+    return LoadedScene(scene=scene, notes=(*notes, *scaled_albedo_notes(scene))), digests
 
 
 def load_mesh_file(
@@ -221,14 +216,12 @@ def load_mesh_file(
         raise TrilightError(f"{display_name}: {rejection}; expected a usable mesh.") from rejection
     except OSError as error:
         raise TrilightError(f"{display_name}: cannot be read ({error.strerror}).") from error
-    centre = raw.positions.mean(axis=0)
     return LoadedMesh(
         uid=uid,
         licence=licence,
         positions=mesh.positions,
         faces=mesh.faces,
-        centre=centre,
-        reach=float(np.sqrt(np.sum(np.square(raw.positions - centre), axis=1).max())),
+        stated=raw.positions,
         unread=source.unread,
         sha256=source.sha256,
     )
@@ -287,7 +280,7 @@ def find_scene_files(folder: str, albedo_over_one: AlbedoOverOne = "scale") -> S
     unusable = {}
     for name in names:
         try:
-            description = read_scene_description(root, name)
+            description = read_renderformer_json(_read_scene_file(root, name), name)
             num_cameras[name] = len(description.cameras)
             notes += (f"{name}: unknown field {field}" for field in description.unknown_fields)
         except EnvironmentFailure:

@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from PIL import Image, UnidentifiedImageError
 
 from pipeline.foreign import openexr, radiance_hdr
-from pipeline.foreign.linear_picture import LinearPicture, clip_to_unit
+from pipeline.foreign.linear_picture import LinearPicture, clip_to_unit, require_pixels
 from storage.conventions import linear_from_srgb, linear_from_srgb8
 from storage.errors import Rejected
 from storage.records.exr import MAGIC
@@ -34,6 +34,10 @@ UNREADABLE_PICTURE = (
     "write it again"
 )
 """Text that records hold for such a picture, since they never quote a library."""
+
+MAX_BYTES = 256 << 20
+MAX_PIXELS = 64 << 20
+"""Maximum size of one picture of a scene; those of an object have a common one (`Decoder`)."""
 
 _STRIP = 256  # rows; an even number, since pairs of rows are averaged
 _MOST = 65504.0
@@ -81,14 +85,14 @@ class Decoder:
 
 
 def decode_image(
-    data: bytes, name: str, max_pixels: int, notes: list[str], *, replaces_nan: bool = False
+    data: bytes, name: str, max_pixels: int, notes: list[str], *, of_scene: bool = False
 ) -> NDArray:
     """Return a picture [H, W, 4], row 0 at the bottom: uint8, or uint16 for grays of 16 bits.
 
     Palettes, grays, transparency and CMYK become RGBA; colors of 16 bits are reduced to 8. OpenEXR
     and Radiance are float16, clipped to 0 from below; emission may exceed 1, other slots cut it.
-    `notes` receives sentences on what is not read, cut, or replaced. With `replaces_nan` NaN
-    becomes 0; without, it is refused.
+    `notes` receives sentences on what is not read, cut, or replaced. In pictures of scenes NaN
+    becomes 0; those of objects are refused for it.
 
     Raises:
         Rejected: texture_too_large or texture_unreadable.
@@ -99,6 +103,8 @@ def decode_image(
             with warnings.catch_warnings():
                 warnings.simplefilter("ignore", Image.DecompressionBombWarning)  # ours is stricter
                 with Image.open(io.BytesIO(data), formats=FORMATS) as image:
+                    if of_scene:
+                        require_pixels(image.width, image.height, max_pixels)
                     if image.width * image.height > max_pixels:
                         raise Rejected(
                             "texture_too_large",
@@ -110,7 +116,7 @@ def decode_image(
                     linear = LinearPicture(values=np.asarray(image, np.float32)[..., None])
         values = linear.values
         sentences = list(linear.unread)
-        if replaces_nan and not np.isfinite(values).all():
+        if of_scene and not np.isfinite(values).all():
             sentences.append("texels that are no finite numbers: NaN replaced by 0")
             values = np.nan_to_num(values, nan=0.0)
         sentences += clip_to_unit(values)[1]

@@ -16,7 +16,7 @@ from typing import Any
 import numpy as np
 
 from pipeline.assets.settings import AssetSettings
-from pipeline.exchange.from_description import AlbedoOverOne, scaled_albedo_notes
+from pipeline.exchange.from_description import AlbedoOverOne
 from pipeline.exchange.scene_files import SceneFiles, build_scene, require_usable
 from pipeline.generation.dataset_writer import DatasetWriter
 from pipeline.generation.prepare_isolated import asset_child
@@ -377,7 +377,11 @@ def _build_all(
     left_out = (f"{name} is left out: {why.rstrip('.')}" for name, why in unusable.items())
     notes += (*left_out, *folder.notes, *folder.unused_camera_notes(num_views))
     return dataclasses.replace(
-        folder, sha256=sha256, unusable=unusable, licence=licence, notes=tuple(notes)
+        folder,
+        sha256=sha256,
+        unusable=unusable,
+        licence=licence,
+        notes=tuple(dict.fromkeys(notes)),  # the folder's unknown fields are those of its scenes
     )
 
 
@@ -389,16 +393,7 @@ def build_once(
     Files are named by their path below the folder. Runs only in child processes; raises as
     `build_scene`.
     """
-    unread: list[str] = []
-    scene, sha256 = build_scene(
-        root,
-        name,
-        settings,
-        licence="",
-        num_views=num_views,
-        scene_index=0,
-        seed=0,
-        albedo_over_one=over_one,
-        notes=unread,
+    loaded, sha256 = build_scene(
+        root, name, settings, licence="", num_views=num_views, albedo_over_one=over_one
     )
-    return sha256, tuple(f"{name}: {text}" for text in (*unread, *scaled_albedo_notes(scene)))
+    return sha256, tuple(f"{name}: {text}" for text in loaded.notes)

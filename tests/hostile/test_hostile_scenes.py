@@ -72,11 +72,13 @@ class Outcome:
 
 def smaller_limits() -> None:
     """Prepare a child."""
-    from pipeline.exchange import pictures
+    from pipeline.exchange import gltf
+    from pipeline.exchange.usd import foreign_scene, write_materials
     from pipeline.foreign.usd import placed, stage
 
     stage.MAX_PRIMS, stage.MAX_COMPOSITION_S = 2000, 0.3
-    placed.MAX_PLACED, pictures.MAX_PIXELS = 2000, 1 << 20
+    placed.MAX_PLACED = 2000
+    gltf.MAX_PIXELS = foreign_scene.MAX_PIXELS = write_materials.MAX_PIXELS = 1 << 20
 
 
 def outcome(path: str) -> Outcome:

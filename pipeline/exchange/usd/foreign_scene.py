@@ -23,7 +23,6 @@ from pxr import UsdGeom, UsdLux
 
 from pipeline.exchange.from_description import SMOOTH_ANGLE_DEG
 from pipeline.exchange.part_materials import Part, PartConverter, drop_empty, unit_normals
-from pipeline.exchange.pictures import MAX_BYTES, decode_pixels, decode_values
 from pipeline.exchange.textured_triangles import (
     SceneParts,
     TexturedTriangles,
@@ -35,18 +34,24 @@ from pipeline.exchange.textured_triangles import (
 )
 from pipeline.exchange.usd import layout
 from pipeline.exchange.usd.held_materials import HeldMaterial, keep_exact, read_columns
-from pipeline.foreign.numbers import FINITE, read_number, read_numbers
-from pipeline.foreign.picture import Picture
+from pipeline.foreign.numbers import read_numbers
+from pipeline.foreign.picture import (
+    MAX_BYTES,
+    MAX_PIXELS,
+    Picture,
+    decode_image,
+    read_linear_picture,
+)
 from pipeline.foreign.usd.materials import MeshMaterials
 from pipeline.foreign.usd.object_source import read_stage_materials
 from pipeline.foreign.usd.placed import DOMES, SOLIDS, PlacedPrim, placed_prims
 from pipeline.foreign.usd.polygons import CutMesh, as_array, cut_mesh
 from pipeline.foreign.usd.shaders import StatedMaterial, read_material
 from pipeline.foreign.usd.stage import OpenedStage
-from pipeline.foreign.usd.texture_nodes import asset_bytes, convert_to_rec709
+from pipeline.foreign.usd.texture_nodes import asset_bytes, convert_to_rec709, resolve_file
 from pipeline.objects.licences import USER_PROVIDED
 from pipeline.scenes.shading_normals import smooth_shaded
-from storage.errors import TrilightError
+from storage.errors import Rejected, TrilightError
 from storage.records.material import EMISSION, column_places
 from storage.records.scene import Scene, SceneObject
 from storage.records.texture import Environment, MapSource, Texture
@@ -83,16 +88,16 @@ def _smooth(positions: NDArray[np.float32], cut: CutMesh) -> NDArray[np.float32]
     return shaded.normals[shaded.faces]
 
 
-def _stated_normals(prim: Any, time: Any) -> tuple[NDArray[np.float64], str] | None:
-    mesh = UsdGeom.Mesh(prim)
+def _stated_normals(placed: PlacedPrim) -> tuple[NDArray[np.float64], str] | None:
+    mesh = UsdGeom.Mesh(placed.prim)
     if not mesh:
         return None
     primvar = UsdGeom.PrimvarsAPI(mesh).GetPrimvar("normals")
     if primvar and primvar.HasValue():
-        values = primvar.ComputeFlattened(time)
+        values = primvar.ComputeFlattened(placed.time)
         interpolation = str(primvar.GetInterpolation())
     else:
-        values = mesh.GetNormalsAttr().Get(time)
+        values = mesh.GetNormalsAttr().Get(placed.time)
         interpolation = str(mesh.GetNormalsInterpolation())
     if values is None or len(values) == 0:
         return None
@@ -113,7 +118,6 @@ class StageReader:
     def __init__(
         self,
         stage: Any,
-        time: Any,
         opened: OpenedStage,
         written: Mapping[str, Mapping[str, NDArray[np.float32]]],
     ) -> None:
@@ -123,21 +127,18 @@ class StageReader:
 
         Raises:
             Rejected: a picture is outside of the folder, or too large.
-            TrilightError: a picture has too many pixels.
         """
-        self._time = time
         self._lost = opened.lost
         self._opened = opened
         self._written = written
         self._converter = PartConverter(self._lost)
-        self._placed = sorted(placed_prims(stage, time, self._lost), key=_read_row)
+        self._placed = sorted(placed_prims(stage, opened.time, self._lost), key=_read_row)
         meshes = [each for each in self._placed if each.prim.GetTypeName() in _MESHES]
         # of each material: name of its prim, added columns, and exact columns if Trilight wrote it
         self._extras: list[tuple[str, dict[str, Any], dict[str, Texture] | None]] = []
         self._looks = MeshMaterials(
-            read_stage_materials(meshes, time, _MAX_PICTURE_BYTES, self._read),
-            lambda data, name: decode_values(data, name, self._lost),
-            time,
+            read_stage_materials(meshes, _MAX_PICTURE_BYTES, self._read),
+            lambda data, name: decode_image(data, name, MAX_PIXELS, self._lost, of_scene=True),
             emission=True,
             notes=self._lost,
         )
@@ -150,7 +151,7 @@ class StageReader:
             TrilightError: a count exceeds its maximum, arrays contradict each other, or the stage
                 lacks triangles or light.
         """
-        time = self._time
+        time = self._opened.time
         numbers = itertools.count()
         parts = SceneParts(self._opened.path.name)
         cameras = []
@@ -164,14 +165,14 @@ class StageReader:
             elif kind == "Camera":
                 cameras.append(self._read_camera(each))
             elif kind not in DOMES:
-                lamp = _light_triangles(each, time, self._lost)
+                lamp = _light_triangles(each)
                 if lamp is not None:
-                    radiance = _compute_radiance(each, lamp, time, self._lost)
+                    radiance = _compute_radiance(each, lamp)
                     parts.add(self._entry(each.prim), build_lamp(lamp, radiance), is_lamp=True)
             elif sky is not None:
-                self._note(each.prim, "a second dome; a scene has one environment")
+                each.note("a second dome; a scene has one environment")
             else:
-                sky = _read_dome(each.prim, each.to_world, time, self._opened)
+                sky = _read_dome(each, self._opened)
         is_lit = sky is not None and sky.radiance_rgb.any()
         if not is_lit and not parts.has_emitters:
             raise TrilightError(
@@ -181,9 +182,6 @@ class StageReader:
         code = time.GetValue() if time.IsNumeric() and not time.IsEarliestTime() else None
         provenance = {"template": "usd", "file": self._opened.path.name, "time_code": code}
         return parts.build(cameras, sky, provenance, self._lost)
-
-    def _note(self, prim: Any, text: str) -> None:
-        self._lost.append(f"{prim.GetPath()}: {text}")
 
     def _entry(self, prim: Any) -> SceneObject:
         """Return the object entry of a prim: values that Trilight wrote on it, or its name."""
@@ -195,25 +193,21 @@ class StageReader:
 
     def _read_camera(self, placed: PlacedPrim) -> tuple[NDArray[np.float64], float] | None:
         """Return pose [4, 4] and full angle in degrees of a camera; None for an unusable one."""
-        time = self._time
-        camera = UsdGeom.Camera(placed.prim)
         names = ("focalLength", "horizontalAperture", "verticalAperture")
-        lens = map(placed.prim.GetAttribute, names)
-        focal, wide, high = (read_number(each.Get(time), str(each.GetPath())) for each in lens)
+        focal, wide, high = map(placed.number, names)
         pose = rigid_pose(placed.to_world)
-        if camera.GetProjectionAttr().Get(time) != "perspective" or pose is None or not focal > 0:
-            self._note(placed.prim, "no perspective camera with a focal length")
+        if placed.value("projection") != "perspective" or pose is None or not focal > 0:
+            placed.note("no perspective camera with a focal length")
             return None
         angle = math.degrees(2 * math.atan(wide / (2 * focal)))
-        held = placed.prim.GetAttribute(layout.FOV_DEG).Get(time)
+        held = placed.value(layout.FOV_DEG)
         is_held = isinstance(held, float) and math.isclose(held, angle, rel_tol=layout.SAME_VALUE)
         if not is_held and not math.isclose(wide, high, rel_tol=1e-4):
-            self._note(placed.prim, "pictures are square; its horizontal angle was used")
-        if any(a.Get(time) for a in (camera.GetHorizontalApertureOffsetAttr(),
-                                     camera.GetVerticalApertureOffsetAttr())):  # fmt: skip
-            self._note(placed.prim, "its shift has no place here")
-        if camera.GetFStopAttr().Get(time):
-            self._note(placed.prim, "depth of field has no place here")
+            placed.note("pictures are square; its horizontal angle was used")
+        if any(placed.value(f"{axis}ApertureOffset") for axis in ("horizontal", "vertical")):
+            placed.note("its shift has no place here")
+        if placed.value("fStop"):
+            placed.note("depth of field has no place here")
         angle = held if is_held else angle
         return (pose, angle) if 0 < angle < 180 else None
 
@@ -222,18 +216,18 @@ class StageReader:
     ) -> NDArray[np.float32]:
         """Return normals [T, 3, 3] at the corners [T, 3, 3] of triangles with normals [T, 3]."""
         placed = cut.placed
-        stated = None if placed.skin is not None else _stated_normals(cut.prim, self._time)
+        stated = None if placed.skin is not None else _stated_normals(placed)
         if stated is None:
             if not (cut.is_smooth or placed.skin is not None):
                 return unit_normals(None, flat)
             if placed.skin is not None:
-                self._note(cut.prim, "posed by bones; its normals are those of its faces")
+                placed.note("posed by bones; its normals are those of its faces")
             elif cut.prim.GetTypeName() == "Mesh":
-                self._note(cut.prim, "subdivision; its cage was read, with smooth normals")
+                placed.note("subdivision; its cage was read, with smooth normals")
             return _smooth(positions, cut)
         normals = cut.per_corner(*stated)
         if normals is None:
-            self._note(cut.prim, "the number of normals does not match")
+            placed.note("the number of normals does not match")
             return unit_normals(None, flat)
         normal_matrix = np.linalg.inv(placed.to_world[:3, :3]).T
         return unit_normals(np.einsum("ij,tcj->tci", normal_matrix, normals), flat)
@@ -246,12 +240,12 @@ class StageReader:
         Raises:
             TrilightError: the arrays of the mesh contradict each other, or are not finite.
         """
-        cut = cut_mesh(placed, self._time)
+        cut = cut_mesh(placed)
         positions, flat, has_area = drop_empty(cut.world_points[cut.indices[cut.corners]])
         if not has_area.all():
-            self._note(cut.prim, f"{int((~has_area).sum())} triangles without an area")
+            placed.note(f"{int((~has_area).sum())} triangles without an area")
         if not len(positions):
-            self._note(cut.prim, "no triangle with an area")
+            placed.note("no triangle with an area")
             return None
         cut = cut.select(has_area)
         normals = self._normals(cut, positions, flat)
@@ -271,14 +265,13 @@ class StageReader:
     def _add_light(self, placed: PlacedPrim, triangles: TexturedTriangles) -> None:
         """Multiply the emission of a mesh with that of its light, or replace it."""
         rows = triangles.rows
-        light = _compute_radiance(placed, triangles.positions, self._time, self._lost)
-        mode = placed.prim.GetAttribute("light:materialSyncMode").Get(self._time)
+        light = _compute_radiance(placed, triangles.positions)
+        mode = placed.value("light:materialSyncMode")
         glows = rows[:, EMISSION].any()
         tints = mode == "materialGlowTintsLight" and glows
         rows[:, EMISSION] = rows[:, EMISSION] * light if tints else light
         if mode == "materialGlowTintsLight" and not glows:
-            text = "its material emits nothing; the radiance of the light is used"
-            self._note(placed.prim, text)
+            placed.note("its material emits nothing; the radiance of the light is used")
 
     def _convert_row(
         self,
@@ -294,7 +287,7 @@ class StageReader:
 
         def coordinates(number: int) -> NDArray[np.float64] | None:
             primvar = self._looks.primvars[number]
-            uv = cut.read_coordinates(primvar, self._time)
+            uv = cut.read_coordinates(primvar)
             if not np.isfinite(uv).all():
                 self._lost.append(f"{where}: no coordinates {primvar!r:.60}")
                 return None
@@ -318,18 +311,20 @@ class StageReader:
 
     def _read(self, material: Any) -> StatedMaterial | None:
         """Return the inputs of a material; None, with a note, where none are understood."""
-        columns = read_columns(material.GetPrim(), self._time, self._lost)
+        columns = read_columns(material.GetPrim(), self._opened)
         held = None
         if columns.keys() >= layout.MATERIAL_ATTRIBUTES.keys():
-            held = HeldMaterial(material, columns, self._written, self._time, self._opened)
+            held = HeldMaterial(material, columns, self._written, self._opened)
         known = () if held is None else ("specular",)  # Blender writes its specular level there
-        stated = read_material(material, self._time, self._opened, known)
+        stated = read_material(material, self._opened, known)
         exact = None
         if held is not None:
             self._lost.append(_HELD)
             stated, exact = held.restore(stated)
         if stated is None:
-            self._note(material, "no supported shader; its display color is used")
+            self._lost.append(
+                f"{material.GetPath()}: no supported shader; its display color is used"
+            )
             return None
         added = {name: columns[name] for name in columns.keys() - layout.MATERIAL_ATTRIBUTES.keys()}
         self._extras.append((stated.name, added, exact))
@@ -356,69 +351,65 @@ _OLD_NAMES = ("intensity", "exposure", "color", "normalize", "radius", "width", 
 _EXPOSURES = Within(-1000, 1000, unit="stops")
 
 
-def _light_triangles(placed: PlacedPrim, time: Any, lost: list[str]) -> NDArray[np.float32] | None:
+def _light_triangles(placed: PlacedPrim) -> NDArray[np.float32] | None:
     """Return the world-space triangles [T, 3, 3] of a light; None where it has no area."""
-    prim = placed.prim
-    kind = str(prim.GetTypeName())
+    kind = str(placed.prim.GetTypeName())
     shape, sizes = _SHAPES[kind]
-    scale = [_read(prim.GetAttribute(f"inputs:{name}"), time) for name in sizes]
+    scale = [placed.number(f"inputs:{name}") for name in sizes]
     world = np.einsum("ij,tcj->tci", placed.to_world[:3, :3], shape() * np.array([*scale, 1.0][:3]))
     world = world + placed.to_world[:3, 3]
     area = sum_area(world)
     if not area > 0 or not np.isfinite(area):
-        lost.append(f"{prim.GetPath()}: a light without an area")
+        placed.note("a light without an area")
         return None
     if kind in ("RectLight", "DiskLight"):
-        lost.append(f"{prim.GetPath()}: emits to one side in USD, and to both sides in a scene")
+        placed.note("emits to one side in USD, and to both sides in a scene")
     return world.astype(np.float32)
 
 
-def _compute_radiance(
-    placed: PlacedPrim, triangles: NDArray[np.float32], time: Any, lost: list[str]
-) -> NDArray[np.float32]:
+def _compute_radiance(placed: PlacedPrim, triangles: NDArray[np.float32]) -> NDArray[np.float32]:
     """Return the radiance [3] that the light API of a prim states.
 
     The prim is a light, or a mesh with the light API; its triangles [T, 3, 3] in meters have the
     area.
     """
-    emitted = _read_light_color(placed.prim, time, lost)
-    if placed.prim.GetAttribute("inputs:normalize").Get(time):
+    emitted = _read_light_color(placed)
+    if placed.value("inputs:normalize"):
         area = sum_area(triangles) / placed.meters_per_unit**2
         emitted = emitted / max(area, 1e-30)
     if (emitted < 0).any():
-        lost.append(f"{placed.prim.GetPath()}: negative radiance; the light emits nothing")
+        placed.note("negative radiance; the light emits nothing")
     emitted = np.maximum(emitted, 0)
     return np.where(np.isfinite(emitted), emitted, 0).astype(np.float32)
 
 
-def _read_light_color(prim: Any, time: Any, lost: list[str]) -> NDArray[np.float64]:
+def _read_light_color(placed: PlacedPrim) -> NDArray[np.float64]:
     """Return intensity x 2^exposure x color [3] of a light, tinted by its temperature."""
-    light = UsdLux.LightAPI(prim)
-    strength = _read(light.GetIntensityAttr(), time)
-    strength *= 2.0 ** _read(light.GetExposureAttr(), time, _EXPOSURES)
+    light = UsdLux.LightAPI(placed.prim)
+    strength = placed.number("inputs:intensity")
+    strength *= 2.0 ** placed.number("inputs:exposure", _EXPOSURES)
     stated = light.GetColorAttr()
-    rgb = read_numbers(stated.Get(time), 3, str(stated.GetPath()))
+    rgb = read_numbers(stated.Get(placed.time), 3, str(stated.GetPath()))
     color = convert_to_rec709(stated, np.array(rgb))
-    kelvin = light.GetColorTemperatureAttr()
     # Blender enables temperature on every light but sets none; the USD default would tint by 4 %
-    if light.GetEnableColorTemperatureAttr().Get(time) and kelvin.HasAuthoredValue():
-        color = color * np.array(UsdLux.BlackbodyTemperatureAsRgb(_read(kelvin, time)))
-    _note_losses(prim, time, lost)
+    is_stated = light.GetColorTemperatureAttr().HasAuthoredValue()
+    if placed.value("inputs:enableColorTemperature") and is_stated:
+        kelvin = placed.number("inputs:colorTemperature")
+        color = color * np.array(UsdLux.BlackbodyTemperatureAsRgb(kelvin))
+    _note_losses(placed)
     return np.asarray(strength * color)
 
 
-def _read(attribute: Any, time: Any, within: Within = FINITE) -> float:
-    return read_number(attribute.Get(time), str(attribute.GetPath()), within)
-
-
-def _note_losses(prim: Any, time: Any, lost: list[str]) -> None:
+def _note_losses(placed: PlacedPrim) -> None:
+    prim = placed.prim
+    lost = placed.lost
     where = prim.GetPath()
     files = {"inputs:texture:file", "inputs:shaping:ies:file"}
     if "Dome" in str(prim.GetTypeName()):
         files.remove(layout.MAP_PATH)
     for attribute in prim.GetAuthoredAttributes():
         name = attribute.GetName()
-        value = attribute.Get(time)
+        value = attribute.Get(placed.time)
         is_lost = value is not None and value != _NEUTRAL.get(name, value)
         if is_lost or (name in files and value and value.path):
             lost.append(f"{where}.{name}: has no place here")
@@ -478,56 +469,54 @@ _SHAPES: Mapping[str, tuple[Callable[[], NDArray[np.float64]], Sequence[str]]] =
 """Shape of each light, and its sizes along the axes of the light."""
 
 
-def _read_dome(
-    prim: Any, to_world: NDArray[np.float64], time: Any, opened: OpenedStage
-) -> Environment | None:
+def _read_dome(placed: PlacedPrim, opened: OpenedStage) -> Environment | None:
     """Read the environment of any DomeLight; return None, with a note, where it is unusable.
 
-    `to_world` [4, 4] is its transform.
-
     Raises:
-        TrilightError: the map file is outside the folder or on the network.
+        Rejected: the map has more pixels than MAX_PIXELS.
+        TrilightError: its file is outside the folder or on the network.
     """
-    prim_path = str(prim.GetPath())
-    radiance = _read_map(prim, time, opened)
-    if radiance is None:
-        return None
-    tinted = radiance * _read_light_color(prim, time, opened.lost)
-    left_basis, _, right_basis = np.linalg.svd(to_world[:3, :3] @ _pole_rotation(prim))
-    rotation = left_basis @ right_basis
-    if np.linalg.det(rotation) < 0:
-        opened.lost.append(f"{prim_path}: a mirrored dome; its light was left out")
-        return None
-    visibility = prim.GetAttribute(layout.VISIBLE_TO_CAMERA)
-    sky = Environment(
-        radiance_rgb=tinted.astype(np.float32),
-        rotation=(rotation @ layout.TO_OUR_AXES.T).astype(np.float32),
-        is_seen=bool(visibility and visibility.Get(time)),
-        source=MapSource(name=prim.GetName(), licence=USER_PROVIDED),
-    )
     try:
-        sky.check()
-    except TrilightError as error:
-        opened.lost.append(f"{prim_path}: {error}; its light was left out")
+        tinted = _read_map(placed, opened) * _read_light_color(placed)
+        first_basis, _, last_basis = np.linalg.svd(
+            placed.to_world[:3, :3] @ _pole_rotation(placed.prim)
+        )
+        rotation = first_basis @ last_basis
+        if np.linalg.det(rotation) < 0:
+            raise Rejected("mirrored", "a mirrored dome")
+        sky = Environment(
+            radiance_rgb=tinted.astype(np.float32),
+            rotation=(rotation @ layout.TO_OUR_AXES.T).astype(np.float32),
+            is_seen=bool(placed.value(layout.VISIBLE_TO_CAMERA)),
+            source=MapSource(name=placed.prim.GetName(), licence=USER_PROVIDED),
+        )
+        try:
+            sky.check()
+        except TrilightError as error:
+            raise Rejected("law_broken", str(error)) from error
+    except Rejected as error:
+        if error.reason in ("too_many_pixels", "texture_too_large"):
+            raise
+        placed.note(f"{error.message}; its light was left out")
         return None
-    return _take_held(sky, prim, time)
+    return _take_held(sky, placed)
 
 
-def _take_held(sky: Environment, dome: Any, time: Any) -> Environment:
+def _take_held(sky: Environment, placed: PlacedPrim) -> Environment:
     """Return an environment with the values that Trilight wrote on the prim of the scene."""
-    stage = dome.GetStage()
+    stage = placed.prim.GetStage()
     holder = next((prim for prim in stage.Traverse() if prim.HasAttribute(layout.SKY_SOURCE)), None)
     if holder is None:
         return sky
 
     def read_value(name: str) -> Any:
-        return holder.GetAttribute(name).Get(time)
+        return holder.GetAttribute(name).Get(placed.time)
 
     held = layout.parse_map_text(read_value(layout.SKY_SOURCE))
     if held is None or held[0] != sky.sha256:
         return sky
     sky = dataclasses.replace(sky, source=held[1])
-    if not dome.HasAttribute(layout.VISIBLE_TO_CAMERA):
+    if not placed.prim.HasAttribute(layout.VISIBLE_TO_CAMERA):
         sky = dataclasses.replace(sky, is_seen=bool(read_value(layout.SKY_VISIBLE)))
     rows = list(map(read_value, layout.SKY_ROWS))
     if None in rows or not np.allclose(rows, sky.rotation, atol=layout.SAME_VALUE):
@@ -545,29 +534,31 @@ def _pole_rotation(prim: Any) -> NDArray[np.float64]:
     return np.array([[1, 0, 0], [0, 0, -1], [0, 1, 0]]) if is_turned else np.eye(3)
 
 
-def _read_map(prim: Any, time: Any, opened: OpenedStage) -> NDArray[np.float64] | None:
-    """Return the map [H, 2 H, 3] of a dome; uniform radiance 1 where it names no file."""
-    prim_path = str(prim.GetPath())
-    attribute = prim.GetAttribute(layout.MAP_PATH)
-    asset = attribute.Get(time) if attribute else None
-    if asset is None or not asset.path:
+def _read_map(placed: PlacedPrim, opened: OpenedStage) -> NDArray[np.float64]:
+    """Return the map [H, 2 H, 3] of a dome; uniform radiance 1 where it names no file.
+
+    Raises:
+        Rejected: the map is missing, no picture that is read, or of another projection.
+    """
+    named, resolved = resolve_file(placed.prim.GetAttribute(layout.MAP_PATH), opened)
+    if not named:
         return np.ones((1, 2, 3))
-    projection = prim.GetAttribute("inputs:texture:format").Get(time)
+    projection = placed.value("inputs:texture:format")
     if projection not in (None, "automatic", "latlong"):
-        opened.lost.append(f"{prim_path}: a picture of format {projection}; expected latlong")
-        return None
-    specs = attribute.GetPropertyStack(time)
-    resolved = opened.resolve(specs[0].layer if specs else opened.root, asset.path)
+        raise Rejected("projection", f"a picture of format {projection}; expected latlong")
     data = None if resolved is None else asset_bytes(resolved, MAX_BYTES)
     if data is None:
-        opened.lost.append(f"{prim_path}: map {asset.path!r:.100} is missing")
-        return None
-    pixels = decode_pixels(data, asset.path, opened.lost)
-    if pixels is None:
-        opened.lost.append(
-            f"{prim_path}: map {asset.path!r:.100} is not read; its light was left out"
-        )
-        return None
+        raise Rejected("missing_file", f"map {named!r:.100} is missing")
+    try:
+        picture = read_linear_picture(data, MAX_PIXELS)
+        if picture is None:
+            pixels = decode_image(data, named, MAX_PIXELS, opened.lost, of_scene=True)[::-1]
+        else:
+            pixels = picture.values
+            opened.lost += [f"{named!r:.100}: {sentence}" for sentence in picture.unread]
+    except Rejected as error:
+        text = error.message.removeprefix(f"{named!r:.80}: ")
+        raise Rejected(error.reason, f"map {named!r:.100} is not read: {text}") from error
     linear = Picture(values=pixels, is_srgb=pixels.dtype == np.uint8).linear(pixels)
     rgb = linear[..., :3] if linear.shape[2] >= 3 else np.repeat(linear[..., :1], 3, axis=2)
     return rgb.astype(np.float64)

@@ -15,7 +15,6 @@ import numpy as np
 from numpy.typing import NDArray
 from pxr import UsdShade
 
-from pipeline.exchange.pictures import MAX_BYTES
 from pipeline.exchange.textured_triangles import (
     EXCESS,
     NO_TEXTURES,
@@ -33,6 +32,7 @@ from pipeline.exchange.usd.write_materials import (
     decode_texture,
     openpbr_inputs,
 )
+from pipeline.foreign.picture import MAX_BYTES
 from pipeline.foreign.usd.shaders import (
     DEFAULTS,
     IOR_OF_CONSTANT_ALBEDOS,
@@ -66,10 +66,10 @@ _INPUTS = {
 """OpenPBR's inputs whose product is a column; an index of refraction counts as its reflectance."""
 
 
-def read_columns(prim: Any, time: Any, lost: list[str]) -> dict[str, NDArray[np.float32]]:
+def read_columns(prim: Any, opened: OpenedStage) -> dict[str, NDArray[np.float32]]:
     """Return the columns that Trilight wrote on the prim of a material, by name.
 
-    `lost` receives a note for each that is not declared, not lawful or not there any more.
+    Its notes receive one for each that is not declared, not lawful or not there any more.
     """
     declared = {column.name: column for column, _ in laid_out()}
     columns = dict[str, NDArray[np.float32]]()
@@ -81,20 +81,20 @@ def read_columns(prim: Any, time: Any, lost: list[str]) -> dict[str, NDArray[np.
         missing = [each for each in missing if each != name]
         column = declared.get(name)
         if column is None:
-            lost.append(f"{attribute.GetPath()}: this material column is not declared here")
+            opened.lost.append(f"{attribute.GetPath()}: this material column is not declared here")
             continue
         try:
-            value = np.array(attribute.Get(time), np.float64).reshape(-1)
+            value = np.array(attribute.Get(opened.time), np.float64).reshape(-1)
         except (TypeError, ValueError):
             value = np.zeros(0)
         if len(value) == column.width and np.all(column.within.holds(value)):
             columns[name] = value.astype(np.float32)
         else:
-            lost.append(
+            opened.lost.append(
                 f"{attribute.GetPath()}: expected {column.width} numbers {column.within}; it is "
                 "not used"
             )
-    lost += [
+    opened.lost += [
         f"{prim.GetPath()}: material column {name!r} is not in the file any more; default used"
         for name in missing
     ]
@@ -109,7 +109,6 @@ class HeldMaterial:
         material: Any,
         columns: Mapping[str, NDArray[np.float32]],
         written: Mapping[str, Mapping[str, NDArray[np.float32]]],
-        time: Any,
         opened: OpenedStage,
     ) -> None:
         """Read the values of a UsdShade.Material, whose exact columns are known.
@@ -123,15 +122,14 @@ class HeldMaterial:
         self._shader = surface_shader(material)
         self._columns = columns
         self._written = written.get(self._where, {})
-        self._time = time
         self._opened = opened
         self._maps: dict[str, tuple[str, MapSource]] = {}
         for name in TEXTURED:
-            text = prim.GetAttribute(layout.TEXTURE_SOURCE + name).Get(time)
+            text = prim.GetAttribute(layout.TEXTURE_SOURCE + name).Get(opened.time)
             if (held := layout.parse_map_text(text)) is not None:
                 self._maps[name] = held
         self._is_marked = bool(root) and root.HasAttribute(layout.DIGEST)
-        self._openpbr = _read_openpbr(material, time, opened) if self._is_marked else {}
+        self._openpbr = _read_openpbr(material, opened) if self._is_marked else {}
 
     def restore(
         self, stated: StatedMaterial | None
@@ -171,7 +169,7 @@ class HeldMaterial:
         if "specular" in self._maps and sources and is_output(sources[0]):
             node = UsdShade.Shader(sources[0].GetPrim())
             if "specularColor" not in textures and node.GetShaderId() == "UsdUVTexture":
-                textures["specularColor"] = read_texture_node(node, "rgb", self._time, self._opened)
+                textures["specularColor"] = read_texture_node(node, "rgb", self._opened)
         if not stated.is_specular:
             constants["specularColor"] = self._columns["specular"]
             if "specular" in self._maps and "specularColor" not in textures:
@@ -183,7 +181,7 @@ class HeldMaterial:
         for column, name in PREVIEW_INPUTS.items():
             if name not in stated.textures:
                 continue
-            constant = parse_color(self._shader.GetInput(name).Get(self._time))
+            constant = parse_color(self._shader.GetInput(name).Get(self._opened.time))
             written = self._columns[column]
             if constant is not None and not np.allclose(constant, written, layout.SAME_VALUE, 0):
                 self._note(
@@ -295,7 +293,7 @@ def _written_columns(columns: Mapping[str, NDArray]) -> dict[str, NDArray[np.flo
     return _multiply({name.removeprefix("inputs:"): each[1] for name, each in table.items()})
 
 
-def _read_openpbr(material: Any, time: Any, opened: OpenedStage) -> dict[str, NDArray[np.float64]]:
+def _read_openpbr(material: Any, opened: OpenedStage) -> dict[str, NDArray[np.float64]]:
     """Return the columns [3] that the OpenPBR shader beside a preview states; none without both.
 
     Columns with an input that is missing, or no constant, are left out; notes name the latter.
@@ -313,7 +311,7 @@ def _read_openpbr(material: Any, time: Any, opened: OpenedStage) -> dict[str, ND
         sources = find_sources(shader, name)
         if not sources:
             continue
-        stated = None if is_output(sources[0]) else sources[0].Get(time)
+        stated = None if is_output(sources[0]) else sources[0].Get(opened.time)
         value = parse_color(
             None if stated is None else convert_to_rec709(sources[0], np.array(stated))
         )
@@ -321,7 +319,7 @@ def _read_openpbr(material: Any, time: Any, opened: OpenedStage) -> dict[str, ND
             opened.lost.append(f"{shader.GetPath()}.{name}: no finite constant; it is not read")
         else:
             values[name] = value
-    reader = ShaderReader(shader, time, opened)
+    reader = ShaderReader(shader, opened)
     reader.note_unsupported(("specular_weight", "specular_color"))
     return _multiply(values)
 

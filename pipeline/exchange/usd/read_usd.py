@@ -12,7 +12,6 @@ Only child processes with limits import this (pipeline.isolation): native code p
 import contextlib
 import dataclasses
 import json
-from collections import defaultdict
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any
@@ -21,8 +20,7 @@ import numpy as np
 from numpy.typing import NDArray
 from pxr import Usd
 
-from pipeline.exchange.pictures import MAX_BYTES
-from pipeline.exchange.textured_triangles import MAX_ROWS, LoadedScene
+from pipeline.exchange.textured_triangles import LoadedScene
 from pipeline.exchange.usd import layout
 from pipeline.exchange.usd.foreign_scene import StageReader
 from pipeline.exchange.usd.write_materials import (
@@ -39,6 +37,7 @@ from pipeline.exchange.usd.write_usd import (
     new_layer,
     sum_positions,
 )
+from pipeline.foreign.picture import MAX_BYTES
 from pipeline.foreign.usd.stage import OpenedStage, read_quietly
 from pipeline.foreign.usd.texture_nodes import asset_bytes
 from storage.conventions import require_readable
@@ -66,8 +65,13 @@ def usd_keys(path: Path, folder: Path | None = None) -> list[str]:
     Raises:
         TrilightError: the file is unusable (pipeline.foreign.usd.stage).
     """
-    with _name_errors(path):
-        return _keys(OpenedStage(path, folder))
+    with _open(path, folder) as opened:
+        shard = _scene_keys(opened.root)
+        if shard is not None:
+            return shard
+        if _read_exact(opened) is not None:
+            return [""]
+        return list(_frames(opened.compose())) or [""]
 
 
 def read_usd(path: Path, key: str | None = None, folder: Path | None = None) -> LoadedScene:
@@ -81,16 +85,21 @@ def read_usd(path: Path, key: str | None = None, folder: Path | None = None) -> 
     Raises:
         TrilightError: the file is unusable, lacks the scene, or a `Scene` cannot hold it.
     """
-    with _name_errors(path):
-        return _read(OpenedStage(path, folder), key)
+    with _open(path, folder) as opened:
+        shard = _scene_keys(opened.root)
+        if shard is not None:
+            return LoadedScene(scene=_read_shard_scene(opened, shard, key or shard[0]), notes=())
+        if key is None and (scene := _read_exact(opened)) is not None:
+            return LoadedScene(scene=scene, notes=())
+        return _read_foreign(opened, key)
 
 
 @contextlib.contextmanager
-def _name_errors(path: Path) -> Iterator[None]:
-    """Begin every message on a file with its name."""
+def _open(path: Path, folder: Path | None) -> Iterator[OpenedStage]:
+    """Yield an opened file; begin every message on it with its name."""
     try:
         with read_quietly(path):
-            yield
+            yield OpenedStage(path, folder)
     except (TrilightError, Rejected) as error:
         message = error.message if isinstance(error, Rejected) else str(error)
         if isinstance(error, TrilightError) and message.startswith(path.name):
@@ -99,14 +108,8 @@ def _name_errors(path: Path) -> Iterator[None]:
         raise TrilightError(f"{path.name}: {text}") from error
 
 
-def _read(opened: OpenedStage, key: str | None) -> LoadedScene:
-    shard = _scene_keys(opened.root)
-    if shard is not None:
-        return _read_shard_scene(opened, shard, key or shard[0])
-    if key is None:
-        scene = _read_exact(opened)
-        if scene is not None:
-            return LoadedScene(scene=scene, notes=())
+def _read_foreign(opened: OpenedStage, key: str | None) -> LoadedScene:
+    """Read a stage as any other file, at a time code or the first one."""
     stage = opened.compose()
     frames = list(_frames(stage))
     if _find_root(opened.root, None) is not None:
@@ -117,12 +120,13 @@ def _read(opened: OpenedStage, key: str | None) -> LoadedScene:
     chosen = key or (frames[0] if frames else "")
     if frames and key is None:
         opened.lost.append(f"time codes other than {chosen} of {len(frames)}")
-    time = Usd.TimeCode(float(chosen)) if chosen else Usd.TimeCode.EarliestTime()
-    scene = StageReader(stage, time, opened, _read_written_columns(opened)).scene()
+    if chosen:
+        opened.time = Usd.TimeCode(float(chosen))
+    scene = StageReader(stage, opened, _read_written_columns(opened)).scene()
     return LoadedScene(scene=scene, notes=opened.notes)
 
 
-def _read_shard_scene(opened: OpenedStage, keys: list[str], key: str) -> LoadedScene:
+def _read_shard_scene(opened: OpenedStage, keys: list[str], key: str) -> Scene:
     if key not in keys:
         raise TrilightError(f"no scene {key}; expected one of {keys[0]} to {keys[-1]}.")
     scene = _read_exact(opened, key)
@@ -131,16 +135,7 @@ def _read_shard_scene(opened: OpenedStage, keys: list[str], key: str) -> LoadedS
             f"scene {key} has been changed since Trilight wrote it; save it as a file of its own "
             "and read that."
         )
-    return LoadedScene(scene=scene, notes=())
-
-
-def _keys(opened: OpenedStage) -> list[str]:
-    shard = _scene_keys(opened.root)
-    if shard is not None:
-        return shard
-    if _read_exact(opened) is not None:
-        return [""]
-    return list(_frames(opened.compose())) or [""]
+    return scene
 
 
 def _frames(stage: Any) -> Iterator[str]:
@@ -185,26 +180,24 @@ def _read_exact(opened: OpenedStage, key: str | None = None) -> Scene | None:
         TrilightError: the file has an unsupported version or an undeclared material column, or the
             scene breaks a law (`Scene.check`).
     """
-    layer = opened.root
-    root = _find_root(layer, key)
-    if root is None or len(layer.subLayerPaths) or len(layer.rootPrims) != 1:
+    root = _find_root(opened.root, key)
+    if root is None or len(opened.root.subLayerPaths) or len(opened.root.rootPrims) != 1:
         return None
     require_readable(root.attributes[layout.VERSION].default, opened.path.name)
     try:
         scene = _read_scene(root, opened)
+        if scene_digest(scene) != root.attributes[layout.DIGEST].default:
+            return None
+        layer = new_layer(layout.ROOT)  # specs end with the last name of their layer
+        written = author_scene(layer, str(root.path), scene)
+        if _list_specs(root) != _list_specs(written):
+            return None
     except UndeclaredColumn:
         raise
     except _NOT_AS_WRITTEN:
         return None
-    if scene_digest(scene) != root.attributes[layout.DIGEST].default:
-        return None
     scene.check()
-    expected = new_layer(layout.ROOT)
-    try:
-        written = author_scene(expected, str(root.path), scene)
-        return scene if _list_specs(root) == _list_specs(written) else None
-    except _NOT_AS_WRITTEN:
-        return None
+    return scene
 
 
 def _read_written_columns(opened: OpenedStage) -> dict[str, dict[str, NDArray[np.float32]]]:
@@ -250,23 +243,20 @@ def _read_scene(root: Any, opened: OpenedStage) -> Scene:
     sky = None
     if ENVIRONMENT in folders:
         sky = _read_dome(folders[ENVIRONMENT], opened)
-    materials = _read_materials(folders["Materials"], opened)
     prims = sorted(
         folders["Objects"].nameChildren, key=lambda p: p.attributes[layout.INDEX].default
     )
     objects = tuple(SceneObject(**_read_texts(prim, layout.OBJECT_TEXTS)) for prim in prims)
     _require(all(entry.kind in OBJECT_KINDS for entry in objects))
-    meshes = [prim for prim in prims if prim.typeName == "Mesh"]
     cameras = [prim.attributes for prim in _list_by_row(folders["Cameras"], layout.camera_name)]
     poses = [np.array(camera["xformOp:transform"].default).T for camera in cameras]
     return Scene(
-        **_read_vertices(root, meshes),
-        **_read_triangles(meshes, is_textured=bool(materials["textures"])),
+        **_read_meshes(root, [prim for prim in prims if prim.typeName == "Mesh"]),
         c2w=np.array(poses, np.float32),
         fov_deg=np.array([camera[layout.FOV_DEG].default for camera in cameras], np.float32),
         objects=objects,
         provenance=scene_provenance(json.loads(root.attributes[layout.PROVENANCE].default)),
-        **materials,
+        **_read_materials(folders["Materials"], opened),
         environment=sky,
     )
 
@@ -287,61 +277,46 @@ def _read_texts(prim: Any, attributes: Mapping[str, str]) -> dict[str, Any]:
     return {field: prim.attributes[name].default for field, name in attributes.items()}
 
 
-def _read_vertices(root: Any, meshes: list[Any]) -> dict[str, Any]:
-    """Return positions and normals [V, 3], placed by the vertex rows of root and meshes."""
+def _read_meshes(root: Any, meshes: Sequence[Any]) -> dict[str, Any]:
+    """Return the fields of a scene by vertex and by triangle, each placed by the rows of meshes."""
     rows = [_read_integers(root, layout.UNUSED_ROWS)]
-    rows += [_read_integers(mesh, layout.VERTEX_ROWS) for mesh in meshes]
-    positions = [_read_vectors(root, layout.UNUSED_POSITIONS), *map(_read_positions, meshes)]
-    normals = [_read_vectors(root, layout.UNUSED_NORMALS)]
-    normals += [_read_vectors(mesh, "normals") for mesh in meshes]
-    order = _order_rows(rows)
-    return {
-        "vertex_positions": np.concatenate(positions)[order],
-        "vertex_normals": np.concatenate(normals)[order],
-    }
-
-
-def _read_positions(mesh: Any) -> NDArray[np.float32]:
-    """Return the positions [V, 3] of a mesh's vertices."""
-    name = _OLD_CENTER if _OLD_CENTER in mesh.attributes else CENTER
-    center = np.array(mesh.attributes[name].default, np.float64)
-    positions = sum_positions(center, _read_vectors(mesh, "points"))
-    positions[_read_integers(mesh, layout.EXACT_ROWS)] = _read_vectors(mesh, layout.EXACT_POSITIONS)
-    return positions
-
-
-def _read_triangles(meshes: list[Any], *, is_textured: bool) -> dict[str, Any]:
-    """Return the fields of a scene by triangle, placed by the face rows of meshes."""
-    rows = [_read_integers(mesh, layout.FACE_ROWS) for mesh in meshes]
-    values = defaultdict[str, list[NDArray]](list)
-    for mesh, face_rows in zip(meshes, rows, strict=True):
-        vertex_rows = _read_integers(mesh, layout.VERTEX_ROWS)
-        values["faces"].append(
-            vertex_rows[_read_integers(mesh, "faceVertexIndices").reshape(-1, 3)]
-        )
-        values["objects"].append(np.full(len(face_rows), mesh.attributes[layout.INDEX].default))
-        index = np.full(len(face_rows), -1)
+    vertices = [_read_vectors(root, layout.UNUSED_POSITIONS, layout.UNUSED_NORMALS)]
+    face_rows = []
+    triangles = []
+    uv = []
+    for mesh in meshes:
+        rows.append(_read_integers(mesh, layout.VERTEX_ROWS))
+        placed = _read_vectors(mesh, "points", "normals")
+        name = _OLD_CENTER if _OLD_CENTER in mesh.attributes else CENTER
+        center = np.array(mesh.attributes[name].default, np.float64)
+        placed[:, :3] = sum_positions(center, placed[:, :3])
+        exact = _read_vectors(mesh, layout.EXACT_POSITIONS)
+        placed[_read_integers(mesh, layout.EXACT_ROWS), :3] = exact
+        vertices.append(placed)
+        face_rows.append(_read_integers(mesh, layout.FACE_ROWS))
+        faces = np.full((len(face_rows[-1]), 5), mesh.attributes[layout.INDEX].default)
+        faces[:, :3] = rows[-1][_read_integers(mesh, "faceVertexIndices").reshape(-1, 3)]
         for subset in mesh.nameChildren:
-            index[_read_integers(subset, "indices")] = int(subset.name.rpartition("_")[2])
-        _require(index.min() >= 0 and index.max() < MAX_ROWS)
-        values["materials"].append(index)
-        if is_textured:
-            values["uv"].append(np.array(mesh.attributes[ST].default, np.float32).reshape(-1, 3, 2))
-    order = _order_rows(rows)
-    placed = {name: np.concatenate(arrays)[order] for name, arrays in values.items()}
+            faces[_read_integers(subset, "indices"), 3] = int(subset.name.rpartition("_")[2])
+        triangles.append(faces)
+        if ST in mesh.attributes:
+            uv.append(np.array(mesh.attributes[ST].default, np.float32).reshape(-1, 6))
+    vertices_in_order = _place(vertices, rows)
+    faces = _place(triangles, face_rows)
     return {
-        "faces": placed["faces"].astype(np.uint32),
-        "material_index": placed["materials"].astype(np.uint16),
-        "object_index": placed["objects"].astype(np.uint16),
-        "uv": placed["uv"].reshape(-1, 2) if is_textured else None,
+        "vertex_positions": vertices_in_order[:, :3].copy(),
+        "vertex_normals": vertices_in_order[:, 3:].copy(),
+        "faces": faces[:, :3].astype(np.uint32),
+        "material_index": faces[:, 3].astype(np.uint16),
+        "object_index": faces[:, 4].astype(np.uint16),
+        "uv": _place(uv, face_rows).reshape(-1, 2) if uv else None,
     }
 
 
-def _order_rows(rows: Sequence[NDArray[np.int64]]) -> NDArray[np.intp]:
-    """Return where each of the rows 0 to N - 1 stands first; some may repeat."""
-    distinct, first = np.unique(np.concatenate(rows), return_index=True)
-    _require(len(distinct) > 0 and distinct[0] == 0 and distinct[-1] == len(distinct) - 1)
-    return first
+def _place(values: Sequence[NDArray], rows: Sequence[NDArray[np.int64]]) -> NDArray:
+    """Return values in the order of their rows 0 to N - 1; some may repeat."""
+    _, first = np.unique(np.concatenate(rows), return_index=True)
+    return np.concatenate(values)[first]
 
 
 def _read_materials(folder: Any, opened: OpenedStage) -> dict[str, Any]:
@@ -434,13 +409,13 @@ def _list_by_row(folder: Any, name: Callable[[int], str]) -> list[Any]:
 
 
 def _read_integers(prim: Any, name: str) -> NDArray[np.int64]:
-    values = np.array(prim.attributes[name].default, np.int64)
-    _require(values.ndim == 1)
-    return values
+    return np.array(prim.attributes[name].default, np.int64)
 
 
-def _read_vectors(prim: Any, name: str) -> NDArray[np.float32]:
-    return np.array(prim.attributes[name].default, np.float32).reshape(-1, 3)
+def _read_vectors(prim: Any, *names: str) -> NDArray[np.float32]:
+    """Return the vectors of attributes, beside each other."""
+    values = (np.array(prim.attributes[name].default, np.float32) for name in names)
+    return np.concatenate([each.reshape(-1, 3) for each in values], axis=1)
 
 
 def _require(condition: Any) -> None:

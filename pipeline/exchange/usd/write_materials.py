@@ -27,10 +27,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pipeline.documents.png import encode_png
-from pipeline.exchange.pictures import MAX_PIXELS
 from pipeline.exchange.textured_triangles import used_textures
 from pipeline.exchange.usd import layout
-from pipeline.foreign.picture import decode_image
+from pipeline.foreign.picture import MAX_PIXELS, decode_image
 from pipeline.foreign.usd.shaders import IOR_OF_CONSTANT_ALBEDOS
 from storage.errors import Rejected, TrilightError
 from storage.records.exr import MAGIC, MAX_RESOLUTION, decode_channels, encode_channels

@@ -21,7 +21,7 @@ from pipeline.foreign.material import (
     with_normal_map,
 )
 from pipeline.foreign.picture import Decode, Picture, has_colors
-from pipeline.foreign.usd.object_source import TIME, StageMaterials, UsdSource
+from pipeline.foreign.usd.object_source import StageMaterials, UsdSource
 from pipeline.foreign.usd.polygons import CutMesh
 from pipeline.foreign.usd.shaders import (
     IOR_OF_CONSTANT_ALBEDOS,
@@ -57,7 +57,7 @@ def usd_textured_mesh(source: UsdSource, decode: Decode, *, emission: bool = Fal
         Rejected: no_materials, materials_unreadable, no_texture_coordinates, or as reading a
             picture.
     """
-    looks = MeshMaterials(source.materials, decode, TIME, emission=emission)
+    looks = MeshMaterials(source.materials, decode, emission=emission)
     if len(looks.primvars) > MOST_UV_SETS:
         count = len(looks.primvars)
         raise Rejected("no_texture_coordinates", f"textures lie on {count} sets of them")
@@ -68,10 +68,7 @@ def usd_textured_mesh(source: UsdSource, decode: Decode, *, emission: bool = Fal
     if (material == looks.plain).all() and (tint == _UNBOUND).all():
         raise Rejected("no_materials", "the stage has no materials and no display colors")
     sets = looks.primvars or ["st"]
-    uv = [
-        np.stack([cut.read_coordinates(name, TIME) for name in sets], axis=1)
-        for cut in cuts.values()
-    ]
+    uv = [np.stack([cut.read_coordinates(name) for name in sets], axis=1) for cut in cuts.values()]
     return TexturedMesh(
         mesh=source.mesh,
         material=material,
@@ -89,8 +86,6 @@ class MeshMaterials:
     """Materials as the stage states them."""
     decode: Decode
     """Function that returns the values of a picture's bytes."""
-    time: Any
-    """The Usd.TimeCode of the values."""
     _: KW_ONLY
     emission: bool = False
     """True to read emission, too."""
@@ -131,7 +126,7 @@ class MeshMaterials:
         tints = np.ones((len(rows), 3, 3))
         is_plain = rows == self.plain
         if is_plain.any():
-            display_colors = read_colors(cut, "displayColor", self.time)
+            display_colors = read_colors(cut, "displayColor")
             tints[is_plain] = (
                 _UNBOUND if display_colors is None else np.clip(display_colors[is_plain], 0, 1)
             )
@@ -146,7 +141,7 @@ class MeshMaterials:
         """Replace the rows [T] and tints [T, 3, 3] of triangles of a material with primvars."""
         stated = self.stage.materials[row]
         mask = rows == row
-        values = {name: stated.read_values(name, cut, self.time) for name in stated.primvars}
+        values = {name: stated.read_values(name, cut) for name in stated.primvars}
         base = values.pop("diffuseColor", None)
         if base is not None:
             tints[mask] = np.clip(base, 0, 1)[mask]
@@ -166,10 +161,7 @@ class MeshMaterials:
         table = np.concatenate(list(means.values()), axis=1)
         distinct, index = np.unique(table, axis=0, return_inverse=True)
         if len(distinct) > _MOST_VARIED:
-            names = ", ".join(means)
-            cut.placed.lost.append(
-                f"{cut.prim.GetPath()}: many values of {names}: their mean is taken"
-            )
+            cut.placed.note(f"many values of {', '.join(means)}: their mean is taken")
             distinct = table.mean(axis=0, keepdims=True)
             index = np.zeros(len(table), np.int64)
         rows = []

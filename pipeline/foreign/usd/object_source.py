@@ -16,7 +16,6 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
-from pxr import Usd
 
 from pipeline.foreign.limits import ReadLimits
 from pipeline.foreign.material_files import MaterialFiles
@@ -38,10 +37,6 @@ _MAX_OFFSET = 1e5
 and off by 1 % of the size beyond it."""
 
 
-TIME = Usd.TimeCode.EarliestTime()
-"""Time at which an object's values are read: the first of an animated stage."""
-
-
 @dataclass(frozen=True, kw_only=True, eq=False)
 class StageMaterials:
     """The materials of a stage."""
@@ -55,13 +50,12 @@ class StageMaterials:
 
 
 def read_stage_materials(
-    meshes: Sequence[PlacedPrim], time: Any, max_bytes: int, read: ReadMaterial
+    meshes: Sequence[PlacedPrim], max_bytes: int, read: ReadMaterial
 ) -> StageMaterials:
     """Return the materials of the visible meshes of a stage.
 
     Args:
         meshes: the meshes, which receive notes on what is not read.
-        time: time of the values.
         max_bytes: maximum bytes of all pictures together.
         read: function that reads a UsdShade.Material; None leaves it out.
 
@@ -83,10 +77,7 @@ def read_stage_materials(
 
     try:
         bindings = tuple(
-            tuple(
-                (find_row(material), polygons)
-                for material, polygons in read_bindings(placed.prim, time)
-            )
+            tuple((find_row(material), polygons) for material, polygons in read_bindings(placed))
             for placed in meshes
         )
     except OutsideFile as error:
@@ -128,7 +119,7 @@ def _cut_meshes(placed: Sequence[PlacedPrim], max_faces: int) -> Mapping[int, Cu
     faces_left = max_faces
     farthest = 0.0
     for number, each in enumerate(placed):
-        cut = cut_mesh(each, TIME, faces_left)
+        cut = cut_mesh(each, faces_left)
         faces_left -= cut.num_faces
         if len(cut.corners):
             scale = np.linalg.norm(each.to_world[:3, :3], 2)
@@ -217,7 +208,7 @@ class UsdSource:
 
         def read(material: Any) -> StatedMaterial:
             normals = self._limits.with_normal_maps
-            stated = read_material(material, TIME, self.opened, normals=normals)
+            stated = read_material(material, self.opened, normals=normals)
             if stated is None:
                 name = str(material.GetPath())
                 raise TrilightError(f"{name!r:.100} has no shader that is understood")
@@ -225,7 +216,7 @@ class UsdSource:
 
         try:
             with _reject_errors(self._path):
-                return read_stage_materials(self._placed, TIME, bytes_left, read)
+                return read_stage_materials(self._placed, bytes_left, read)
         except Rejected as why:
             return Rejected(why.reason, why.message)
 
@@ -250,7 +241,7 @@ def _place_meshes(opened: OpenedStage, limits: ReadLimits) -> list[PlacedPrim]:
     stage = opened.compose()
     if opened.unresolved:
         raise Rejected("missing_file", f"{opened.unresolved[0]}; an object needs all of its parts")
-    placed = placed_prims(stage, TIME, opened.lost, ("Mesh", *SOLIDS, "NurbsPatch"))
+    placed = placed_prims(stage, opened.time, opened.lost, ("Mesh", *SOLIDS, "NurbsPatch"))
     if len(placed) > limits.max_instances:
         raise Rejected("too_many_instances", f"{len(placed)} meshes; <= {limits.max_instances}")
     for each in placed:
@@ -260,5 +251,5 @@ def _place_meshes(opened: OpenedStage, limits: ReadLimits) -> list[PlacedPrim]:
             raise Rejected("unsupported_primitive", f"{where!r:.100} is a {kind}; make it a mesh")
         scheme = each.prim.GetAttribute("subdivisionScheme")
         if scheme and scheme.Get() != "none":
-            opened.lost.append(f"{where}: subdivision; its cage was read")
+            each.note("subdivision; its cage was read")
     return placed

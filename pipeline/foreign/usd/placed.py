@@ -35,18 +35,15 @@ class BoundSkin:
     skeleton: Any  # UsdSkel.SkeletonQuery
     binding: Any  # UsdSkel.SkinningQuery
 
-    def pose(self, prim: Any, stated: Any, time: Any) -> NDArray[np.float64]:
+    def pose(self, placed: "PlacedPrim") -> NDArray[np.float64]:
         """Return the posed points [P, 3] of a mesh in its own space.
-
-        Args:
-            prim: the mesh.
-            stated: unposed points as a USD array.
-            time: time of the pose.
 
         Raises:
             UnposedMesh: joints, weights and points contradict each other.
         """
-        points = Vt.Vec3fArray(stated)
+        prim = placed.prim
+        time = placed.time
+        points = Vt.Vec3fArray(placed.value("points"))
         if self.binding.HasBlendShapes():
             _blend_shapes(self.skeleton, self.binding, prim, points, time)
         if not self.binding.HasJointInfluences():
@@ -138,9 +135,22 @@ class PlacedPrim:
 
     prim: Any  # the Usd.Prim; several instances may share one
     to_world: NDArray[np.float64]  # [4, 4] for column vectors, to meters with +Z up
+    time: Any  # the Usd.TimeCode of its values
     meters_per_unit: float = 1.0  # length of a unit of the stage
     skin: BoundSkin | None = None  # the skin that poses a mesh
     lost: list[str] = field(default_factory=list)  # receives notes on contents that are not read
+
+    def value(self, name: str) -> Any:
+        """Return the value of an attribute of the prim; None without one."""
+        return self.prim.GetAttribute(name).Get(self.time)
+
+    def number(self, name: str, within: Within = FINITE) -> float:
+        """Return the value of an attribute that is a number; raises Malformed for another one."""
+        return read_number(self.value(name), f"{self.prim.GetPath()}.{name}", within)
+
+    def note(self, text: str) -> None:
+        """Note something of the prim that is not read."""
+        self.lost.append(f"{self.prim.GetPath()}: {text}")
 
 
 def placed_prims(
@@ -165,10 +175,13 @@ def placed_prims(
     root = _Visit(
         prim=stage.GetPseudoRoot(),
         to_world=base,
+        time=time,
+        meters_per_unit=meters_per_unit,
+        lost=lost,
         origin=base,
         predicate=Usd.TraverseInstanceProxies(),
     )
-    for number, visit in enumerate(_visit_below(_visit_children(root), time, lost)):
+    for number, visit in enumerate(_visit_below(_visit_children(root))):
         if number >= MAX_PLACED:
             raise TrilightError(f"more than {MAX_PLACED} prims with all instances.")
         prim = visit.prim
@@ -182,15 +195,7 @@ def placed_prims(
         if kind in kinds:
             if not np.isfinite(visit.to_world).all():
                 raise TrilightError(f"{path}: its place is not finite.")
-            placed.append(
-                PlacedPrim(
-                    prim=prim,
-                    to_world=visit.to_world,
-                    meters_per_unit=meters_per_unit,
-                    skin=find_skin(skins, prim),
-                    lost=lost,
-                )
-            )
+            placed.append(dataclasses.replace(visit, skin=find_skin(skins, prim)))
     lost += [f"{count} x {kind}: not read" for kind, count in sorted(unread.items())]
     return placed
 
@@ -204,20 +209,16 @@ def _stage_to_world(stage: Any, meters_per_unit: float) -> NDArray[np.float64]:
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
-class _Visit:
-    """A prim with the state that it inherits from its ancestors."""
+class _Visit(PlacedPrim):
+    """A prim with what it inherits; `to_world` is its parent's until its own one is applied."""
 
-    prim: Any
-    to_world: NDArray[np.float64]  # of its parent until its own transform is applied
     origin: NDArray[np.float64]  # start of `!resetXformStack!`: of the stage, or of an instance
     purpose: str = "default"
     is_render_shown: bool = True  # VisibilityAPI's answer for the purpose `render`
     predicate: Any = None  # selects the children to visit
 
 
-def _visit_below(
-    visits: Iterator[_Visit], time: Any, lost: list[str], depth: int = 1
-) -> Iterator[_Visit]:
+def _visit_below(visits: Iterator[_Visit], depth: int = 1) -> Iterator[_Visit]:
     """Yield the visible ones of prims and of all below them, placed, in the order of the tree."""
     for above in visits:
         prim = above.prim
@@ -226,9 +227,9 @@ def _visit_below(
                 f"{prim.GetPath()}: nested more than {MAX_NESTED} deep, prototypes counted."
             )
         imageable = UsdGeom.Imageable(prim)
-        if imageable and imageable.GetVisibilityAttr().Get(time) == UsdGeom.Tokens.invisible:
+        if imageable and imageable.GetVisibilityAttr().Get(above.time) == UsdGeom.Tokens.invisible:
             continue
-        visit = _apply_own(above, imageable, time)
+        visit = _apply_own(above, imageable)
         is_shown = visit.purpose == "default" or (
             visit.purpose == "render" and visit.is_render_shown
         )
@@ -236,8 +237,8 @@ def _visit_below(
             yield visit
         is_instancer = prim.IsA(UsdGeom.PointInstancer)
         if is_shown or not is_instancer:
-            below = _visit_instances(visit, time, lost) if is_instancer else _visit_children(visit)
-            yield from _visit_below(below, time, lost, depth + 1)
+            below = _visit_instances(visit) if is_instancer else _visit_children(visit)
+            yield from _visit_below(below, depth + 1)
 
 
 def _visit_children(above: _Visit) -> Iterator[_Visit]:
@@ -245,18 +246,18 @@ def _visit_children(above: _Visit) -> Iterator[_Visit]:
     return (dataclasses.replace(above, prim=child) for child in children)
 
 
-def _apply_own(above: _Visit, imageable: Any, time: Any) -> _Visit:
+def _apply_own(above: _Visit, imageable: Any) -> _Visit:
     """Return a visit with the prim's own transform and purpose, if any; its children inherit it."""
     if not imageable:
         return above
     purpose = imageable.GetPurposeAttr()
     is_shown = above.is_render_shown
     if above.prim.HasAPI(UsdGeom.VisibilityAPI):
-        stated = UsdGeom.VisibilityAPI(above.prim).GetRenderVisibilityAttr().Get(time)
+        stated = UsdGeom.VisibilityAPI(above.prim).GetRenderVisibilityAttr().Get(above.time)
         is_shown = is_shown if stated in (None, "inherited") else stated == "visible"
     to_world = above.to_world
     if move := UsdGeom.Xformable(above.prim):
-        local = np.array(move.GetLocalTransformation(time)).T
+        local = np.array(move.GetLocalTransformation(above.time)).T
         start = above.origin if move.GetResetXformStack() else to_world
         to_world = np.einsum("ij,jk->ik", start, local)
     return dataclasses.replace(
@@ -267,8 +268,9 @@ def _apply_own(above: _Visit, imageable: Any, time: Any) -> _Visit:
     )
 
 
-def _visit_instances(above: _Visit, time: Any, lost: list[str]) -> Iterator[_Visit]:
+def _visit_instances(above: _Visit) -> Iterator[_Visit]:
     prim = above.prim
+    time = above.time
     instancer = UsdGeom.PointInstancer(prim)
     targets = instancer.GetPrototypesRel().GetForwardedTargets()
     prototype_indices = instancer.GetProtoIndicesAttr().Get(time) or []
@@ -284,18 +286,18 @@ def _visit_instances(above: _Visit, time: Any, lost: list[str]) -> Iterator[_Vis
             f"{prim.GetPath()}: its positions, orientations or scales are not as many as its "
             f"{len(prototype_indices)} protoIndices."
         )
-    lost += [
+    above.lost.extend(
         f"{prim.GetPath()}.{primvar.GetName()}: values of single instances are not read"
         for primvar in UsdGeom.PrimvarsAPI(prim).GetPrimvarsWithValues()
         if primvar.GetInterpolation() != UsdGeom.Tokens.constant
-    ]
+    )
     visibilities = instancer.ComputeMaskAtTime(time) or [True] * len(prototype_indices)
     plain = Usd.PrimIsActive & Usd.PrimIsLoaded & Usd.PrimHasDefiningSpecifier
     for index, move, visible in zip(prototype_indices, moves, visibilities, strict=True):
         named = targets[index] if 0 <= index < len(targets) else None
         prototype = None if named is None else prim.GetStage().GetPrimAtPath(named)
         if not prototype:
-            lost.append(f"{prim.GetPath()}: instances of prototype {index}, which is not there")
+            above.note(f"instances of prototype {index}, which is not there")
         elif visible and prototype.IsActive():
             to_world = np.einsum("ij,jk->ik", above.to_world, np.array(move).T)
             known = plain if prototype.IsAbstract() else plain & ~Usd.PrimIsAbstract

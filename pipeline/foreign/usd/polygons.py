@@ -13,7 +13,6 @@ import numpy as np
 from numpy.typing import NDArray
 from pxr import UsdGeom
 
-from pipeline.foreign.numbers import read_number
 from pipeline.foreign.polygons import triangulate
 from pipeline.foreign.usd.placed import SOLIDS, PlacedPrim
 from pipeline.foreign.usd.texture_nodes import convert_to_rec709
@@ -75,7 +74,7 @@ class CutMesh:
             return None
         return values[where]
 
-    def read_primvar(self, name: str, time: Any) -> NDArray | None:
+    def read_primvar(self, name: str) -> NDArray | None:
         """Return a primvar of the mesh, or an inherited one, at corners [T, 3, ...].
 
         None where there is none, or not for every corner.
@@ -83,7 +82,7 @@ class CutMesh:
         primvar = UsdGeom.PrimvarsAPI(self.prim).FindPrimvarWithInheritance(name)
         if not primvar or not primvar.HasValue():
             return None
-        values = np.array(primvar.ComputeFlattened(time))
+        values = np.array(primvar.ComputeFlattened(self.placed.time))
         spread = str(primvar.GetInterpolation())
         if values.ndim == 0 or values.dtype.kind not in "fiu":
             return None
@@ -96,16 +95,16 @@ class CutMesh:
             )
         return fitting
 
-    def read_coordinates(self, primvar: str, time: Any) -> NDArray[np.float64]:
+    def read_coordinates(self, primvar: str) -> NDArray[np.float64]:
         """Return texture coordinates [T, 3, 2], perhaps not finite; NaN where one is missing."""
-        values = self.read_primvar(primvar, time)
+        values = self.read_primvar(primvar)
         if values is None or values.ndim != 3 or values.shape[2] < 2:
             return np.full((len(self.corners), 3, 2), np.nan)
         return np.asarray(values[..., :2], np.float64)
 
 
-def cut_mesh(placed: PlacedPrim, time: Any, max_faces: int | None = None) -> CutMesh:
-    """Return the triangles of a mesh or solid at a time, posed by its skeleton, without its holes.
+def cut_mesh(placed: PlacedPrim, max_faces: int | None = None) -> CutMesh:
+    """Return the triangles of a mesh or solid, posed by its skeleton, without its holes.
 
     A mirroring transform reverses the order of corners. More than `max_faces` triangles are not
     cut.
@@ -117,17 +116,14 @@ def cut_mesh(placed: PlacedPrim, time: Any, max_faces: int | None = None) -> Cut
     prim = placed.prim
     holes = as_array(None, np.int64, (-1,))
     if prim.GetTypeName() in SOLIDS:
-        points, counts, indices, is_smooth = _build_solid(prim, time)
+        points, counts, indices, is_smooth = _build_solid(placed)
     else:
-        mesh = UsdGeom.Mesh(prim)
-        stated = mesh.GetPointsAttr().Get(time)
-        points = as_array(stated, np.float64, (-1, 3))
+        points = as_array(placed.value("points"), np.float64, (-1, 3))
         if placed.skin is not None and len(points):
-            points = placed.skin.pose(prim, stated, time)
-        counts = as_array(mesh.GetFaceVertexCountsAttr().Get(time), np.int64, (-1,))
-        indices = as_array(mesh.GetFaceVertexIndicesAttr().Get(time), np.int64, (-1,))
-        holes = as_array(mesh.GetHoleIndicesAttr().Get(time), np.int64, (-1,))
-        is_smooth = mesh.GetSubdivisionSchemeAttr().Get() != "none"
+            points = placed.skin.pose(placed)
+        names = ("faceVertexCounts", "faceVertexIndices", "holeIndices")
+        counts, indices, holes = (as_array(placed.value(name), np.int64, (-1,)) for name in names)
+        is_smooth = placed.value("subdivisionScheme") != "none"
     _check(prim, points, counts, indices)
     num_faces = int(np.maximum(counts - 2, 0).sum())
     if max_faces is not None and num_faces > max_faces:
@@ -182,20 +178,17 @@ Polygons = tuple[NDArray[np.float64], NDArray[np.int64], NDArray[np.int64], bool
 """Points [P, 3], corner counts [F], point indices of corners, and whether the solid is round."""
 
 
-def _build_solid(prim: Any, time: Any) -> Polygons:
-    """Return the polygons at a time of a prim whose type is in SOLIDS."""
-    kind = str(prim.GetTypeName())
-
-    def read_size(name: str) -> float:
-        return read_number(prim.GetAttribute(name).Get(time), f"{prim.GetPath()}.{name}")
-
+def _build_solid(placed: PlacedPrim) -> Polygons:
+    """Return the polygons of a prim whose type is in SOLIDS."""
+    kind = str(placed.prim.GetTypeName())
+    read_size = placed.number
     if kind == "TetMesh":
-        return _read_tetrahedra(prim, time)
+        return _read_tetrahedra(placed)
     if kind == "Cube":
         corners = np.array([[x, y, z] for z in (-1, 1) for y in (-1, 1) for x in (-1, 1)])
         sides = [[0, 2, 3, 1], [4, 5, 7, 6], [0, 1, 5, 4], [2, 6, 7, 3], [0, 4, 6, 2], [1, 3, 7, 5]]
         return corners * read_size("size") / 2, np.full(6, 4), np.ravel(sides), False
-    axis = "Z" if kind == "Sphere" else str(prim.GetAttribute("axis").Get())
+    axis = "Z" if kind == "Sphere" else str(placed.prim.GetAttribute("axis").Get())
     if kind == "Plane":
         wide = read_size("width") / 2
         long = read_size("length") / 2
@@ -249,11 +242,10 @@ def _revolve(
     return np.concatenate(rings), counts[counts > 0], sides[is_corner]
 
 
-def _read_tetrahedra(prim: Any, time: Any) -> Polygons:
-    mesh = UsdGeom.TetMesh(prim)
-    faces = mesh.GetSurfaceFaceVertexIndicesAttr().Get(time)
+def _read_tetrahedra(placed: PlacedPrim) -> Polygons:
+    faces = placed.value("surfaceFaceVertexIndices")
     if not faces:
-        faces = UsdGeom.TetMesh.ComputeSurfaceFaces(mesh, time)
-    points = np.array(mesh.GetPointsAttr().Get(time) or np.zeros((0, 3)), np.float64)
+        faces = UsdGeom.TetMesh.ComputeSurfaceFaces(UsdGeom.TetMesh(placed.prim), placed.time)
+    points = np.array(placed.value("points") or np.zeros((0, 3)), np.float64)
     sides = np.array(faces or np.zeros((0, 3)), np.int64).reshape(-1, 3)
     return points, np.full(len(sides), 3), sides.ravel(), False

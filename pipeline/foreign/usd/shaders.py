@@ -12,6 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 from pxr import UsdShade
 
+from pipeline.foreign.usd.placed import PlacedPrim
 from pipeline.foreign.usd.polygons import CutMesh, as_array
 from pipeline.foreign.usd.stage import OpenedStage
 from pipeline.foreign.usd.texture_nodes import (
@@ -144,20 +145,18 @@ class StatedMaterial:
         """Return whether the material uses the specular workflow."""
         return bool(self.constants["useSpecularWorkflow"].any())
 
-    def read_values(self, name: str, cut: CutMesh, time: Any) -> NDArray[np.float64] | None:
+    def read_values(self, name: str, cut: CutMesh) -> NDArray[np.float64] | None:
         """Return the primvar of an input at corners [T, 3, 3]; None, with a note, without one."""
         primvar = self.primvars[name]
-        values = read_colors(cut, primvar, time)
+        values = read_colors(cut, primvar)
         if values is None:
-            cut.placed.lost.append(
-                f"{cut.prim.GetPath()}: no primvar {primvar!r:.60}; its fallback taken"
-            )
+            cut.placed.note(f"no primvar {primvar!r:.60}; its fallback taken")
         return values
 
 
-def read_colors(cut: CutMesh, primvar: str, time: Any) -> NDArray[np.float64] | None:
+def read_colors(cut: CutMesh, primvar: str) -> NDArray[np.float64] | None:
     """Return numbers or colors at corners as colors [T, 3, 3]; None for anything else."""
-    values = cut.read_primvar(primvar, time)
+    values = cut.read_primvar(primvar)
     if values is None:
         return None
     wide = values[..., None] if values.ndim == 2 else values
@@ -172,17 +171,17 @@ def reflect_head_on(ior: Any) -> Any:
     return np.square((ior - 1) / np.maximum(ior + 1, 1e-3))
 
 
-def read_bindings(prim: Any, time: Any) -> Iterator[tuple[Any, NDArray[np.int64] | None]]:
+def read_bindings(placed: PlacedPrim) -> Iterator[tuple[Any, NDArray[np.int64] | None]]:
     """Yield the material of a mesh, or None; then those of its subsets with their polygons.
 
     The binding for full rendering, or else that for previews, counts if its shader is supported.
     Later subsets override earlier ones.
     """
-    yield _find_material(prim), None
-    for subset in UsdShade.MaterialBindingAPI(prim).GetMaterialBindSubsets():
+    yield _find_material(placed.prim), None
+    for subset in UsdShade.MaterialBindingAPI(placed.prim).GetMaterialBindSubsets():
         bound = _find_material(subset.GetPrim())
-        if bound and subset.GetElementTypeAttr().Get(time) == "face":
-            yield bound, as_array(subset.GetIndicesAttr().Get(time), np.int64, (-1,))
+        if bound and subset.GetElementTypeAttr().Get(placed.time) == "face":
+            yield bound, as_array(subset.GetIndicesAttr().Get(placed.time), np.int64, (-1,))
 
 
 def _find_material(prim: Any) -> Any:
@@ -208,7 +207,6 @@ def surface_shader(material: Any) -> Any:
 
 def read_material(
     material: Any,
-    time: Any,
     opened: OpenedStage,
     known: Collection[str] = (),
     *,
@@ -218,7 +216,6 @@ def read_material(
 
     Args:
         material: the UsdShade.Material.
-        time: time of the values.
         opened: the file, which receives notes.
         known: unsupported inputs that the caller reads itself.
         normals: whether the normal map of a UsdPreviewSurface is read, as the texture `normal`.
@@ -229,7 +226,7 @@ def read_material(
     shader = surface_shader(material)
     if shader is None:
         return None
-    reader = ShaderReader(shader, time, opened)
+    reader = ShaderReader(shader, opened)
     notes = len(opened.lost)
     for name in TEXTURED:
         reader.read_connection(name)
@@ -258,10 +255,9 @@ def read_material(
 class ShaderReader:
     """Reads the inputs of one supported shader."""
 
-    def __init__(self, shader: Any, time: Any, opened: OpenedStage) -> None:
+    def __init__(self, shader: Any, opened: OpenedStage) -> None:
         """Take the names and defaults of the shader; the notes of `opened` receive what is lost."""
         self._shader = shader
-        self._time = time
         self._opened = opened
         self._names = NAMES[shader.GetShaderId()]
         self._defaults = _DEFAULTS[shader.GetShaderId()]
@@ -279,13 +275,13 @@ class ShaderReader:
         node = UsdShade.Shader(sources[0].GetPrim())
         if node.GetShaderId() == "UsdUVTexture":
             output = UsdShade.Output(sources[0]).GetBaseName()
-            self.textures[name] = read_texture_node(node, output, self._time, self._opened)
+            self.textures[name] = read_texture_node(node, output, self._opened)
         elif name == "normal":  # other connections stay unsupported
             return
         elif node.GetShaderId() in _READERS:
             primvar, fallback = _READERS[node.GetShaderId()]
-            self.primvars[name] = str(read_input(node, primvar, self._time, ""))
-            self._fallbacks[name] = read_input(node, fallback, self._time, 0.0)
+            self.primvars[name] = str(read_input(node, primvar, self._opened.time, ""))
+            self._fallbacks[name] = read_input(node, fallback, self._opened.time, 0.0)
         else:
             self._lose(name, f"{node.GetShaderId() or 'a network'} that is not read")
 
@@ -295,7 +291,7 @@ class ShaderReader:
         stated = self._fallbacks.get(name)
         sources = self._sources(name)
         if sources and not is_output(sources[0]):
-            stated = sources[0].Get(self._time)
+            stated = sources[0].Get(self._opened.time)
             stated = None if stated is None else convert_to_rec709(sources[0], np.array(stated))
         value = parse_color(default if stated is None else stated)
         if value is None:
@@ -340,7 +336,7 @@ class ShaderReader:
         sources = self._sources(name)
         if sources and is_output(sources[0]):
             return None
-        return parse_color(read_input(self._shader, name, self._time, default))
+        return parse_color(read_input(self._shader, name, self._opened.time, default))
 
     def _sources(self, name: str) -> Any:
         return find_sources(self._shader, self._names.get(name, name))

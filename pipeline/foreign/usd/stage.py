@@ -87,6 +87,8 @@ class OpenedStage:
         self.folder = (folder or self.path.parent).resolve()
         self.lost: list[str] = []
         self.unresolved: list[str] = []
+        self.time = Usd.TimeCode.EarliestTime()
+        """Time at which values are read: the first of an animated stage, unless it is set."""
         self._max_file_bytes = max_file_bytes
         self._layers: dict[str, Any] = {}
         self._context = Ar.GetResolver().CreateDefaultContextForAsset(str(self.path))

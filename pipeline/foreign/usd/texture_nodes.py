@@ -48,26 +48,20 @@ class TextureNode:
     """[4] RGBA value used without a picture; None where none is stated."""
 
 
-def read_texture_node(shader: Any, output: str, time: Any, opened: OpenedStage) -> TextureNode:
+def read_texture_node(shader: Any, output: str, opened: OpenedStage) -> TextureNode:
     """Return the inputs of a UsdUVTexture shader.
 
     Args:
         shader: the node.
         output: name of the connected output.
-        time: time of the values.
         opened: the file, which resolves paths and receives notes.
 
     Raises:
         TrilightError: its picture is outside of the folder, or on the network, or Malformed.
     """
+    time = opened.time
     sources = find_sources(shader, "file")
-    attribute = sources[0] if sources else None
-    asset = attribute.Get(time) if attribute else None
-    named = "" if asset is None else asset.path
-    resolved = None
-    if attribute and named:
-        specs = attribute.GetPropertyStack(time)
-        resolved = opened.resolve(specs[0].layer if specs else opened.root, named)
+    named, resolved = resolve_file(sources[0] if sources else None, opened)
     if "<UDIM>" in named:
         opened.lost.append(f"{shader.GetPath()}: {named!r:.100} has UDIM tiles, which are not read")
     for name in ("scale", "bias", "fallback"):
@@ -85,6 +79,19 @@ def read_texture_node(shader: Any, output: str, time: Any, opened: OpenedStage) 
         output=output if output in ("r", "g", "b", "a") else "rgb",
         fallback=None if fallback is None else np.array(fallback, np.float64),
     )
+
+
+def resolve_file(attribute: Any, opened: OpenedStage) -> tuple[str, str | None]:
+    """Return the path that an attribute states, or an empty one; and the resolved path, if any.
+
+    Raises:
+        TrilightError: the file is outside of the folder, or on the network.
+    """
+    asset = attribute.Get(opened.time) if attribute else None
+    if asset is None or not asset.path:
+        return "", None
+    specs = attribute.GetPropertyStack(opened.time)
+    return asset.path, opened.resolve(specs[0].layer if specs else opened.root, asset.path)
 
 
 def _read_coordinates(shader: Any, time: Any, lost: list[str]) -> dict[str, Any]:

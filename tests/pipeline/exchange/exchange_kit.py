@@ -45,7 +45,8 @@ def errors_of(stage: Any) -> list[str]:
 
 def build_json(folder: Path, name: str, **more: Any) -> Scene:
     """Return the scene of a RenderFormer file."""
-    return build_scene(folder.resolve(), name, AssetSettings(), **{"licence": "CC0-1.0", **more})[0]
+    more = {"licence": "CC0-1.0", **more}
+    return build_scene(folder.resolve(), name, AssetSettings(), **more)[0].scene
 
 
 def json_and_back(scene: Scene, folder: Path) -> tuple[Scene, tuple[str, ...]]:

@@ -36,7 +36,7 @@ EXAMPLES = {
 @cache
 def example_scene(shared: Path, name: str) -> Scene:
     """Return an example scene with the cameras of its file; nobody may change it."""
-    scene, _ = build_scene(
+    loaded, _ = build_scene(
         (shared / "renderformer_scenes").resolve(),
         f"{name}.json",
         AssetSettings(),
@@ -45,7 +45,7 @@ def example_scene(shared: Path, name: str) -> Scene:
         scene_index=0,
         seed=0,
     )
-    return scene
+    return loaded.scene
 
 
 def plain_obj(path: Path) -> tuple[NDArray[np.float64], NDArray[np.int64]]:
