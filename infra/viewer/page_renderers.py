@@ -28,7 +28,6 @@ from pipeline.exchange.formats import LoadedScene
 from pipeline.renders.preview import PreviewSettings, usual_filter
 from pipeline.renders.settings import RenderSettings
 from storage.errors import TrilightError, Unrenderable
-from storage.metrics import psnr_log_db
 from storage.records.passes import pass_names, view_passes
 from storage.records.scene import Scene
 from storage.renderer import Camera, Image, ReadyScene, Renderer, Sampling
@@ -322,7 +321,10 @@ class RenderQueue:
         return job
 
     def reference(self, job: RenderJob) -> RenderJob | None:
-        """Return the job whose picture is the reference of another job; None without one."""
+        """Return the job whose picture is the reference of another job; None without one.
+
+        It has the shape of the job's picture, if there is one already.
+        """
         with self._changed:
             for engine in _REFERENCES:
                 for other in reversed(self._jobs.values()):
@@ -400,21 +402,6 @@ class RenderQueue:
         self._changed.notify_all()
 
 
-def agreement_db(job: RenderJob, reference: RenderJob | None) -> float | None:
-    """Return psnr_log_db of a picture against the reference; None where one is missing."""
-    if reference is None or reference is job or job.image is None or reference.image is None:
-        return None
-    if not _are_comparable(job.image, reference.image):
-        return None
-    return float(psnr_log_db(job.image.radiance_rgb, reference.image.radiance_rgb))
-
-
-def _are_comparable(image: Image, other: Image) -> bool:
-    if isinstance(image, PassImage) or isinstance(other, PassImage):
-        return False
-    return image.radiance_rgb.shape == other.radiance_rgb.shape
-
-
 def _is_over(job: RenderJob) -> bool:
     return job.state in ("done", "failed", "cancelled")
 
@@ -435,5 +422,11 @@ def _can_judge(other: RenderJob, job: RenderJob, engine: str) -> bool:
         and other.options.camera_key == job.options.camera_key
         and other.image is not None
         and (engine == "target" or other.image.stated_error_db is not None)
-        and (job.image is None or _are_comparable(job.image, other.image))
+        and (
+            job.image is None
+            or (
+                not isinstance(job.image, PassImage)
+                and job.image.radiance_rgb.shape == other.image.radiance_rgb.shape
+            )
+        )
     )

@@ -25,7 +25,6 @@ from infra.viewer.page_renderers import (
     PassImage,
     RenderJob,
     RenderQueue,
-    agreement_db,
 )
 from infra.viewer.picture_options import (
     parse_picture_options,
@@ -44,6 +43,7 @@ from pipeline.exchange.formats import FORMATS, LoadedScene
 from pipeline.exchange.renderformer_json import camera_entry
 from storage.conventions import srgb8
 from storage.errors import TrilightError
+from storage.metrics import psnr_log_db
 from storage.records.lights import num_lights
 from storage.records.lookup import environment_values
 from storage.records.material import DIFFUSE, EMISSION, ROUGHNESS, SPECULAR
@@ -160,9 +160,7 @@ class SceneHandlers:
         after = request.query.get("after", "0")
         number = request.path.removeprefix("api/picture/")
         job = self.queue.wait_for_update(number, int(after) if after.isdecimal() else 0)
-        return json_response(
-            {**_job_record(job, self.queue.reference(job)), **self._reproduction(job)}
-        )
+        return json_response({**job_record(job, self.queue), **self._reproduction(job)})
 
     def _reproduction(self, job: RenderJob) -> Mapping[str, Any]:
         """Return the command that renders a picture, and its camera as a file for that command."""
@@ -184,9 +182,8 @@ class SceneHandlers:
             raise NotFound("the picture has not begun yet.")
         if request.query.get("as") == "error":
             reference = self.queue.reference(job)
-            if reference is None or agreement_db(job, reference) is None:
+            if reference is None or reference.image is None:
                 raise TrilightError("There is nothing to judge this picture by yet.")
-            assert reference.image is not None
             pixels = error_picture(job.image.radiance_rgb, reference.image.radiance_rgb)
         elif isinstance(job.image, PassImage):
             pixels = job.image.pixels
@@ -209,8 +206,11 @@ class SceneHandlers:
         return Response(body=data, kind=_OCTETS, headers={"X-Lost": said} if said else {})
 
 
-def _job_record(job: RenderJob, reference: RenderJob | None) -> Mapping[str, Any]:
-    image = job.image
+def job_record(job: RenderJob, queue: RenderQueue) -> Mapping[str, Any]:
+    """Return what a page shows of a job of a queue, as JSON values."""
+    image = job.image  # before the reference, which then has its shape
+    reference = queue.reference(job)
+    truth = None if reference is None else reference.image
     sampling = job.sampling
     record: dict[str, Any] = {
         "id": job.id,
@@ -232,7 +232,11 @@ def _job_record(job: RenderJob, reference: RenderJob | None) -> Mapping[str, Any
             "expected_db": image.facts.get("expected_error_db"),
             "says": image.remark,
             "notes": list(job.notes),
-            "agreement_db": agreement_db(job, reference),
+            "agreement_db": (
+                None
+                if truth is None
+                else float(psnr_log_db(image.radiance_rgb, truth.radiance_rgb))
+            ),
             "truth": None if reference is None else reference.options.engine,
             "error_white": ERROR_WHITE,
         }
