@@ -28,9 +28,11 @@ from pipeline.exchange.formats import LoadedScene
 from pipeline.renders.preview import PreviewSettings, usual_filter
 from pipeline.renders.settings import RenderSettings
 from storage.errors import TrilightError, Unrenderable
+from storage.metrics import psnr_log_db
 from storage.records.passes import pass_names, view_passes
 from storage.records.scene import Scene
 from storage.renderer import Camera, Image, ReadyScene, Renderer, Sampling
+from train.evaluation.sheet import ERROR_WHITE
 
 if TYPE_CHECKING:
     from model.inference import NeuralRenderer
@@ -400,6 +402,43 @@ class RenderQueue:
         job.state = state or job.state
         job.version += 1
         self._changed.notify_all()
+
+
+def job_record(job: RenderJob, queue: RenderQueue) -> Mapping[str, Any]:
+    """Return what a page shows of a job of a queue, as JSON values."""
+    image = job.image  # before the reference, which then has its shape
+    reference = queue.reference(job)
+    truth = None if reference is None else reference.image
+    sampling = job.sampling
+    record: dict[str, Any] = {
+        "id": job.id,
+        "engine": job.options.engine,
+        "state": job.state,
+        "version": job.version,
+        "error": job.error,
+        "prices": job.costs,
+        "shown": image is not None,
+    }
+    if sampling is not None:
+        record["sampling"] = {"spp": sampling.spp, "expected_spp": sampling.expected_spp}
+    if image is not None:
+        record |= {
+            "spp": image.samples,
+            "core_s": image.cpu_seconds,
+            "scene_core_s": job.scene_core_s,
+            "floor_db": image.stated_error_db,
+            "expected_db": image.facts.get("expected_error_db"),
+            "says": image.remark,
+            "notes": list(job.notes),
+            "agreement_db": (
+                None
+                if truth is None
+                else float(psnr_log_db(image.radiance_rgb, truth.radiance_rgb))
+            ),
+            "truth": None if reference is None else reference.options.engine,
+            "error_white": ERROR_WHITE,
+        }
+    return record
 
 
 def _is_over(job: RenderJob) -> bool:

@@ -20,12 +20,7 @@ from PIL import Image as Picture
 
 from infra.render.path_tracer import RenderChild
 from infra.render.tone_mapping import ToneMap, tone_mapped
-from infra.viewer.page_renderers import (
-    PageRenderer,
-    PassImage,
-    RenderJob,
-    RenderQueue,
-)
+from infra.viewer.page_renderers import PageRenderer, PassImage, RenderJob, RenderQueue, job_record
 from infra.viewer.picture_options import (
     parse_picture_options,
     short_digest,
@@ -43,14 +38,13 @@ from pipeline.exchange.formats import FORMATS, LoadedScene
 from pipeline.exchange.renderformer_json import camera_entry
 from storage.conventions import srgb8
 from storage.errors import TrilightError
-from storage.metrics import psnr_log_db
 from storage.records.lights import num_lights
 from storage.records.lookup import environment_values
 from storage.records.material import DIFFUSE, EMISSION, ROUGHNESS, SPECULAR
 from storage.records.scene import Scene
 from storage.records.scene_facts import lights
 from storage.records.texture import TEXTURED, Texture
-from train.evaluation.sheet import ERROR_WHITE, error_picture
+from train.evaluation.sheet import error_picture
 
 EXPORTS = {
     ".usdz": "USD with textures",
@@ -204,43 +198,6 @@ class SceneHandlers:
             data = path.read_bytes()
         said = "; ".join(lost).encode("ascii", "replace").decode()[:800]
         return Response(body=data, kind=_OCTETS, headers={"X-Lost": said} if said else {})
-
-
-def job_record(job: RenderJob, queue: RenderQueue) -> Mapping[str, Any]:
-    """Return what a page shows of a job of a queue, as JSON values."""
-    image = job.image  # before the reference, which then has its shape
-    reference = queue.reference(job)
-    truth = None if reference is None else reference.image
-    sampling = job.sampling
-    record: dict[str, Any] = {
-        "id": job.id,
-        "engine": job.options.engine,
-        "state": job.state,
-        "version": job.version,
-        "error": job.error,
-        "prices": job.costs,
-        "shown": image is not None,
-    }
-    if sampling is not None:
-        record["sampling"] = {"spp": sampling.spp, "expected_spp": sampling.expected_spp}
-    if image is not None:
-        record |= {
-            "spp": image.samples,
-            "core_s": image.cpu_seconds,
-            "scene_core_s": job.scene_core_s,
-            "floor_db": image.stated_error_db,
-            "expected_db": image.facts.get("expected_error_db"),
-            "says": image.remark,
-            "notes": list(job.notes),
-            "agreement_db": (
-                None
-                if truth is None
-                else float(psnr_log_db(image.radiance_rgb, truth.radiance_rgb))
-            ),
-            "truth": None if reference is None else reference.options.engine,
-            "error_white": ERROR_WHITE,
-        }
-    return record
 
 
 def _tone_map(radiance_rgb: NDArray[np.float32], query: Mapping[str, str]) -> NDArray[np.uint8]:

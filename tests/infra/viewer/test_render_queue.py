@@ -19,17 +19,12 @@ from infra.viewer.page_renderers import (
     RenderJob,
     RenderQueue,
     StoredPictures,
+    job_record,
     network_on_page,
     samples_on_page,
 )
 from infra.viewer.picture_options import PictureOptions, apply_edits, parse_picture_options
-from infra.viewer.scene_handlers import (
-    SceneHandlers,
-    job_record,
-    scene_bytes,
-    sky_bytes,
-    texture_png,
-)
+from infra.viewer.scene_handlers import SceneHandlers, scene_bytes, sky_bytes, texture_png
 from pipeline.exchange.formats import LoadedScene
 from storage.errors import TrilightError
 from storage.records.material import DIFFUSE, EMISSION, ROUGHNESS
