@@ -62,16 +62,6 @@ class Interval:
 
 
 @dataclass(frozen=True, kw_only=True)
-class MeasuredScenes:
-    """Measured costs of some scenes."""
-
-    core_s: tuple[float, ...]
-    """CPU seconds of each scene, in the order of rendering."""
-    num_bytes: tuple[int, ...]
-    """Bytes of each scene in its shard, in the same order."""
-
-
-@dataclass(frozen=True, kw_only=True)
 class Prediction:
     """Predicted size and cost of a dataset."""
 
@@ -99,12 +89,15 @@ class Prediction:
 
 def measure_scenes(
     options: GenerateOptions, count: int, place: Path, scene_done: Callable[[], None]
-) -> MeasuredScenes:
+) -> list[tuple[float, int]]:
     """Make the first scenes of a dataset in another folder.
 
     Args:
         options: options of the dataset, whose folder is not touched.
         place: empty folder, which may be deleted afterwards.
+
+    Returns:
+        CPU seconds of each scene, and its bytes in its shard, in the order of rendering.
 
     Raises:
         TrilightError: as `prepare_dataset`.
@@ -114,22 +107,25 @@ def measure_scenes(
     run = prepare_dataset(dataclasses.replace(options, out=str(place), scenes=scenes))
     job = dataclasses.replace(run.job, num_at_once=1)
     splits = job.settings.splits
-    core_s = []
-    sizes = []
+    measured = []
     try:
         for scene in range(count):
             shard = scene // splits.scenes_per_shard
             made = make_task(job, (Piece(shard_index=shard, first=scene, last=scene + 1),))
-            core_s.append(made.core_s)
-            sizes.append(_scene_bytes(job.folder, shard_name(shard, splits), scene))
+            num_bytes = _scene_bytes(job.folder, shard_name(shard, splits), scene)
+            measured.append((made.core_s, num_bytes))
             scene_done()
     finally:
         close_children()
-    return MeasuredScenes(core_s=tuple(core_s), num_bytes=tuple(sizes))
+    return measured
 
 
 def predict_cost(
-    measured: MeasuredScenes, options: GenerateOptions, *, cores: int, usd_per_core_hour: float
+    measured: Sequence[tuple[float, int]],
+    options: GenerateOptions,
+    *,
+    cores: int,
+    usd_per_core_hour: float,
 ) -> Prediction:
     """Return the predicted cost of the whole dataset from the means of measured scenes.
 
@@ -140,7 +136,8 @@ def predict_cost(
     splits = options.settings.splits
     num_scenes = planned_scenes(options.num_scenes, splits)
     num_shards = shards_for(num_scenes, splits)
-    core_hours = _total(measured.core_s[1:] or measured.core_s, num_scenes / 3600)
+    core_s, num_bytes = zip(*measured, strict=True)
+    core_hours = _total(core_s[1:] or core_s, num_scenes / 3600)
     scene_s = core_hours.value * 3600 / num_scenes / available_cores()
     num_tasks = min(MAX_TASKS, max(1, math.ceil(num_scenes * scene_s / TASK_S)))
     task_minutes = num_scenes * scene_s / num_tasks / 60
@@ -158,7 +155,7 @@ def predict_cost(
         core_hours=core_hours,
         hours=_scale(core_hours, 1 / cores),
         usd=_scale(core_hours, usd_per_core_hour),
-        gigabytes=_total(measured.num_bytes, num_scenes / 1e9),
+        gigabytes=_total(num_bytes, num_scenes / 1e9),
         shard_hours=_scale(core_hours, 1 / num_shards),
         num_tasks=num_tasks,
         task_minutes=task_minutes,

@@ -5,7 +5,6 @@ only ratios within one run are meaningful.
 """
 
 import dataclasses
-import importlib.util
 import os
 import platform
 import shutil
@@ -29,6 +28,7 @@ from infra.bench.experiment import (
 )
 from infra.bench.rows import plot
 from infra.bench_options import BenchOptions
+from infra.torch_library import require_torch
 from pipeline.isolation import ChildFailed
 from storage.errors import Rejected, TrilightError
 from storage.machine import processor
@@ -64,8 +64,8 @@ def run(
         TrilightError: a requirement of the experiment is missing, or no trial could be measured.
     """
     name = experiment.name
-    if "torch" in experiment.needs and importlib.util.find_spec("torch") is None:
-        raise TrilightError(f"bench {name}: torch is not installed; run `make setup-all`.")
+    if "torch" in experiment.needs:
+        require_torch(f"bench {name}")
     if "data" in experiment.needs and not options.data:
         raise TrilightError(
             f"bench {name}: --data is not given; expected the root of a finished dataset."

@@ -6,6 +6,7 @@ from typing import TYPE_CHECKING, Annotated
 
 from infra.cli.console import first_words, print_json, print_rows
 from infra.cli.options import command
+from infra.torch_library import require_torch
 from storage.errors import TrilightError, expected_one_of
 from storage.settings.described import checked
 from storage.settings.ranges import Within
@@ -40,13 +41,10 @@ class PublishOptions:
 def model(options: ModelOptions, files: PublishOptions) -> None:
     name = options.network
     first_words(f"Looking at {name}")
-    try:
-        from model.config import SIZES
-        from model.costs import Workload, costs
-    except ModuleNotFoundError as error:
-        if error.name != "torch":
-            raise
-        raise TrilightError("model: torch is not installed; run `make setup-all`.") from error
+    require_torch("model")
+    from model.config import SIZES
+    from model.costs import Workload, costs
+
     network = None
     if name not in SIZES:
         from model.open import open_network

@@ -6,6 +6,7 @@ import sys
 import threading
 import time
 import webbrowser
+from concurrent.futures import Future
 from typing import Annotated
 
 from infra.cli.console import console, first_words, suggest_look
@@ -38,13 +39,13 @@ class ViewOptions:
 @command("source", has_json=False)
 def view(options: ViewOptions) -> None:
     first_words(f"Opening {safe_url(options.source)}")
-    from infra.viewer.open_source import DeferredHandlers, open_handlers, page_of
+    from infra.viewer.open_source import PageHandlers, deferred_routes, open_handlers, page_of
     from infra.viewer.server import PageServer
 
     if options.checkpoint is not None:
         require_torch("--checkpoint")
-    later = DeferredHandlers(page_of(options.source))
-    server = PageServer(later.routes, port=options.port)
+    opened = Future[PageHandlers]()
+    server = PageServer(deferred_routes(page_of(options.source), opened), port=options.port)
     stops: list[int] = []
     signal.signal(signal.SIGTERM, signal.getsignal(signal.SIGINT))
     threading.Thread(target=server.serve_forever, daemon=True).start()
@@ -56,7 +57,7 @@ def view(options: ViewOptions) -> None:
     room = open_handlers(options.source, checkpoint=options.checkpoint, threads=options.threads)
     for number in (signal.SIGINT, signal.SIGTERM):
         signal.signal(number, lambda number, _: stops.append(number))
-    later.opened.set_result(room)
+    opened.set_result(room)
     while not stops:  # no lock: a signal just before a wait without end would be seen after it
         time.sleep(_STOP_S)
     room.close()

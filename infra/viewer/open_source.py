@@ -28,17 +28,14 @@ class PageHandlers(Protocol):
         """Stop reading and rendering."""
 
 
-class DeferredHandlers:
-    """Routes that wait for the handlers of a source that is being opened."""
+def deferred_routes(page: str, opened: Future[PageHandlers]) -> Routes:
+    """Return the routes of a page whose other requests wait until its source is opened."""
 
-    def __init__(self, page: str) -> None:
-        """Serve a page; its other requests wait for the result of `opened`."""
-        self.opened = Future[PageHandlers]()
-        waiting = ("GET api/", "GET scene/", "POST api/", "POST scene/")
-        self.routes: Routes = {**static_routes(page), **dict.fromkeys(waiting, self._respond)}
+    def respond(request: Request) -> Response:
+        return dispatch(opened.result().routes(), request)
 
-    def _respond(self, request: Request) -> Response:
-        return dispatch(self.opened.result().routes(), request)
+    waiting = ("GET api/", "GET scene/", "POST api/", "POST scene/")
+    return {**static_routes(page), **dict.fromkeys(waiting, respond)}
 
 
 def page_of(source: str) -> str:

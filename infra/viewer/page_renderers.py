@@ -31,6 +31,7 @@ from storage.metrics import psnr_log_db
 from storage.records.passes import pass_names, view_passes
 from storage.records.scene import Scene
 from storage.renderer import Camera, Image, ReadyScene, Renderer, Sampling
+from train.evaluation.sheet import ERROR_WHITE
 
 if TYPE_CHECKING:
     from model.inference import NeuralRenderer
@@ -321,7 +322,10 @@ class RenderQueue:
         return job
 
     def reference(self, job: RenderJob) -> RenderJob | None:
-        """Return the job whose picture is the reference of another job; None without one."""
+        """Return the job whose picture is the reference of another job; None without one.
+
+        It has the shape of the job's picture, if there is one already.
+        """
         with self._changed:
             for engine in _REFERENCES:
                 for other in reversed(self._jobs.values()):
@@ -399,19 +403,41 @@ class RenderQueue:
         self._changed.notify_all()
 
 
-def agreement_db(job: RenderJob, reference: RenderJob | None) -> float | None:
-    """Return psnr_log_db of a picture against the reference; None where one is missing."""
-    if reference is None or reference is job or job.image is None or reference.image is None:
-        return None
-    if not _are_comparable(job.image, reference.image):
-        return None
-    return float(psnr_log_db(job.image.radiance_rgb, reference.image.radiance_rgb))
-
-
-def _are_comparable(image: Image, other: Image) -> bool:
-    if isinstance(image, PassImage) or isinstance(other, PassImage):
-        return False
-    return image.radiance_rgb.shape == other.radiance_rgb.shape
+def job_record(job: RenderJob, queue: RenderQueue) -> Mapping[str, Any]:
+    """Return what a page shows of a job of a queue, as JSON values."""
+    image = job.image  # before the reference, which then has its shape
+    reference = queue.reference(job)
+    truth = None if reference is None else reference.image
+    sampling = job.sampling
+    record: dict[str, Any] = {
+        "id": job.id,
+        "engine": job.options.engine,
+        "state": job.state,
+        "version": job.version,
+        "error": job.error,
+        "prices": job.costs,
+        "shown": image is not None,
+    }
+    if sampling is not None:
+        record["sampling"] = {"spp": sampling.spp, "expected_spp": sampling.expected_spp}
+    if image is not None:
+        record |= {
+            "spp": image.samples,
+            "core_s": image.cpu_seconds,
+            "scene_core_s": job.scene_core_s,
+            "floor_db": image.stated_error_db,
+            "expected_db": image.facts.get("expected_error_db"),
+            "says": image.remark,
+            "notes": list(job.notes),
+            "agreement_db": (
+                None
+                if truth is None
+                else float(psnr_log_db(image.radiance_rgb, truth.radiance_rgb))
+            ),
+            "truth": None if reference is None else reference.options.engine,
+            "error_white": ERROR_WHITE,
+        }
+    return record
 
 
 def _is_over(job: RenderJob) -> bool:
@@ -434,5 +460,11 @@ def _can_judge(other: RenderJob, job: RenderJob, engine: str) -> bool:
         and other.options.camera_key == job.options.camera_key
         and other.image is not None
         and (engine == "target" or other.image.stated_error_db is not None)
-        and (job.image is None or _are_comparable(job.image, other.image))
+        and (
+            job.image is None
+            or (
+                not isinstance(job.image, PassImage)
+                and job.image.radiance_rgb.shape == other.image.radiance_rgb.shape
+            )
+        )
     )

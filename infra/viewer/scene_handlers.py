@@ -20,13 +20,7 @@ from PIL import Image as Picture
 
 from infra.render.path_tracer import RenderChild
 from infra.render.tone_mapping import ToneMap, tone_mapped
-from infra.viewer.page_renderers import (
-    PageRenderer,
-    PassImage,
-    RenderJob,
-    RenderQueue,
-    agreement_db,
-)
+from infra.viewer.page_renderers import PageRenderer, PassImage, RenderJob, RenderQueue, job_record
 from infra.viewer.picture_options import (
     parse_picture_options,
     short_digest,
@@ -50,7 +44,7 @@ from storage.records.material import DIFFUSE, EMISSION, ROUGHNESS, SPECULAR
 from storage.records.scene import Scene
 from storage.records.scene_facts import lights
 from storage.records.texture import TEXTURED, Texture
-from train.evaluation.sheet import ERROR_WHITE, error_picture
+from train.evaluation.sheet import error_picture
 
 EXPORTS = {
     ".usdz": "USD with textures",
@@ -160,9 +154,7 @@ class SceneHandlers:
         after = request.query.get("after", "0")
         number = request.path.removeprefix("api/picture/")
         job = self.queue.wait_for_update(number, int(after) if after.isdecimal() else 0)
-        return json_response(
-            {**_job_record(job, self.queue.reference(job)), **self._reproduction(job)}
-        )
+        return json_response({**job_record(job, self.queue), **self._reproduction(job)})
 
     def _reproduction(self, job: RenderJob) -> Mapping[str, Any]:
         """Return the command that renders a picture, and its camera as a file for that command."""
@@ -184,9 +176,8 @@ class SceneHandlers:
             raise NotFound("the picture has not begun yet.")
         if request.query.get("as") == "error":
             reference = self.queue.reference(job)
-            if reference is None or agreement_db(job, reference) is None:
+            if reference is None or reference.image is None:
                 raise TrilightError("There is nothing to judge this picture by yet.")
-            assert reference.image is not None
             pixels = error_picture(job.image.radiance_rgb, reference.image.radiance_rgb)
         elif isinstance(job.image, PassImage):
             pixels = job.image.pixels
@@ -207,36 +198,6 @@ class SceneHandlers:
             data = path.read_bytes()
         said = "; ".join(lost).encode("ascii", "replace").decode()[:800]
         return Response(body=data, kind=_OCTETS, headers={"X-Lost": said} if said else {})
-
-
-def _job_record(job: RenderJob, reference: RenderJob | None) -> Mapping[str, Any]:
-    image = job.image
-    sampling = job.sampling
-    record: dict[str, Any] = {
-        "id": job.id,
-        "engine": job.options.engine,
-        "state": job.state,
-        "version": job.version,
-        "error": job.error,
-        "prices": job.costs,
-        "shown": image is not None,
-    }
-    if sampling is not None:
-        record["sampling"] = {"spp": sampling.spp, "expected_spp": sampling.expected_spp}
-    if image is not None:
-        record |= {
-            "spp": image.samples,
-            "core_s": image.cpu_seconds,
-            "scene_core_s": job.scene_core_s,
-            "floor_db": image.stated_error_db,
-            "expected_db": image.facts.get("expected_error_db"),
-            "says": image.remark,
-            "notes": list(job.notes),
-            "agreement_db": agreement_db(job, reference),
-            "truth": None if reference is None else reference.options.engine,
-            "error_white": ERROR_WHITE,
-        }
-    return record
 
 
 def _tone_map(radiance_rgb: NDArray[np.float32], query: Mapping[str, str]) -> NDArray[np.uint8]:

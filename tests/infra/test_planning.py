@@ -9,7 +9,7 @@ from unittest import mock
 import pytest
 
 from infra.cli import doctor
-from infra.planning import MeasuredScenes, describe_run, measure_scenes, predict_cost
+from infra.planning import describe_run, measure_scenes, predict_cost
 from pipeline.executors.threads import ThreadRunner
 from pipeline.flows import prefect_server
 from pipeline.generation.generate_options import GenerateOptions
@@ -25,8 +25,8 @@ from tests.for_each import case
 from tests.pipeline.generation.tiny_scenes_kit import Undocumented, tiny_order, without_rendering
 
 
-def _measured(core_s: tuple[float, ...], num_bytes: int = 150_000) -> MeasuredScenes:
-    return MeasuredScenes(core_s=core_s, num_bytes=(num_bytes,) * len(core_s))
+def _measured(core_s: tuple[float, ...], num_bytes: int = 150_000) -> list[tuple[float, int]]:
+    return [(seconds, num_bytes) for seconds in core_s]
 
 
 def test_equal_scenes_add_up_exactly() -> None:
@@ -89,7 +89,8 @@ def test_what_is_measured_are_the_first_scenes_of_the_dataset_in_order(
     measured = measure_scenes(order, 10, tmp_path / "measured", lambda: None)
     assert not (tmp_path / "set").exists()
     cores = available_cores()
-    assert measured.core_s == tuple(cores * seconds for seconds in (1000, *range(1, 10)))
+    core_s, num_bytes = zip(*measured, strict=True)
+    assert core_s == tuple(cores * seconds for seconds in (1000, *range(1, 10)))
     sampled = list(scenes)
     scenes.clear()
     make_dataset(order, Undocumented())
@@ -101,7 +102,7 @@ def test_what_is_measured_are_the_first_scenes_of_the_dataset_in_order(
                 size = 512 + -(-member.num_bytes // 512) * 512
                 by_key[member.key] = by_key.get(member.key, 0) + size
     expected = [size for _, size in sorted(by_key.items())]
-    assert measured.num_bytes == tuple(expected[:10])
+    assert num_bytes == tuple(expected[:10])
     found = predict_cost(measured, order, cores=1, usd_per_core_hour=1)
     assert found.core_hours.value == pytest.approx(24 * cores * 5 / 3600)  # floating point only
 

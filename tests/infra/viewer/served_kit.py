@@ -5,9 +5,10 @@ import http.client
 import json
 import threading
 from collections.abc import Iterator
+from concurrent.futures import Future
 from typing import Any
 
-from infra.viewer.open_source import DeferredHandlers, PageHandlers
+from infra.viewer.open_source import PageHandlers, deferred_routes
 from infra.viewer.server import PageServer
 
 
@@ -40,9 +41,9 @@ class Asker:
 @contextlib.contextmanager
 def served(room: PageHandlers, page: str = "scene.html") -> Iterator[Asker]:
     """Serve a room for the block."""
-    later = DeferredHandlers(page)
-    later.opened.set_result(room)
-    server = PageServer(later.routes)
+    opened = Future[PageHandlers]()
+    opened.set_result(room)
+    server = PageServer(deferred_routes(page, opened))
     thread = threading.Thread(target=server.serve_forever, args=(0.01,), daemon=True)
     thread.start()
     try:

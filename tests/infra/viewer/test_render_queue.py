@@ -19,7 +19,7 @@ from infra.viewer.page_renderers import (
     RenderJob,
     RenderQueue,
     StoredPictures,
-    agreement_db,
+    job_record,
     network_on_page,
     samples_on_page,
 )
@@ -162,11 +162,11 @@ def test_pictures_of_one_place_are_judged_by_the_target_and_else_by_the_traced_o
     }
     easel = queue_of(renderers, scene)
     hits = over(easel, easel.submit(wanted("hits")))
-    assert easel.reference(hits) is None and agreement_db(hits, None) is None
+    assert easel.reference(hits) is None and job_record(hits, easel)["agreement_db"] is None
     traced = over(easel, easel.submit(wanted("traced")))
     assert easel.reference(hits) is traced
     expected = -20 * np.log10(np.log10(1.4) - np.log10(1.3))
-    assert agreement_db(hits, traced) == pytest.approx(expected, abs=1e-3)
+    assert job_record(hits, easel)["agreement_db"] == pytest.approx(expected, abs=1e-3)
     target = over(easel, easel.submit(wanted("target")))
     assert easel.reference(hits) is target and easel.reference(traced) is target
     assert target.image is not None and target.image.stated_error_db == 33.0

@@ -12,6 +12,7 @@ import socket
 import threading
 import time
 from collections.abc import Iterator
+from concurrent.futures import Future
 from pathlib import Path
 from typing import Any
 from unittest import mock
@@ -25,7 +26,7 @@ from infra.render.path_tracer import RenderChild
 from infra.viewer import open_source
 from infra.viewer import server as viewer_server
 from infra.viewer.list_handlers import THUMBNAIL_PX, DatasetHandlers, FolderHandlers
-from infra.viewer.open_source import DeferredHandlers, page_of, scene_list
+from infra.viewer.open_source import PageHandlers, deferred_routes, page_of, scene_list
 from infra.viewer.server import (
     MAX_BODY_BYTES,
     MAX_PATH,
@@ -263,21 +264,20 @@ def test_the_page_of_a_source(tmp_path: Path) -> None:
 
 
 def test_questions_wait_until_the_source_is_open() -> None:
-    later, answers = DeferredHandlers("scene.html"), list[bytes]()
-    assert later.routes["GET "](Request(path="", query={})).kind.startswith("text/html")
+    opened, answers = Future[PageHandlers](), list[bytes]()
+    routes = deferred_routes("scene.html", opened)
+    assert routes["GET "](Request(path="", query={})).kind.startswith("text/html")
     asked = threading.Thread(
-        target=lambda: answers.append(
-            later.routes["GET api/"](Request(path="api/echo", query={})).body
-        )
+        target=lambda: answers.append(routes["GET api/"](Request(path="api/echo", query={})).body)
     )
     asked.start()
     asked.join(0.05)
     assert asked.is_alive() and not answers
-    later.opened.set_result(EchoRoom())
+    opened.set_result(EchoRoom())
     asked.join(10)
     assert b"api/echo" in answers[0]
     with pytest.raises(NotFound):
-        later.routes["POST api/"](Request(method="POST", path="api/none", query={}))
+        routes["POST api/"](Request(method="POST", path="api/none", query={}))
 
 
 CUBE, BALL = locked("cube"), locked("ball")
