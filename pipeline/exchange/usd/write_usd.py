@@ -30,6 +30,7 @@ from pxr import Sdf, Tf
 from pipeline.exchange.usd import layout
 from pipeline.exchange.usd.write_materials import ST, add_materials, map_files, sky_file
 from pipeline.foreign.limits import WRITTEN_USD_SUFFIXES
+from pipeline.foreign.usd.stage import without_warnings
 from storage.atomic import write_atomically
 from storage.conventions import SCHEMA_VERSION
 from storage.digests import canonical_json
@@ -144,7 +145,9 @@ def _save(path: Path, layer: Any, files: Mapping[str, bytes]) -> None:
         within = path.parent if path.parent.is_dir() else None
         with tempfile.TemporaryDirectory(dir=within) as folder:
             plain = Path(folder) / _LAYER_NAME
-            if not layer.Export(str(plain)):
+            with without_warnings():  # such as that a confined child may not set a file's mode
+                is_written = layer.Export(str(plain))
+            if not is_written:
                 raise TrilightError(f"{path.name}: USD could not write the scene.")
             data = plain.read_bytes()
     if suffix == ".usdz":

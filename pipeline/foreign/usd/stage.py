@@ -320,15 +320,26 @@ def _check_package(path: Path, size: int) -> None:
 
 
 @contextmanager
+def without_warnings() -> Iterator[None]:
+    """Keep USD's own warnings from standard error."""
+    delegate = UsdUtils.CoalescingDiagnosticDelegate()
+    try:
+        yield
+    finally:
+        delegate.TakeUncoalescedDiagnostics()
+        del delegate
+
+
+@contextmanager
 def read_quietly(path: Path) -> Iterator[None]:
-    """Keep USD's own warnings on a file from standard error, and turn its errors into ours.
+    """Turn USD's errors on a file into ours, `without_warnings`.
 
     Raises:
         TrilightError: as the block, or the file is broken or has a value of a wrong type.
     """
-    delegate = UsdUtils.CoalescingDiagnosticDelegate()
     try:
-        yield
+        with without_warnings():
+            yield
     except Malformed as error:
         raise Malformed(f"{path.name}: {str(error).removeprefix(f'{path.name}: ')}.") from error
     except TrilightError:
@@ -339,9 +350,6 @@ def read_quietly(path: Path) -> Iterator[None]:
         raise TrilightError(
             f"{path.name}: holds a value of another kind than USD states."
         ) from error
-    finally:
-        delegate.TakeUncoalescedDiagnostics()
-        del delegate
 
 
 def _find_line(error: Exception) -> str:
