@@ -119,13 +119,12 @@ def write_page(
 ) -> Path:
     """Write `index.html`, its pictures and the README of a static space; return the page's path.
 
-    Pictures of an earlier page, which would be uploaded, too, are deleted.
+    Pictures of an earlier page, which would be uploaded, too, are deleted last.
 
     Raises:
         TrilightError: the folder cannot be written; or as `compare_scenes`.
     """
-    for old in sorted((folder / _PICTURES).glob("[0-9]" * 9 + "-*.png")):
-        old.unlink()
+    earlier = {*(folder / _PICTURES).glob("[0-9]" * 9 + "-*.png")}
     psnr_db: dict[str, list[float]] = {}
     rows = []
     for split, sample, pictures_rgb in scenes:
@@ -145,6 +144,8 @@ def write_page(
     )
     path = folder / "index.html"
     write_atomically(path, page)
+    for old in earlier - {folder / each.source for *_, figures in rows for each in figures}:
+        old.unlink()
     card = front_matter({"title": _TITLE, "sdk": "static", "license": "cc0-1.0"})
     write_atomically(folder / "README.md", f"{card}\n# {_TITLE}\n\n{_EXPLAINED}\n".encode())
     return path
