@@ -21,6 +21,7 @@ from pipeline.exchange.from_description import (
     LoadedMesh,
     SceneDescription,
     Vector,
+    centre_and_reach,
     scene_from_description,
 )
 from pipeline.exchange.reader import SceneReader
@@ -86,8 +87,14 @@ def mesh_of_arrays(positions: ArrayLike, faces: ArrayLike, *, uid: str, licence:
             f"{uid}: triangles name vertices {rows.min()} to {rows.max()}; expected 0 to "
             f"{len(points) - 1}."
         )
+    centre, reach = centre_and_reach(points)
     return LoadedMesh(
-        uid=uid, licence=licence, positions=points, faces=rows.astype(np.int64), stated=points
+        uid=uid,
+        licence=licence,
+        positions=points,
+        faces=rows.astype(np.int64),
+        centre=centre,
+        reach=reach,
     )
 
 
@@ -157,8 +164,7 @@ class SceneBuilder:
             loaded = (path, licence)
         if size is not None and not 0 < size < np.inf:
             raise TrilightError(f"{name}: size is {size}; expected meters above 0.")
-        is_point = isinstance(loaded, LoadedMesh) and not np.ptp(loaded.positions, axis=0).any()
-        if size is not None and is_point:
+        if size is not None and isinstance(loaded, LoadedMesh) and loaded.reach == 0:
             raise TrilightError(f"{name}: all vertices are one point; expected a mesh.")
         scale = 1.0 if size is None else float(size)
         transform = DescribedTransform(

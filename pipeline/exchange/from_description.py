@@ -153,9 +153,21 @@ class LoadedMesh:
     licence: str  # SPDX identifier, or `LicenseRef-...`
     positions: NDArray[np.float64]  # [V, 3] in the units of the file
     faces: NDArray[np.int64]  # [F, 3]
-    stated: NDArray[np.float64]  # [N, 3] vertices of the file, whose sphere is normalized
+    centre: NDArray[np.float64]  # [3] mean of the vertices in the file
+    reach: float  # distance of the farthest vertex from `centre`
     unread: tuple[str, ...] = ()  # parts of the file that were ignored
     sha256: str = ""  # digest of the file, in hex
+
+
+def centre_and_reach(points: NDArray[np.float64]) -> tuple[NDArray[np.float64], float]:
+    """Return the mean of points [N, 3], and how far the farthest is from it; 0 of a single point.
+
+    It is also 0 where squares of all distances are below the least number.
+    """
+    centre = points.mean(axis=0)
+    if not np.ptp(points, axis=0).any():  # a mean is rounded
+        return centre, 0.0
+    return centre, float(np.sqrt(np.sum(np.square(points - centre), axis=1).max()))
 
 
 def scene_from_description(
@@ -220,9 +232,7 @@ def _pieces(
     transform = described.transform
     points = mesh.positions
     if transform.normalize:
-        centre = mesh.stated.mean(axis=0)
-        reach = float(np.sqrt(np.sum(np.square(mesh.stated - centre), axis=1).max()))
-        points = (points - centre) / (2 * reach)
+        points = (points - mesh.centre) / (2 * mesh.reach)
     rotated = rotate_points(points, rotation_xyz(transform.rotation))
     world = rotated * np.array(transform.scale) + np.array(transform.translation)
     positions = world.astype(np.float32)

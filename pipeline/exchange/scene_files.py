@@ -19,6 +19,7 @@ from pipeline.exchange.from_description import (
     Cameras,
     LoadedMesh,
     build_cameras,
+    centre_and_reach,
     scaled_albedo_notes,
     scene_from_description,
 )
@@ -216,12 +217,14 @@ def load_mesh_file(
         raise TrilightError(f"{display_name}: {rejection}; expected a usable mesh.") from rejection
     except OSError as error:
         raise TrilightError(f"{display_name}: cannot be read ({error.strerror}).") from error
+    centre, reach = centre_and_reach(raw.positions)
     return LoadedMesh(
         uid=uid,
         licence=licence,
         positions=mesh.positions,
         faces=mesh.faces,
-        stated=raw.positions,
+        centre=centre,
+        reach=reach,
         unread=source.unread,
         sha256=source.sha256,
     )

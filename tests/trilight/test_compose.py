@@ -134,6 +134,8 @@ def _described(place: dict[str, object]) -> dict[str, object]:
         (lambda: _lit().add_mesh(TETRAHEDRON, size=np.inf), "size is inf; expected meters above"),
         (lambda: _lit().add_mesh(TETRAHEDRON, at=(0, 0)), "at is .*three finite numbers"),  # type: ignore[arg-type]
         (lambda: _lit().add_mesh(([[1, 1, 1]] * 3, [[0, 1, 2]]), size=1), "object1: all vertices"),
+        (lambda: _lit().add_mesh(([[0.1] * 3] * 3, [[0, 1, 2]]), size=1), "object1: all vertices"),
+        (lambda: _lit().add_mesh((1e-170 * np.eye(3), [[0, 1, 2]]), size=1), "object1: all vert"),
         (lambda: _lit().add_builtin("rok"), "did you mean rock"),
         (lambda: _lit().add_lamp(at=(0, 0, 0)), "another point"),
         (lambda: _lit().add_floor(Material(diffuse=(0.9,) * 3, specular=(0.9,) * 3)).scene(),
