@@ -21,7 +21,7 @@ from storage.raycast import MISS
 from storage.records.material import DIFFUSE
 from storage.records.objects import Failure
 from storage.records.passes import pass_names, view_passes
-from storage.records.sample import PartFloor, Sample, error_text
+from storage.records.sample import PictureErrors, Sample, error_text
 from storage.records.scene import Scene
 from storage.records.scene_facts import cameras, lights, sky_facts, surfaces
 from storage.records.texture import NORMAL, TEXTURED, Environment, MapSource, Texture
@@ -205,7 +205,7 @@ def _pictures(sample: Sample) -> Iterator[Figure]:
         yield Figure(png_uri(preview(picture * gain, _PICTURE_PX)), f"view {view}", caption)
 
 
-def _parts(sample: Sample) -> Iterator[tuple[int, str, PartFloor, Figure]]:
+def _parts(sample: Sample) -> Iterator[tuple[int, str, PictureErrors, Figure]]:
     """Yield view, name, stated errors and picture of each stored light component."""
     if sample.parts_rgb is None:
         return

@@ -44,7 +44,7 @@ from storage.records.asset import decode_asset
 from storage.records.object_index import ObjectIndex
 from storage.records.objects import SKY, TEXTURE, Failure, LockedObject, LockRows, failure_of
 from storage.records.passes import passes_exr
-from storage.records.sample import PartFloor, Sample, ViewRecord, sample_key
+from storage.records.sample import PictureErrors, Sample, ViewRecord, sample_key
 from storage.records.scene import Scene
 from storage.records.texture import MapSource
 from storage.renderer import Sampling
@@ -381,12 +381,14 @@ def _record(
         at_cap=rendered.at_cap,
         seed=seed,
         camera_attempt=camera.attempt,
-        expected=None if rendered.expected_error is None else _part_floor(rendered.expected_error),
-        parts={name: _part_floor(each) for name, each in (rendered.part_floors or {}).items()}
+        expected=None
+        if rendered.expected_error is None
+        else _round_errors(rendered.expected_error),
+        parts={name: _round_errors(each) for name, each in (rendered.part_floors or {}).items()}
         or None,
-        lights=tuple(map(_part_floor, rendered.light_floors or ())) or None,
+        lights=tuple(map(_round_errors, rendered.light_floors or ())) or None,
     )
 
 
-def _part_floor(floor: PartFloor) -> PartFloor:
-    return PartFloor(**floor.rounded)
+def _round_errors(floor: PictureErrors) -> PictureErrors:
+    return PictureErrors(**floor.rounded)

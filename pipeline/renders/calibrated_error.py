@@ -31,7 +31,7 @@ from pipeline.renders.view_pictures import (
 )
 from storage.digests import canonical_json, sha256_hex
 from storage.metrics import MAX_DB
-from storage.records.sample import PartFloor
+from storage.records.sample import PictureErrors
 from storage.settings.ranges import Within
 from storage.typed_json import Sha256, ShortText, read_json
 
@@ -40,7 +40,7 @@ _CODE = 1
 
 FILE = Path(__file__).with_name("stated_errors.json")
 _FIELDS = dict(zip(("log", "linear", "object"), FLOOR_METRICS, strict=True))
-"""Field of PartFloor by metric."""
+"""Field of PictureErrors by metric."""
 
 METRICS = tuple(_FIELDS)
 MEASURES = ("estimate", "agreement", "move", "surprise", "sure")
@@ -112,7 +112,7 @@ class CalibratedStatement:
 
     def state(
         self, measures: Mapping[str, ErrorMeasures], resolution: int, spp: int
-    ) -> tuple[PartFloor, PartFloor]:
+    ) -> tuple[PictureErrors, PictureErrors]:
         """Return what a picture's errors are calibrated to keep, and what they are expected to be.
 
         Args:
@@ -130,7 +130,7 @@ class CalibratedStatement:
             for result, shifts in ((bound, metric.bound), (expected, metric.expected)):
                 shift_db = 0.0 if is_empty else shifts[group]
                 result[_FIELDS[name]] = min(MAX_DB, center_db + shift_db)
-        return PartFloor(**bound), PartFloor(**expected)
+        return PictureErrors(**bound), PictureErrors(**expected)
 
 
 OUTSIDE = "other samples, widths, filters, layers or versions than measured, or guided paths"
@@ -216,7 +216,7 @@ def _statement_of(settings: RenderSettings) -> CalibratedStatement | None:
     return statement if narrowest <= settings.resolution <= widest else None
 
 
-def is_far(bound: PartFloor, settings: RenderSettings, spp: int) -> bool:
+def is_far(bound: PictureErrors, settings: RenderSettings, spp: int) -> bool:
     """Return whether halves alone show that sampling goes on, so that no picture is needed.
 
     Args:

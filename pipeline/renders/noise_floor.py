@@ -45,7 +45,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from storage.metrics import MAX_DB
-from storage.records.sample import PartFloor
+from storage.records.sample import PictureErrors
 
 BLOCK_PX = 8
 """Pixels across the blocks of the standard error: errors of a denoised picture are correlated over
@@ -71,7 +71,7 @@ FLOOR_METRICS = {
 """The metric of each error (storage.metrics)."""
 
 
-def by_metric(floor: PartFloor) -> dict[str, float]:
+def by_metric(floor: PictureErrors) -> dict[str, float]:
     """Return the three errors of a floor in dB by the name of their metric."""
     return {metric: getattr(floor, field) for field, metric in FLOOR_METRICS.items()}
 
@@ -105,7 +105,7 @@ class ErrorMeasures:
 
 def measured_floor(
     rows: Iterable[tuple[float, float, NDArray[np.float64], NDArray[np.float64]]],
-) -> PartFloor:
+) -> PictureErrors:
     """Return the floor of a picture.
 
     Args:
@@ -122,7 +122,7 @@ def measured_floor(
             bound += deviations * _standard_error(sums, counts)
         smallest = 10 ** (-MAX_DB / 10)
         floors_db.append(MAX_DB if bound <= smallest else float(-10 * np.log10(bound)))
-    return PartFloor(**dict(zip(FLOOR_METRICS, floors_db, strict=True)))
+    return PictureErrors(**dict(zip(FLOOR_METRICS, floors_db, strict=True)))
 
 
 def _standard_error(sums: NDArray[np.float64], counts: NDArray[np.float64]) -> float:

@@ -39,7 +39,7 @@ from pipeline.renders.view_pictures import (
     to_filter,
 )
 from storage.denoiser import denoise
-from storage.records.sample import PartFloor
+from storage.records.sample import PictureErrors
 
 if TYPE_CHECKING:
     from pipeline.renders.vector_tracer import VectorTracer
@@ -352,7 +352,7 @@ def metric_counts(hits: NDArray[np.bool_]) -> tuple[NDArray[np.float64], ...]:
     return everywhere, everywhere, objects
 
 
-def floors_of(numbers: LookNumbers, counts: tuple[NDArray[np.float64], ...]) -> list[PartFloor]:
+def floors_of(numbers: LookNumbers, counts: tuple[NDArray[np.float64], ...]) -> list[PictureErrors]:
     """Return the floors of `floor_groups`, by the halves alone and `metric_counts`."""
     _require_numbers(numbers)
     errors = numbers.adds[3:]
@@ -455,7 +455,7 @@ class ViewPictures:
         return self._look(numbers, [floor], expected)
 
     def _look(
-        self, numbers: LookNumbers, floors: list[PartFloor], expected: PartFloor | None
+        self, numbers: LookNumbers, floors: list[PictureErrors], expected: PictureErrors | None
     ) -> MeasuredLook:
         self._logs = numbers.logs
         self._filtered = []  # memory for the passes that follow

@@ -47,7 +47,7 @@ from storage.records.lights import (
     rounded_to_half,
     sum_of_lights,
 )
-from storage.records.sample import PartFloor
+from storage.records.sample import PictureErrors
 from storage.records.scene import Scene
 from storage.renderer import Image, Sampling
 
@@ -65,7 +65,7 @@ slower passes cost easier ones 7 to 11 %."""
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
-class RenderedView(PartFloor):
+class RenderedView(PictureErrors):
     """One finished picture with its measured error."""
 
     radiance_rgb: NDArray[np.float32]
@@ -73,7 +73,7 @@ class RenderedView(PartFloor):
     spp: int
     """Samples per pixel that were spent, on each light where they are apart: the mean over the
     pixels that show anything, rounded down."""
-    expected_error: PartFloor | None = None
+    expected_error: PictureErrors | None = None
     """Errors that are as often better as worse, in dB, where the three above are calibrated bounds
     (pipeline.renders.calibrated_error); None where they are bounds by estimate and allowances."""
     at_cap: bool
@@ -90,9 +90,9 @@ class RenderedView(PartFloor):
     """[R, R, 3] radiance of each part, with `split` or `split_lobes`; rounded to half floats. With
     `per_light` [L, R, R, 3]. Their storage.records.lights.sum_of_parts is `radiance_rgb`, or
     `lights_rgb`, in every bit."""
-    part_floors: Mapping[str, PartFloor] | None = None
+    part_floors: Mapping[str, PictureErrors] | None = None
     """Measured error of each part, of all lights together."""
-    light_floors: Sequence[PartFloor] | None = None
+    light_floors: Sequence[PictureErrors] | None = None
     """Measured error of each of `lights_rgb`."""
 
 

@@ -26,7 +26,7 @@ from pipeline.renders.noise_floor import clamped_radiance
 from pipeline.renders.samples import by_tiles
 from storage.conventions import HALF_FLOAT_MAX, log10_radiance
 from storage.errors import Rejected
-from storage.records.sample import PartFloor
+from storage.records.sample import PictureErrors
 
 LEAST_PASSES = 10
 """Passes from which on their spread says how far a pixel has converged: of fewer, 4 standard errors
@@ -63,12 +63,12 @@ which would hide the overflow."""
 class MeasuredLook:
     """Measurements on the samples of a view at one time."""
 
-    floor: PartFloor
-    part_floors: Mapping[str, PartFloor]
+    floor: PictureErrors
+    part_floors: Mapping[str, PictureErrors]
     """Stated error of each part that is stored, of all lights together."""
-    light_floors: Sequence[PartFloor]
+    light_floors: Sequence[PictureErrors]
     """Stated error of each light whose picture is stored; empty where they are together."""
-    expected: PartFloor | None = None
+    expected: PictureErrors | None = None
     """Error of the picture that is as often better as worse, where the stated one is calibrated
     (pipeline.renders.calibrated_error); None where it is the bound of noise_floor."""
     changes: Sequence[NDArray[np.float64]]

@@ -54,7 +54,7 @@ Plausible = Annotated[float, Within(-1000, 1000, low_open=True, high_open=True)]
 
 
 @dataclass(frozen=True, kw_only=True)
-class PartFloor:
+class PictureErrors:
     """Errors of a picture, of one layer of it for all lights together, or of one light."""
 
     noise_floor_db: Plausible
@@ -67,7 +67,7 @@ class PartFloor:
     @property
     def rounded(self) -> dict[str, float]:
         """The three errors by name, to a thousandth: as records and headers state them."""
-        names = [field.name for field in dataclasses.fields(PartFloor)]
+        names = [field.name for field in dataclasses.fields(PictureErrors)]
         return {name: round(getattr(self, name), 3) for name in names}
 
 
@@ -84,7 +84,7 @@ class KnownParts(Law):
 
 
 @dataclass(frozen=True, kw_only=True)
-class ViewRecord(PartFloor):
+class ViewRecord(PictureErrors):
     """Sampling and stated errors of one picture.
 
     They are measured before it is packed; the profile `compact` adds at most a tenth to their mean
@@ -100,13 +100,13 @@ class ViewRecord(PartFloor):
     seed: int
     camera_attempt: int
     """Number of cameras that were rejected before this one."""
-    expected: PartFloor | None = None
+    expected: PictureErrors | None = None
     """Errors that are as often better as worse, where the stated errors are calibrated bounds; a
     record whose floors are bounds by estimate and allowances is written without this field."""
-    parts: Annotated[Mapping[str, PartFloor], KnownParts()] | None = None
+    parts: Annotated[Mapping[str, PictureErrors], KnownParts()] | None = None
     """Floors of the parts that are stored, by name (storage.records.lights); a record that has none
     is written without this field."""
-    lights: tuple[PartFloor, ...] | None = None
+    lights: tuple[PictureErrors, ...] | None = None
     """Floors of the lights that are stored, in their order (storage.records.lights); absent where
     they are together, and from older sets."""
 

@@ -21,7 +21,7 @@ from storage.records.exr import decode_exr, encode_channels, encode_exr
 from storage.records.lights import decode_parts_exr, encode_parts_exr
 from storage.records.packed_maps import MAP_NAME
 from storage.records.passes import passes_exr
-from storage.records.sample import PartFloor, Sample, decode_sample, decode_scene, encode_sample
+from storage.records.sample import PictureErrors, Sample, decode_sample, decode_scene, encode_sample
 from storage.records.scene_facts import scene_values
 from storage.records.texture import MapSource
 from tests.scenes_by_hand import tiny_sample
@@ -49,7 +49,9 @@ def _sample() -> Sample:
     packed = [passes_exr(scene, ["object"], view=view, resolution=_PIXELS) for view in range(2)]
     black = np.zeros_like(sample.radiance_rgb)
     lights = np.stack([sample.radiance_rgb, black], axis=1)  # the sky is one more
-    floor = PartFloor(noise_floor_db=40.0, noise_floor_linear_db=30.0, object_noise_floor_db=39.0)
+    floor = PictureErrors(
+        noise_floor_db=40.0, noise_floor_linear_db=30.0, object_noise_floor_db=39.0
+    )
     views = [dataclasses.replace(view, parts=dict.fromkeys(_PARTS, floor)) for view in sample.views]
     return dataclasses.replace(
         sample,

@@ -31,7 +31,7 @@ from storage.dataset.shard import write_shard
 from storage.digests import sha256_hex
 from storage.errors import TrilightError
 from storage.records.passes import decode_passes_exr, passes_exr
-from storage.records.sample import PartFloor, encode_sample
+from storage.records.sample import PictureErrors, encode_sample
 from storage.records.scene import Scene
 from storage.records.scene_file import encode_scene
 from tests.command_line import expect_json, expect_mistake, expect_output, trilight
@@ -101,7 +101,9 @@ def test_a_dataset_that_is_read_only_stays_as_it_is(
 def test_parts_show_with_their_floors(tmp_path: Path) -> None:
     made = sample(0, furnished(["a"]))
     floors = {
-        name: PartFloor(noise_floor_db=db, noise_floor_linear_db=30.0, object_noise_floor_db=39.0)
+        name: PictureErrors(
+            noise_floor_db=db, noise_floor_linear_db=30.0, object_noise_floor_db=39.0
+        )
         for name, db in (("direct", 47.5), ("indirect", 38.25))
     }
     parts = {"direct": made.radiance_rgb, "indirect": np.zeros_like(made.radiance_rgb)}

@@ -34,7 +34,7 @@ from storage.markdown import code, front_matter, plain, text
 from storage.records.objects import read_objects_lock, write_objects_lock
 from storage.records.profiles import Profile
 from storage.records.quantities import QUANTITIES, STATISTICS, summary
-from storage.records.sample import PartFloor, error_text
+from storage.records.sample import PictureErrors, error_text
 from tests.for_each import with_folders
 from tests.pipeline.documents.dataset_by_hand import (
     edit_manifest,
@@ -269,7 +269,7 @@ def test_the_body_counts_by_split_and_licence(tmp_path: Path) -> None:
 
 def test_expected_errors_stand_beside_the_promised_ones(tmp_path: Path) -> None:
     """In card, statistics and captions; without them neither says a word of them."""
-    expected = PartFloor(
+    expected = PictureErrors(
         noise_floor_db=43.25, noise_floor_linear_db=35.0, object_noise_floor_db=42.0
     )
     stated = sample(0, tiny_scene())

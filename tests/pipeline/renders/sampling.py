@@ -19,7 +19,7 @@ from pipeline.renders.pictures import (
 from pipeline.renders.renderer import RenderedView, SceneRenderer
 from pipeline.renders.settings import RenderSettings
 from pipeline.renders.tracer import PixelCamera, load_tracer, pixel_camera
-from storage.records.sample import PartFloor
+from storage.records.sample import PictureErrors
 from storage.records.scene import Scene
 
 SIGMAS = 5.0
@@ -146,7 +146,7 @@ def halves_of(a: Half, b: Half) -> Halves:
     return join_halves(a.raw_rgb, b.raw_rgb, a.denoised_rgb, b.denoised_rgb, NUMPY)
 
 
-def floor_of(a: Half, b: Half, hits: NDArray[np.bool_]) -> PartFloor:
+def floor_of(a: Half, b: Half, hits: NDArray[np.bool_]) -> PictureErrors:
     """Return the floor of the picture made from both halves."""
     is_filtered = not np.array_equal(*a)
     rows, nothing = estimates(halves_of(a, b), hits, NUMPY, is_filtered), np.zeros(hits.shape)

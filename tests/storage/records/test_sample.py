@@ -51,7 +51,7 @@ from storage.records.profiles import (
     pack_picture,
     unpack_arrays,
 )
-from storage.records.sample import PartFloor, Sample, decode_sample, decode_scene, encode_sample
+from storage.records.sample import PictureErrors, Sample, decode_sample, decode_scene, encode_sample
 from storage.records.scene import SceneObject
 from storage.records.scene_file import encode_scene
 from tests.command_line import run_program
@@ -385,7 +385,7 @@ def test_verify_demands_the_sum_of_lights() -> None:
     assert "view 1 is not the sum of its lights in 1 pixels, first in (3, 5)" in fault
 
 
-FLOOR = PartFloor(noise_floor_db=40.5, noise_floor_linear_db=30.25, object_noise_floor_db=39.0)
+FLOOR = PictureErrors(noise_floor_db=40.5, noise_floor_linear_db=30.25, object_noise_floor_db=39.0)
 RENDERS = {
     ("direct", "indirect"): {"split": True},
     ("diffuse", "specular"): {"split_lobes": True},

@@ -21,7 +21,7 @@ from storage.dataset.dataset import open_dataset
 from storage.records.exr import decode_exr
 from storage.records.material import DIFFUSE, EMISSION, SPECULAR
 from storage.records.passes import view_passes
-from storage.records.sample import PartFloor, Sample
+from storage.records.sample import PictureErrors, Sample
 from storage.records.scene import Scene
 from tests.command_line import trilight
 from tests.for_each import for_each
@@ -165,7 +165,9 @@ def attributed(tmp_path: Path, shards: dict[str, list[Sample]]) -> Path:
 def _by_lobe(whole: Sample) -> Sample:
     """Return a sample whose light is three quarters diffuse and a quarter specular."""
     light = (np.round(whole.radiance_rgb * 4) * 4).astype(np.float32)  # quarters are half floats
-    floor = PartFloor(noise_floor_db=40.0, noise_floor_linear_db=30.0, object_noise_floor_db=39.0)
+    floor = PictureErrors(
+        noise_floor_db=40.0, noise_floor_linear_db=30.0, object_noise_floor_db=39.0
+    )
     views = [
         dataclasses.replace(v, parts={"diffuse": floor, "specular": floor}) for v in whole.views
     ]
