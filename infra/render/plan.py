@@ -11,8 +11,6 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-import numpy as np
-
 from infra.render.networks import NetworkRenderer
 from infra.render.options import EngineChoice, RenderOptions
 from infra.render.path_tracer import PathTracer, RenderChild
@@ -26,7 +24,6 @@ from pipeline.renders.settings import RenderSettings
 from storage.atomic import write_error
 from storage.errors import TrilightError
 from storage.machine import available_cores
-from storage.records.scene import Scene
 from storage.renderer import Camera, Renderer
 
 
@@ -99,7 +96,7 @@ def pair_cameras(
     """Return scene and camera of each picture, in order.
 
     One scene is combined with all cameras, and one camera with all scenes; equally many scenes and
-    cameras are paired. A number is the row of a camera of the scene.
+    cameras are paired.
 
     Raises:
         TrilightError: several scenes and several cameras, but not equally many.
@@ -113,38 +110,9 @@ def pair_cameras(
     return [(sources[at % len(sources)], cameras[at % len(cameras)]) for at in range(count)]
 
 
-def orbit(scene: Scene, start: Camera, count: int, arc_deg: float) -> list[Camera]:
-    """Return `count` cameras on a horizontal circle around the point that `start` looks at.
-
-    The circle's center is the point of the camera's axis nearest to the center of all surfaces that
-    reflect. The whole circle begins at `start`; a shorter arc has `start` in its middle.
-    """
-    points = scene.vertex_positions[scene.faces[~scene.triangle_emits]].reshape(-1, 3)
-    if not len(points):
-        points = scene.vertex_positions
-    middle = (points.min(axis=0).astype(np.float64) + points.max(axis=0)) / 2
-    pose = start.c2w.astype(np.float64)
-    eye = pose[:3, 3]
-    forward = -pose[:3, 2]
-    target = eye + forward * max(float(np.einsum("i,i->", middle - eye, forward)), 0.0)
-    if arc_deg == 360:
-        angles_deg = 360 * np.arange(count) / count
-    else:
-        angles_deg = np.linspace(-arc_deg / 2, arc_deg / 2, count) if count > 1 else np.zeros(1)
-    cameras = []
-    for angle_rad in np.radians(angles_deg):
-        cos = np.cos(angle_rad)
-        sin = np.sin(angle_rad)
-        rotation = np.array([[cos, -sin, 0], [sin, cos, 0], [0, 0, 1]])  # about the vertical axis
-        turned = pose.copy()
-        turned[:3, :3] = np.einsum("ij,jk->ik", rotation, pose[:3, :3])
-        turned[:3, 3] = np.einsum("ij,j->i", rotation, eye - target) + target
-        cameras.append(Camera(c2w=turned.astype(np.float32), fov_deg=start.fov_deg))
-    return cameras
-
-
 Pairs = Sequence[tuple[SceneSource, Camera | int]]
-"""Scene and camera of each picture; a number is the row of a camera of the scene."""
+"""Scene and camera of each picture. A number counts the cameras around the first scene; without an
+orbit, 0 is the scene's own camera."""
 
 _RESOLUTION = 512
 
@@ -168,6 +136,8 @@ class RenderPlan:
     pairs: Pairs
     """Pictures in order; those of one scene are consecutive."""
     fps: int
+    orbit: tuple[int, float] | None = None
+    """Number of cameras around the first scene, and their angle in degrees; None without them."""
     choice: Choice | None = None
     """Samples or network for a budget, with their expected cost and error; None without one."""
 
@@ -182,22 +152,18 @@ def plan_render(options: RenderOptions, reader: SceneReader) -> RenderPlan:
     output = output_paths(options.out)
     if not output.is_sequence and (options.orbit, options.cameras) != (None, None):
         raise TrilightError(f"--out is {options.out}; expected a folder, X.mp4 or X.webp for many.")
+    _require_writable(output)
     look = Look(tone_map=options.tone_map, exposure_ev=options.exposure_ev)
     checkpoint, resolution = _network_and_width(options)
     PreviewSettings(resolution=resolution, spp=1)  # reports a wrong width first
     traced = None if options.engine == "neural" else options.quality(resolution)
-    _require_writable(output)  # as all that can be refused before a file is read for long
     sources = reader.list_scenes(options.source, options.albedo_over_one, many=output.is_sequence)
     if traced is not None:
         choose_variant("auto")  # probed once, and refused before cameras or a scene are read
-    cameras: Sequence[Camera | int] = [options.view]
+    cameras: Sequence[Camera | int] = range(options.orbit or 1)
     if options.cameras is not None:
         file = scene_source(options.cameras, many=True)
         cameras = reader.cameras(file, options.view)
-    elif options.orbit is not None:
-        scene = reader.load(sources[0]).scene
-        start = Camera.of_scene(scene, options.view, "--view")
-        cameras = orbit(scene, start, options.orbit, options.arc_deg)
     pairs = pair_cameras(sources, cameras)
     renderers, choice = _renderers(options, traced, checkpoint, resolution, pairs)
     return RenderPlan(
@@ -210,6 +176,7 @@ def plan_render(options: RenderOptions, reader: SceneReader) -> RenderPlan:
         output=output,
         pairs=pairs,
         fps=options.fps,
+        orbit=None if options.orbit is None else (options.orbit, options.arc_deg),
         choice=choice,
     )
 

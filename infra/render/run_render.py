@@ -30,7 +30,7 @@ from pipeline.documents.png import encode_png
 from pipeline.exchange.formats import FORMATS, SceneSource
 from pipeline.exchange.reader import SceneReader
 from pipeline.renders.settings import FIRST_SPP
-from storage.atomic import write_atomically, write_error
+from storage.atomic import write_atomically
 from storage.conventions import log10_radiance
 from storage.digests import canonical_json, sha256_hex
 from storage.errors import TrilightError
@@ -57,6 +57,36 @@ _GAP_PX = 8
 _FONT_PX = 14
 _INK = (30, 30, 30)
 _PAPER = (250, 250, 248)
+
+
+def orbit(scene: Scene, start: Camera, count: int, arc_deg: float) -> list[Camera]:
+    """Return `count` cameras on a horizontal circle around the point that `start` looks at.
+
+    The circle's center is the point of the camera's axis nearest to the center of all surfaces that
+    reflect. The whole circle begins at `start`; a shorter arc has `start` in its middle.
+    """
+    points = scene.vertex_positions[scene.faces[~scene.triangle_emits]].reshape(-1, 3)
+    if not len(points):
+        points = scene.vertex_positions
+    middle = (points.min(axis=0).astype(np.float64) + points.max(axis=0)) / 2
+    pose = start.c2w.astype(np.float64)
+    eye = pose[:3, 3]
+    forward = -pose[:3, 2]
+    target = eye + forward * max(float(np.einsum("i,i->", middle - eye, forward)), 0.0)
+    if arc_deg == 360:
+        angles_deg = 360 * np.arange(count) / count
+    else:
+        angles_deg = np.linspace(-arc_deg / 2, arc_deg / 2, count) if count > 1 else np.zeros(1)
+    cameras = []
+    for angle_rad in np.radians(angles_deg):
+        cos = np.cos(angle_rad)
+        sin = np.sin(angle_rad)
+        rotation = np.array([[cos, -sin, 0], [sin, cos, 0], [0, 0, 1]])  # about the vertical axis
+        turned = pose.copy()
+        turned[:3, :3] = np.einsum("ij,jk->ik", rotation, pose[:3, :3])
+        turned[:3, 3] = np.einsum("ij,j->i", rotation, eye - target) + target
+        cameras.append(Camera(c2w=turned.astype(np.float32), fov_deg=start.fov_deg))
+    return cameras
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -206,13 +236,10 @@ def run_plan(
         TrilightError: a network or a scene cannot be loaded or rendered, or a file cannot be
             written.
     """
-    try:
-        plan.output.folder.mkdir(parents=True, exist_ok=True)
-    except OSError as error:
-        raise write_error(plan.output.out, error) from error
     finished = list[FinishedShot]()
     notes = dict[str, None]()
     before: Frame | None = None
+    own: Sequence[Camera] = ()
     with ExitStack() as stack:
         for renderer in plan.renderers:
             stack.enter_context(closing(renderer))
@@ -220,9 +247,14 @@ def run_plan(
         for source, pairs in itertools.groupby(plan.pairs, key=lambda pair: pair[0]):
             loaded = reader.load(source)
             scene = _SceneAtHand(plan, source, loaded.scene, on_samples)
+            if plan.orbit is None:
+                own = ()
             for _, camera in pairs:
                 if isinstance(camera, int):
-                    camera = Camera.of_scene(loaded.scene, camera, "--view")
+                    if not own:
+                        start = Camera.of_scene(loaded.scene, plan.view, "--view")
+                        own = orbit(loaded.scene, start, *plan.orbit) if plan.orbit else [start]
+                    camera = own[camera]
                 stem = plan.output.stem_of(len(finished))
                 done, before = scene.finish(stem, camera, before)
                 finished.append(done)

@@ -20,6 +20,8 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
+import numpy as np
+
 from pipeline.assets.settings import AssetSettings
 from pipeline.exchange.formats import (
     FORMATS,
@@ -100,6 +102,12 @@ def load_cameras(source: SceneSource) -> Cameras:
         return form.cameras(source)
     scene = load_source(source).scene
     return scene.c2w, scene.fov_deg
+
+
+def load_camera(source: SceneSource, view: int) -> Cameras:
+    """Read one camera of a scene, by its row; as `load_cameras`."""
+    camera = Camera.of_scene(load_source(source).scene, view, "--view")
+    return camera.c2w[None], np.array([camera.fov_deg], np.float32)
 
 
 def load_source(source: SceneSource, pictures: bool = False) -> LoadedScene:
@@ -194,12 +202,14 @@ class SceneReader(contextlib.AbstractContextManager["SceneReader"]):
         """
         frames = [file] if view is None else self.scenes_of(file)
         if view is None or len(frames) == 1:
-            return [
-                Camera(c2w=pose, fov_deg=float(angle))
-                for pose, angle in zip(*self._read(load_cameras, frames[0]), strict=True)
-            ]
-        of_frames = [Camera.of_scene(self.load(each).scene, view, "--view") for each in frames]
-        return [replace(camera, view=None) for camera in of_frames]
+            tables = [self._read(load_cameras, frames[0])]
+        else:
+            tables = [self._read(load_camera, each, view) for each in frames]
+        return [
+            Camera(c2w=pose, fov_deg=float(angle))
+            for table in tables
+            for pose, angle in zip(*table, strict=True)
+        ]
 
     def mesh(self, path: Path, licence: str) -> LoadedMesh:
         """Read the mesh of an object file; log the parts of the file that are ignored.
@@ -221,7 +231,7 @@ class SceneReader(contextlib.AbstractContextManager["SceneReader"]):
     def __exit__(self, *error: object) -> None:
         self.close()
 
-    def _read(self, function: Callable[..., Result], source: SceneSource, *args: bool) -> Result:
+    def _read(self, function: Callable[..., Result], source: SceneSource, *args: int) -> Result:
         """Call a function of a source; a complaint about its file names the path as it was given.
 
         Readers say the name alone, since others write what they say into datasets.

@@ -24,7 +24,7 @@ from storage.digests import sha256_hex
 from storage.errors import TrilightError
 from storage.records.safe_read import open_plain
 from storage.remote.shard_cache import shard_cache
-from storage.remote.url import RemoteUrl, parse_local_path, parse_url, printable, safe_text
+from storage.remote.url import RemoteUrl, parse_url, printable, safe_text
 
 MAX_SHARDS = 100_000
 """Maximum number of shards in a list, and of names that one brace pattern expands to."""
@@ -101,7 +101,7 @@ def expand_pattern(pattern: str, what: str = "shards") -> list[str]:
 
     A file or folder of that very name is no pattern.
     """
-    if "://" not in pattern and os.path.exists(parse_local_path(pattern)):
+    if "://" not in pattern and os.path.exists(os.path.expanduser(pattern)):
         return [pattern]
     named = f"{what} {printable(safe_text(pattern))!r}"
     groups = [_alternatives(group[1], named) for group in _GROUP.finditer(pattern)]

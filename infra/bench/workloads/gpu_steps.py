@@ -19,7 +19,7 @@ import torch
 from numpy.typing import NDArray
 
 from infra.bench.workloads.named_scenes import cost_scene
-from infra.render.plan import orbit
+from infra.render.run_render import orbit
 from model.config import SIZES, ModelConfig
 from model.costs import Workload, training_flops
 from model.hits.tracing import with_traced

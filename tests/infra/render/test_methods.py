@@ -23,12 +23,11 @@ from infra.render.networks import (
 from infra.render.options import RenderOptions
 from infra.render.path_tracer import MOST_SCENES, PathTracer, RenderChild, RenderWorker
 from infra.render.plan import (
-    orbit,
     pair_cameras,
     plan_render,
 )
 from infra.render.raw_references import true_error, true_error_db
-from infra.render.run_render import Frame, flicker
+from infra.render.run_render import Frame, flicker, orbit
 from model.config import SIZES
 from model.inference import NeuralRenderer
 from pipeline.exchange.reader import SceneReader, SceneSource, scene_source
@@ -266,6 +265,7 @@ def test_scenes_and_cameras_go_together() -> None:
 
 
 def test_a_path_is_a_list_of_cameras_or_any_scene(tmp_path: Path) -> None:
+    """Of a file of many scenes, it has one camera of each."""
     listed = {"position": [2, 0, 1], "look_at": [0, 0, 0], "up": [0, 0, 1], "fov": 45}
     path = tmp_path / "path.json"
     path.write_text(json.dumps({"cameras": [listed, {**listed, "fov": 1}]}))
@@ -276,6 +276,14 @@ def test_a_path_is_a_list_of_cameras_or_any_scene(tmp_path: Path) -> None:
     np.testing.assert_allclose(found[0].c2w, tiny_scene().c2w[0], atol=1e-6)  # rounded to float32
     own = reader.cameras(scene_source(str(tmp_path / "tiny.safetensors")), 0)
     np.testing.assert_array_equal([camera.c2w for camera in own], tiny_scene().c2w)
+    shard = tmp_path / "train-000000.tar"
+    write_shard(shard, [(key, encode_sample(tiny_sample(key=key))) for key in ("0", "1")])
+    many = scene_source(str(shard), many=True)
+    of_frames = [(camera.c2w, camera.view) for camera in reader.cameras(many, 1)]
+    np.testing.assert_array_equal([c2w for c2w, _ in of_frames], [tiny_scene().c2w[1]] * 2)
+    assert [view for _, view in of_frames] == [None] * 2
+    with pytest.raises(TrilightError, match="--view is 2; expected 0 to 1"):
+        reader.cameras(many, 2)
     for broken, message in (
         ({**listed, "look_at": [2, 0, 1]}, r"path.json: cameras\[0\] looks from"),
         ({**listed, "fov": 180}, r"path.json: cameras.0.fov is 180"),
@@ -314,7 +322,7 @@ def test_a_plan_has_all_that_was_asked(source: Path, tmp_path: Path) -> None:
     ((_, camera),), (tracer,) = plan.pairs, plan.renderers
     assert isinstance(tracer, PathTracer)
     assert (tracer.child.threads, tracer.settings.resolution, plan.resolution) == (3, 512, 512)
-    assert (camera, plan.output.stem_of(0)) == (1, tmp_path / "new/x")
+    assert (camera, plan.view, plan.output.stem_of(0)) == (0, 1, tmp_path / "new/x")
     network = str(write_network(tmp_path / "model.safetensors"))
     asked = RenderOptions(
         source=str(source), out=tmp_path / "turn.webp", engine="both", checkpoint=network,
@@ -326,7 +334,7 @@ def test_a_plan_has_all_that_was_asked(source: Path, tmp_path: Path) -> None:
     assert mitsuba.settings.resolution == neural.resolution == plan.resolution == 16
     assert neural.checkpoint == network
     assert plan.output.video == tmp_path / "turn.webp"
-    assert len(plan.pairs) == 3 and all(isinstance(camera, Camera) for _, camera in plan.pairs)
+    assert [camera for _, camera in plan.pairs] == [0, 1, 2] and plan.orbit == (3, 360)
     assert plan.output.stem_of(2) == tmp_path / "turn/000002"
 
 

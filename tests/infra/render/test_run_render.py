@@ -13,11 +13,10 @@ from infra.render.networks import RendererHere, SceneHere
 from infra.render.plan import (
     OutputPaths,
     RenderPlan,
-    orbit,
     output_paths,
     pair_cameras,
 )
-from infra.render.run_render import FinishedShot, run_plan, write_video
+from infra.render.run_render import FinishedShot, orbit, run_plan, write_video
 from infra.render.tone_mapping import Look, tone_mapped
 from pipeline.exchange.reader import SceneReader, SceneSource
 from storage.conventions import preview_srgb8
