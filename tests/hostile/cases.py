@@ -43,6 +43,7 @@ def Mesh "floor" (prepend apiSchemas = ["MaterialBindingAPI"]) {
 }
 """
 """What makes a scene, so that nothing but the harm is a reason to refuse."""
+UNDIVIDED = 'uniform token subdivisionScheme = "none"'
 
 LEAK = """
 def Mesh "LEAK" {
@@ -101,10 +102,12 @@ def with_file(name: str, content: str, body: str) -> Make:
     return make
 
 
-def textured(spoil: Callable[[Path], object], named: str = "./t.png", head: str = HEAD) -> Make:
+def textured(
+    spoil: Callable[[Path], object], named: str = "./t.png", head: str = HEAD, seen: str = SEEN
+) -> Make:
     def make(folder: Path) -> None:
         spoil(folder / "t.png")
-        text(MATERIAL.replace("FILE", named), head=head)(folder)
+        text(MATERIAL.replace("FILE", named), seen, head)(folder)
 
     return make
 
@@ -294,7 +297,7 @@ def odd_files() -> Iterator[tuple[str, Make, str]]:
 
 
 def contradictions() -> Iterator[tuple[str, Make, str]]:
-    points, counts, indices = SEEN.splitlines()[9:12]
+    points, counts, indices, coordinates = SEEN.splitlines()[9:13]
     moved = "    double3 xformOp:translate = (0, 0, 3)"
     values = {
         "points NaN": (points, "point3f[] points = [(nan, 0, 0), (1, 0, 0), (0, 1, 0)]"),
@@ -313,10 +316,31 @@ def contradictions() -> Iterator[tuple[str, Make, str]]:
         "intensity 1e38": ("inputs:intensity = 5", "inputs:intensity = 1e38"),
         "radius 1e38": ("inputs:radius = 0.2", "inputs:radius = 1e38"),
         "radius NaN": ("inputs:radius = 0.2", "inputs:radius = nan"),
+        # A layer may call an attribute of a schema by any type; so may one that a person wrote.
+        "points of doubles": (points, "double[] points = [1, 2]"),
+        "counts of tokens": (counts, 'token[] faceVertexCounts = ["a"]'),
+        "indices of floats": (indices, "float[] faceVertexIndices = [nan]"),
+        "normals of text": (points, f'{points}\n{UNDIVIDED}\nstring[] normals = ["a"]'),
+        "intensities": ("float inputs:intensity = 5", "float[] inputs:intensity = [1, 2]"),
+        "exposure 1e9": (moved, f"{moved}\nfloat inputs:exposure = 1e9"),
+    }
+    words = {
+        "points NaN": "refused: points are not finite",
+        "indices beyond": "refused: go from 0 to 2147483647; expected 0 to 2",
+        "counts negative": "refused: add up to -3; expected 3",
     }
     for kind, (old, new) in values.items():
         assert old in SEEN
-        yield f"mesh or light with {kind}", text("", seen=SEEN.replace(old, new)), "any"
+        changed = text("", seen=SEEN.replace(old, new))
+        yield f"mesh or light with {kind}", changed, words.get(kind, "any")
+    many = 'def PointInstancer "i" {\nrel prototypes = </floor>\npoint3f[] positions = [(0, 0, 0)]'
+    yield "instances of text", text(f'{many}\nstring[] protoIndices = ["a"]\n}}'), "any"
+    yield "more instances than places", text(f"{many}\nint[] protoIndices = [0, 0]\n}}"), "any"
+    yield "a lens NaN", text('def Camera "c" {\nfloat focalLength = nan\n}'), "any"
+    of_number = SEEN.replace(coordinates, "int primvars:st = 3")
+    yield "coordinates of a number", textured(_png, seen=of_number), "any"
+    rough = MATERIAL.replace("  color3f", '  string inputs:roughness = "smooth"\n    color3f')
+    yield "roughness of text", text(rough.replace("FILE", "./no.png")), "any"
     for kind, body in {"no prim": "", "half a prim": 'def "x" {', "zeros": "\0" * 99}.items():
         head = "" if kind == "zeros" else HEAD
         said = "refused" if kind == "no prim" else "refused: not readable as USD"
