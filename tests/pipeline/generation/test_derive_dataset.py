@@ -228,7 +228,10 @@ def test_a_selection_keeps_keys_bytes_and_only_the_rights_of_what_it_holds(tmp_p
     assert "CC-BY-4.0" not in train.folder.attribution.read_text()
 
 
-def test_resharding_divides_each_split_evenly(tmp_path: Path) -> None:
+def test_resharding_divides_each_split_evenly_and_many_shards_stand_in_parts(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Two files in a folder stand for 4,096."""
     a = finished(tmp_path / "a", scenes(0))
     resharded = shards_made(tmp_path / "c", reshard(3), a)
     assert [(s.name, s.num_samples) for s in resharded.manifest.shards] == [
@@ -239,18 +242,12 @@ def test_resharding_divides_each_split_evenly(tmp_path: Path) -> None:
     back = shards_made(tmp_path / "d", reshard(2), tmp_path / "c")
     before = open_dataset(str(a)).manifest.shards
     assert [shard.sha256 for shard in back.manifest.shards] == [each.sha256 for each in before]
-
-
-def test_many_shards_stand_in_parts(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """Two files in a folder stand for 4,096."""
     monkeypatch.setattr(layout, "FILES_PER_FOLDER", 2)
-    of_training = {name: of for name, of in scenes(0).items() if "train" in name}
-    a = finished(tmp_path / "a", of_training)
-    resharded = shards_made(tmp_path / "c", reshard(1), a)
-    assert [shard.name for shard in resharded.manifest.shards[1:4]] == [
+    parts = shards_made(tmp_path / "e", reshard(1), tmp_path / "c")
+    assert [shard.name for shard in parts.manifest.shards[1:4]] == [
         "train-000001.tar", "part-0001/train-000002.tar", "part-0001/train-000003.tar",
     ]  # fmt: skip
-    assert samples_of(resharded) == given(of_training)
+    assert samples_of(parts) == given(scenes(0))
 
 
 def test_rejections_follow_their_scenes(tmp_path: Path) -> None:
@@ -346,10 +343,9 @@ def refused(out: Path, derive: DeriveOptions, *places: Path | str) -> str:
     """Return the message of a refusal that leaves nothing where the dataset would be."""
     with pytest.raises(TrilightError) as caught:
         derive_dataset([str(place) for place in places], derive, out)
-    message = str(caught.value)
-    assert "\n" not in message
+    assert "\n" not in str(caught.value)
     assert not out.exists() and not list(out.parent.glob(".*"))
-    return message
+    return str(caught.value)
 
 
 @for_each("uid, sha256", [("c", "1" * 64), ("x", TEST_OBJECT.asset_sha256)])
