@@ -209,9 +209,17 @@ def card_of(dataset: Dataset) -> tuple[dict[str, Any], str]:
 
 
 @pytest.mark.usefixtures("bare_reports")
-def test_the_front_matter_says_what_hubs_ask(tmp_path: Path) -> None:
-    dataset = five_scenes(tmp_path)
+def test_the_front_matter_says_what_hubs_ask_and_equal_datasets_have_equal_documents(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Neither place, clock nor language is in them; of the report's figures see test_report."""
+    dataset, second = five_scenes(tmp_path), five_scenes(tmp_path / "other" / "b")
     write_documents(dataset, dataset.folder)
+    os.utime(second.folder.manifest, (0, 0))
+    monkeypatch.setenv("LC_ALL", "de_DE.UTF-8")
+    write_documents(second, second.folder)
+    for name in DOCUMENTS:
+        assert (tmp_path / name).read_bytes() == (second.folder.root / name).read_bytes()
     front, body = card_of(dataset)
     assert dataset.folder.card.read_text().endswith(f"---\n{body}")
     assert front["license"] == "other"
@@ -303,20 +311,6 @@ def test_the_example_of_the_card_runs_as_it_stands(tmp_path: Path, profiles: lis
         exec(example.rstrip() + shown, {})
     lines = [(f"{row:09d} (16, 16, 3) (5, 3) (2, 4, 4)", "3") for row in range(2)]
     assert printed.getvalue().split("\n")[:-1] == [line for each in lines for line in each]
-
-
-@pytest.mark.usefixtures("bare_reports")
-def test_equal_datasets_have_equal_documents(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    """Neither place, clock nor language is in them; of the report's figures see test_report."""
-    first, second = five_scenes(tmp_path / "a"), five_scenes(tmp_path / "other" / "b")
-    write_documents(first, first.folder)
-    os.utime(second.folder.manifest, (0, 0))
-    monkeypatch.setenv("LC_ALL", "de_DE.UTF-8")
-    write_documents(second, second.folder)
-    for name in DOCUMENTS:
-        assert (first.folder.root / name).read_bytes() == (second.folder.root / name).read_bytes()
 
 
 HOSTILE = (

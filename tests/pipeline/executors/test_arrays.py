@@ -314,7 +314,9 @@ def test_every_place_makes_what_is_missing_and_nothing_else() -> None:
     assert _manifest([0])["metadata"]["name"] != manifest["metadata"]["name"]
 
 
-def test_kubernetes_takes_the_job() -> None:
+def test_kubernetes_takes_the_job_and_gives_its_pod_the_rights_of_others() -> None:
+    from tests.infra.setup.manifests_kit import job_template
+
     schemas = pytest.importorskip("kubernetes_validate", reason="make setup-all")
     manifest = _manifest(account="trilight-flow", machine_type="c7i.2xlarge", tries=4)
     schemas.validate(manifest, "1.37", strict=True)
@@ -329,13 +331,8 @@ def test_kubernetes_takes_the_job() -> None:
     assert [rule["action"] for rule in rules] == ["Ignore", "FailIndex"]
     assert rules[1]["onExitCodes"]["containerName"] == container["name"]
     assert manifest["metadata"]["namespace"] == "trilight"
-
-
-def test_the_pod_has_the_rights_of_the_other_manifests() -> None:
-    from tests.infra.setup.manifests_kit import job_template
-
-    manifest = job_template()["job_configuration"]["job_manifest"]
-    theirs = manifest["spec"]["template"]["spec"]
+    # Its pod has the rights of the other manifests.
+    theirs = job_template()["job_configuration"]["job_manifest"]["spec"]["template"]["spec"]
     pod = _manifest()["spec"]["template"]["spec"]
     (ours,), (other,) = pod["containers"], theirs["containers"]
     assert pod["securityContext"] == theirs["securityContext"]

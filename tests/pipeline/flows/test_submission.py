@@ -40,6 +40,7 @@ from pipeline.flows.submission import (
 from pipeline.generation.generate_options import GenerateOptions
 from storage.cache import open_private, private_folder
 from storage.errors import TrilightError
+from tests.command_line import run_program
 from tests.for_each import case, for_each
 from tests.http_server import serve
 
@@ -257,12 +258,8 @@ def test_half_requests_are_closed_and_slow_answers_are_not(monkeypatch: pytest.M
 
 
 def test_without_a_password_there_is_no_server() -> None:
-    done = subprocess.run(
-        [sys.executable, "-m", "pipeline.flows.guarded_server", "--port", "1"],
-        env={"PATH": "/usr/bin:/bin"}, cwd=Path(__file__).parents[3],
-        capture_output=True, text=True, check=False, timeout=60,
-    )  # fmt: skip
-    assert done.returncode == 1
+    words = [sys.executable, "-m", "pipeline.flows.guarded_server", "--port", "1"]
+    done = run_program(words, status=1, env={"PATH": "/usr/bin:/bin"}, timeout=60)
     assert "PREFECT_SERVER_API_AUTH_STRING is not set; expected USER:PASSWORD" in done.stderr
 
 

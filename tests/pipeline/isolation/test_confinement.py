@@ -31,6 +31,7 @@ from pipeline.isolation.call_failures import ENDS, with_retries
 from pipeline.isolation.confinement import covers
 from pipeline.isolation.system_calls import landlock_version, seccomp_works
 from storage.errors import EnvironmentFailure, TrilightError
+from tests.command_line import run_program
 from tests.conftest import ROOT
 from tests.for_each import case, for_each
 from tests.pipeline.isolation import called, probes
@@ -116,7 +117,7 @@ from pipeline.isolation import ChildLimits, IsolatedChild, reach
 from tests.pipeline.isolation import called, probes
 limits = ChildLimits(memory_bytes=2 << 30, wall_s=60, calls_per_child=9)
 child = IsolatedChild(limits=limits, confined_to=reach([pathlib.Path("tests")]))
-print("terminals:", child.call(probes.open_terminals))
+print(f"terminals: {child.call(probes.open_terminals)}")
 """
 
 
@@ -217,11 +218,9 @@ def test_what_cannot_be_had_is_said(
 
 
 def test_an_unknown_word_is_refused_at_once_by_every_command() -> None:
-    run = subprocess.run(
-        [sys.executable, "-m", "trilight", "doctor", "--help"], capture_output=True, text=True,
-        env={**os.environ, confinement.VARIABLE: "maybe"}, check=False, cwd=ROOT,
-    )  # fmt: skip
-    assert (run.returncode, "'maybe'" in run.stderr) == (1, True)
+    words, env = ["-m", "trilight", "doctor", "--help"], {confinement.VARIABLE: "maybe"}
+    run = run_program([sys.executable, *words], status=1, env={**os.environ, **env})
+    assert "'maybe'" in run.stderr
 
 
 def test_very_many_folders_become_those_above_and_never_the_whole_disk() -> None:
