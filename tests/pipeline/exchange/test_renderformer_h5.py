@@ -1,9 +1,7 @@
 """The published HDF5 layouts: what is written and comes back; and hostile files."""
 
 import dataclasses
-import resource
 import shutil
-import subprocess
 import sys
 import zlib
 from collections.abc import Callable
@@ -29,7 +27,7 @@ from storage.records.lookup import environment_values, textured_rows
 from storage.records.material import EMISSION
 from storage.records.scene import Scene
 from storage.records.texture import Texture
-from tests.conftest import ROOT
+from tests.command_line import run_program
 from tests.for_each import case, for_each, with_folders
 from tests.pipeline.exchange.exchange_kit import assert_h5_keeps_light, row_at
 from tests.scenes_by_hand import LIGHT, tiny_sample, tiny_scene
@@ -436,6 +434,27 @@ def test_a_file_that_is_cut_is_refused(path: Path) -> None:
             read_renderformer_h5(path)
 
 
+AUDITED = """
+import resource, sys, pathlib
+resource.setrlimit(resource.RLIMIT_AS, (2 << 30, 2 << 30))
+import h5py, h5py.h5ds, numpy
+from pipeline.exchange.renderformer_h5 import read_renderformer_h5
+from storage.errors import TrilightError
+good, *names = map(pathlib.Path, sys.argv[1:])
+read_renderformer_h5(good)
+bad = ("os.system", "subprocess.Popen", "os.exec", "exec", "import", "ctypes.dlopen")
+seen = []
+sys.addaudithook(lambda event, args: seen.append(event) if event in bad else None)
+for name in names:
+    try:
+        read_renderformer_h5(name)
+    except TrilightError:
+        continue
+    raise SystemExit(f"{name} was read")
+assert not seen, seen
+"""
+
+
 def test_nothing_runs_and_little_memory_is_taken(path: Path) -> None:
     """A child with an audit hook reads the worst of them in 2 GiB of address space.
 
@@ -449,27 +468,4 @@ def test_nothing_runs_and_little_memory_is_taken(path: Path) -> None:
             del file["triangles"]
             HOSTILE[name][0](file)
         files.append(str(hostile))
-    code = (
-        "import sys, pathlib\n"
-        "import h5py, h5py.h5ds, numpy\n"
-        "from pipeline.exchange.renderformer_h5 import read_renderformer_h5\n"
-        "from storage.errors import TrilightError\n"
-        f"read_renderformer_h5(pathlib.Path({str(path)!r}))\n"
-        "bad = ('os.system', 'subprocess.Popen', 'os.exec', 'exec', 'import', 'ctypes.dlopen')\n"
-        "seen = []\n"
-        "sys.addaudithook(lambda event, args: seen.append(event) if event in bad else None)\n"
-        "for name in sys.argv[1:]:\n"
-        "    try:\n"
-        "        read_renderformer_h5(pathlib.Path(name))\n"
-        "    except TrilightError:\n"
-        "        continue\n"
-        "    raise SystemExit(name + ' was read')\n"
-        "assert not seen, seen\n"
-    )
-    limit = 2 << 30
-    result = subprocess.run(
-        [sys.executable, "-c", code, *files],
-        cwd=ROOT, capture_output=True, text=True, check=False,
-        preexec_fn=lambda: resource.setrlimit(resource.RLIMIT_AS, (limit, limit)),
-    )  # fmt: skip
-    assert result.returncode == 0, result.stdout + result.stderr
+    run_program([sys.executable, "-c", AUDITED, str(path), *files])

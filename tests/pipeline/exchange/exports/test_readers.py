@@ -24,7 +24,7 @@ from pipeline.presets.registry import preset_settings
 from scene_templates.sample_layout import scene_plan
 from storage.dataset.dataset import open_dataset
 from storage.records.sample import sample_key
-from tests.command_line import trilight
+from tests.command_line import expect_json, expect_mistake
 from tests.train.toy import VIEWS, toy_sample, write_toy_dataset
 
 PX = 16
@@ -38,8 +38,7 @@ def dataset(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """Return a dataset of three training shards and two for validation, with its card."""
     root = tmp_path_factory.mktemp("set") / "data"
     write_toy_dataset(root, train=TRAIN, validation=VALIDATION, per_shard=PER_SHARD, resolution=PX)
-    ended = trilight(["inspect", str(root), "--json"])
-    assert ended.exit_code == 0, ended.exception
+    expect_json("inspect", root)
     return root
 
 
@@ -103,10 +102,8 @@ def test_energon(dataset: Path, tmp_path: Path, foreign: None) -> None:
     """Its loader reads the export; its own preparation makes the same index of the same shards."""
     energon: Any = pytest.importorskip("megatron.energon")
     out = tmp_path / "out"
-    words = ["export", str(dataset), "--form", "energon", "--out", str(out), "--json"]
-    ended = trilight(words)
-    assert ended.exit_code == 0, ended.exception
-    told = json.loads(ended.stdout)
+    words = ["export", str(dataset), "--form", "energon", "--out"]
+    told = expect_json(*words, out)
     assert (told["scenes"], told["views"]) == (TRAIN + VALIDATION, VIEWS * (TRAIN + VALIDATION))
     for shard in open_dataset(str(dataset)).manifest.shards:
         assert (out / shard.name).read_bytes() == (dataset / shard.name).read_bytes()
@@ -148,10 +145,10 @@ def test_energon(dataset: Path, tmp_path: Path, foreign: None) -> None:
     ours = json.loads((out / ".nv-meta/.info.json").read_text())["shard_counts"]
     assert ours == theirs
 
-    refused = trilight([*words[:4], "--out", str(tmp_path / "one"), "--scene", "1"])
-    assert "copies whole shards, and --scene names a sample" in str(refused.exception)
-    refused = trilight([*words[:4], "--out", str(tmp_path / "one"), "--split", "test"])
-    assert "no shard in split test; expected one of train, validation" in str(refused.exception)
+    refused = expect_mistake(*words, tmp_path / "one", "--scene", "1")
+    assert "copies whole shards, and --scene names a sample" in refused
+    refused = expect_mistake(*words, tmp_path / "one", "--split", "test")
+    assert "no shard in split test; expected one of train, validation" in refused
 
 
 STUDIO_STAGES = {

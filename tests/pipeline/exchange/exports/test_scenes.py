@@ -23,7 +23,7 @@ from storage.records.material import DIFFUSE, EMISSION, SPECULAR
 from storage.records.passes import view_passes
 from storage.records.sample import PictureErrors, Sample
 from storage.records.scene import Scene
-from tests.command_line import trilight
+from tests.command_line import expect_json, expect_mistake
 from tests.for_each import for_each
 from tests.foreign_packages import nerfstudio_pictures
 from tests.pipeline.documents.dataset_by_hand import (
@@ -46,9 +46,8 @@ KEYS = ("000000000", "000000001")
 def benchmark(tmp_path_factory: pytest.TempPathFactory) -> Path:
     root = tmp_path_factory.mktemp("set")
     write_toy_dataset(root / "toy", train=2, validation=1, per_shard=2, resolution=PX)
-    words = ["export", str(root / "toy"), "--form", "benchmark", "--split", "train"]
-    result = trilight([*words, "--out", str(root / "out"), "--json"])
-    assert result.exit_code == 0, result.exception
+    words = ["--form", "benchmark", "--split", "train"]
+    expect_json("export", root / "toy", *words, "--out", root / "out")
     return root / "out"
 
 
@@ -177,8 +176,7 @@ def _by_lobe(whole: Sample) -> Sample:
 
 def exported(dataset: Path, form: str, *words: str) -> Path:
     out = dataset.parent / form
-    result = trilight(["export", str(dataset), "--form", form, "--out", str(out), *words, "--json"])
-    assert result.exit_code == 0, result.exception
+    expect_json("export", dataset, "--form", form, "--out", out, *words)
     assert (out / "attribution.csv").read_text() == "uid\na\n"
     return out
 
@@ -313,23 +311,18 @@ def test_the_same_dataset_gives_the_same_bytes(dataset: Path, form: str) -> None
 
 
 def test_mistakes(dataset: Path, tmp_path: Path) -> None:
-    def refused(*words: str) -> str:
-        result = trilight(["export", str(dataset), *words])
-        assert result.exit_code != 0 and "\n" not in str(result.exception)
-        return str(result.exception)
-
-    (tmp_path / "full").mkdir()
-    (tmp_path / "full/x").touch()
-    full = ("--out", str(tmp_path / "full"))
-    assert "is not empty; expected a new folder" in refused("--form", "coco", *full)
-    new = ("--out", str(tmp_path / "new"))
-    said = refused("--form", "coco", "--split", "validation", *new)
+    full, new = tmp_path / "full", tmp_path / "new"
+    full.mkdir()
+    (full / "x").touch()
+    said = expect_mistake("export", dataset, "--form", "coco", "--out", full)
+    assert "is not empty; expected a new folder" in said
+    words = ["--form", "coco", "--out", str(new)]
+    said = expect_mistake("export", dataset, *words, "--split", "validation")
     assert "no scene in split validation" in said
-    other = trilight(["export", str(tmp_path / "full"), "--form", "coco", *new])
-    assert "no manifest.json" in str(other.exception)
+    assert "no manifest.json" in expect_mistake("export", full, *words)
     shards = {"train-000000.tar": [sample(0, furnished(["a"]))]}
     write_dataset(tmp_path / "one", shards, objects=[locked("a", "CC-BY-4.0")])
-    whole = str(trilight(["export", str(tmp_path / "one"), "--form", "hypersim", *new]).exception)
+    whole = expect_mistake("export", tmp_path / "one", "--form", "hypersim", "--out", new)
     assert "keeps all light together; expected diffuse and specular light apart" in whole
     assert "--set renders.split_lobes=true" in whole
 
