@@ -86,7 +86,7 @@ def _scene(files: SceneFiles, scene_index: int, settings: DatasetSettings) -> Sc
     return files.scene(scene_index, settings.assets, num_views=views, seed=settings.seed)
 
 
-def _accept(folder: Path, out: Path, licence: str | None = None) -> object:
+def _accept(folder: Path, out: Path, licence: str = "CC-BY-4.0") -> object:
     found, settings = find_scene_files(str(folder)), _settings(folder)
     publication = begin_or_resume_dataset(PublishedShards(DatasetFolder(out)), settings, {}, 1)
     return accept_scene_files(found, licence, settings, publication).origin
@@ -162,13 +162,15 @@ def test_without_wish_there_are_as_many_views_as_every_file_has(folder: Path) ->
 
 
 @pytest.mark.usefixtures("no_child")
-def test_files_are_frozen_by_digest(folder: Path, tmp_path: Path) -> None:
+def test_files_are_frozen_by_digest_with_the_users_licence(folder: Path, tmp_path: Path) -> None:
+    with pytest.raises(TrilightError, match="--allow-licence 'CC-BY-NC-4.0'"):
+        _accept(folder, tmp_path / "theirs", "CC-BY-NC-4.0")
     out = tmp_path / "set"
     _accept(folder, out)
     locked = read_objects_lock(DatasetFolder(out).objects_lock)
     files = ["a.json", "b.json", "meshes/green.obj", "meshes/tri.obj"]
     assert [entry.uid for entry in locked] == files
-    assert {entry.split for entry in locked} == {"test"}
+    assert {(entry.split, entry.licence) for entry in locked} == {("test", "CC-BY-4.0")}
     assert read_manifest(DatasetFolder(out).manifest).num_scenes == 2
     _accept(folder, out)  # the same again
     mesh = folder / "meshes/green.obj"
@@ -237,15 +239,6 @@ def test_shares_of_maps_that_no_scene_file_draws_are_refused(folder: Path, tmp_p
     options = GenerateOptions(scenes_from=str(folder), changes=shares)
     with pytest.raises(TrilightError, match="textures.own_share is 1, but --textures is not given"):
         resolve_inputs(options, DatasetFolder(tmp_path / "set"))
-
-
-@pytest.mark.usefixtures("no_child")
-def test_the_licence_is_the_users_word(folder: Path, tmp_path: Path) -> None:
-    _accept(folder, tmp_path / "mine", "CC-BY-4.0")
-    locked = read_objects_lock(DatasetFolder(tmp_path / "mine").objects_lock)
-    assert {entry.licence for entry in locked} == {"CC-BY-4.0"}
-    with pytest.raises(TrilightError, match="--allow-licence 'CC-BY-NC-4.0'"):
-        _accept(folder, tmp_path / "theirs", "CC-BY-NC-4.0")
 
 
 def test_a_bad_file_keeps_its_number_and_stops_nobody(folder: Path, tmp_path: Path) -> None:

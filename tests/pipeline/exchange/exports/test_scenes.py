@@ -69,7 +69,9 @@ def rays_as_published(pose: NDArray, fov_deg: float, pixels: int) -> tuple[NDArr
 
 
 @pytest.mark.parametrize("key", KEYS)
-def test_the_published_loader_reads_what_our_network_reads(benchmark: Path, key: str) -> None:
+def test_the_published_loader_reads_what_our_network_reads_and_our_pictures_show(
+    benchmark: Path, key: str
+) -> None:
     sample = toy_sample(int(key), resolution=PX)
     scene, found = sample.scene, loaded_as_published(benchmark / f"h5/{key}.h5")
     count = scene.num_triangles
@@ -94,11 +96,7 @@ def test_the_published_loader_reads_what_our_network_reads(benchmark: Path, key:
     filled = np.add.outer(np.arange(32), np.arange(32)) <= 32
     np.testing.assert_array_equal(found["texture"] != 0, (texel != 0)[:, :, None, None] & filled)
 
-
-@pytest.mark.parametrize("key", KEYS)
-def test_published_rays_meet_the_triangles_of_our_pictures(benchmark: Path, key: str) -> None:
-    sample = toy_sample(int(key), resolution=PX)
-    found = loaded_as_published(benchmark / f"h5/{key}.h5")
+    # Published rays meet the triangles of our pictures.
     solid = np.where(sample.scene.triangle_emits[:, None, None], np.nan, found["triangles"])
     for view in range(VIEWS):
         pose = found["c2w"][view].astype(np.float64)

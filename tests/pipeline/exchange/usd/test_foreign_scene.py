@@ -26,9 +26,13 @@ from tests.pipeline.exchange.exchange_kit import L_SHAPE, mesh, row_at, write_st
 from tests.scenes_by_hand import tiny_scene
 
 
-def edited(folder: Path, edit: Callable[[Any], object] = lambda stage: None) -> LoadedScene:
-    """Return the stage of a stranger after an edit."""
+def edited(
+    folder: Path, edit: Callable[[Any], object] = lambda stage: None, picture: Any = None
+) -> LoadedScene:
+    """Return the stage of a stranger after an edit, with another picture if one is given."""
     path = write_stage(folder)
+    if picture is not None:
+        Image.fromarray(picture).save(folder / "tex.png")
     stage = Usd.Stage.Open(str(path))
     edit(stage)
     stage.GetRootLayer().Save()
@@ -187,21 +191,6 @@ CODED = 0.005
 """Half a step of 8 sRGB-encoded bits is at most 0.0045 in linear light."""
 
 
-Edit = Callable[[Any, UsdShade.Shader, UsdShade.Shader], None]
-
-
-def changed(folder: Path, edit: Edit | None = None) -> LoadedScene:
-    """Return the stage of a stranger with another picture, edited (stage, preview, texture)."""
-
-    def change(stage: Any) -> None:
-        Image.fromarray(PICTURE).save(folder / "tex.png")
-        shaders = (UsdShade.Shader.Get(stage, f"/W/mat/{name}") for name in ("preview", "texture"))
-        if edit is not None:
-            edit(stage, *shaders)
-
-    return edited(folder, change)
-
-
 BRIGHT = linear_from_srgb8()[GREY[0]]
 WRONG = np.array([[[np.nan] * 3, [np.inf] * 3], [[-1] * 3, [0.5] * 3]], np.float32)
 FLOAT4 = Sdf.ValueTypeNames.Float4
@@ -227,7 +216,8 @@ def test_inputs_of_a_texture_are_applied_bounded_and_said(
 ) -> None:
     """Scale and bias in linear light; NaN, infinity and negative values; a missing file."""
 
-    def edit(stage: Any, preview: Any, texture: UsdShade.Shader) -> None:
+    def edit(stage: Any) -> None:
+        texture = UsdShade.Shader.Get(stage, "/W/mat/texture")
         (tmp_path / "wrong.exr").write_bytes(encode_channels({"RGB": WRONG}))
         for name, value in inputs.items():
             if name == "file":
@@ -235,7 +225,7 @@ def test_inputs_of_a_texture_are_applied_bounded_and_said(
             else:
                 texture.CreateInput(name, FLOAT4).Set(Gf.Vec4f(*value))
 
-    found = changed(tmp_path, edit)
+    found = edited(tmp_path, edit, PICTURE)
     assert any(said in text for text in found.notes)
     for place, rgb in base.items():
         expected = (1 - F) * np.broadcast_to(rgb, 3)
@@ -261,14 +251,14 @@ def test_a_huge_picture_is_refused_and_too_many_triangles_before_all_are_read(
 def test_a_mesh_without_coordinates_takes_the_mean(tmp_path: Path, is_there: bool) -> None:
     """None, or some that are no numbers."""
 
-    def edit(stage: Any, preview: Any, texture: Any) -> None:
+    def edit(stage: Any) -> None:
         grid = stage.GetPrimAtPath("/W/Grid")
         coordinates = [(float("nan"), 0), (1, 0), (1, 1), (0, 1)]
         UsdGeom.PrimvarsAPI(grid).GetPrimvar("st").Set(coordinates)
         if not is_there:
             grid.RemoveProperty("primvars:st")
 
-    found = changed(tmp_path, edit)
+    found = edited(tmp_path, edit, PICTURE)
     assert any("no coordinates 'st'" in text for text in found.notes)
     mean = (1 - F) * linear_from_srgb8()[PICTURE].mean(axis=(0, 1))
     assert row_at(found.scene, 0, 0.1)[:3] == pytest.approx(mean, abs=1e-5)
