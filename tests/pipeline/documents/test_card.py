@@ -323,7 +323,7 @@ HOSTILE = (
 )
 
 
-def test_text_from_outside_stays_text_in_its_line_its_code_span_and_its_yaml(
+def test_text_from_outside_stays_text_in_its_line_its_code_span_its_yaml_and_its_json(
     tmp_path: Path,
 ) -> None:
     for escape in (text, code):
@@ -335,6 +335,9 @@ def test_text_from_outside_stays_text_in_its_line_its_code_span_and_its_yaml(
     }  # fmt: skip
     assert yaml.safe_load(front_matter(values).strip("-")) == values
     dataset = five_scenes(tmp_path)
+    for licence in ('"}, {', "x\n\ud800", "LicenseRef-a"):
+        document = json.loads(encode_croissant(dataset.manifest, [licence]))
+        assert document["license"] == [licence]
     lock, settings = dataset.folder.objects_lock, dataset.manifest.settings
     objects = read_objects_lock(lock)
     for value in HOSTILE:
@@ -379,39 +382,21 @@ def test_the_validator_has_no_error_and_every_shard_and_scene_is_found(tmp_path:
     assert not mlcroissant.Dataset(jsonld=str(path)).metadata.ctx.issues.errors
 
 
-@pytest.mark.parametrize("licence", ['"}, {', "x\n\ud800", "LicenseRef-a"])
-def test_it_is_json_whatever_the_licences_are_called(tmp_path: Path, licence: str) -> None:
-    dataset = five_scenes(tmp_path)
-    document = json.loads(encode_croissant(dataset.manifest, [licence]))
-    assert document["license"] == [licence]
-
-
-@pytest.fixture
-def eleven(tmp_path: Path) -> Dataset:
-    """Return 11 shards of one scene each, one of them for testing."""
+@pytest.mark.usefixtures("bare_reports")
+def test_described_shards_are_spread_over_each_split_and_documents_of_a_sample_say_so(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Eleven shards of one scene each, one of them for testing."""
     shards = {f"train-{row:06d}.tar": [sample(row, tiny_scene())] for row in range(10)}
     shards["test-000010.tar"] = [sample(10, tiny_scene())]
-    return write_dataset(tmp_path / "set", shards)
-
-
-def test_shards_are_spread_over_each_split(
-    eleven: Dataset, monkeypatch: pytest.MonkeyPatch
-) -> None:
+    eleven = write_dataset(tmp_path / "set", shards)
     monkeypatch.setattr("storage.dataset.statistics.MOST_SCENES", 11)
     assert described_shards(eleven) == list(eleven.manifest.shards)
-    monkeypatch.setattr("storage.dataset.statistics.MOST_SCENES", 4)
-    names = [shard.name for shard in described_shards(eleven)]
-    assert names == ["test-000010.tar", *(f"train-{row:06d}.tar" for row in (0, 3, 6, 9))]
-
-
-@pytest.mark.usefixtures("bare_reports")
-def test_documents_of_a_sample_say_so(
-    eleven: Dataset, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    mlcroissant = pytest.importorskip("mlcroissant", reason="run make setup-all")
     whole = dataset_statistics(eleven)
     assert whole.scene_digest and "what follows is" not in dict(whole.lines())
     monkeypatch.setattr("storage.dataset.statistics.MOST_SCENES", 4)
+    names = [shard.name for shard in described_shards(eleven)]
+    assert names == ["test-000010.tar", *(f"train-{row:06d}.tar" for row in (0, 3, 6, 9))]
     monkeypatch.setattr(dataset_documents, "MOST_LISTED", 3)
     out = DatasetFolder(tmp_path / "documents")
     out.root.mkdir()
@@ -423,6 +408,7 @@ def test_documents_of_a_sample_say_so(
     assert f"Views, errors and contents are those {said}." in out.card.read_text()
     assert said in out.report.read_text()
     assert dataset_distributions(eleven).sample == said
+    mlcroissant = pytest.importorskip("mlcroissant", reason="run make setup-all")
     record = json.loads(out.croissant.read_bytes())
     assert "train-000000.tar" not in json.dumps(record)  # 250,000 of them would take 200 MB
     assert not mlcroissant.Dataset(jsonld=str(out.croissant)).metadata.issues.errors

@@ -297,7 +297,12 @@ def _manifest(missing: list[int] = MISSING, **options: Any) -> dict[str, Any]:
     return job_manifest(job, KubernetesOptions(**{"image": IMAGE, **options}))
 
 
-def test_every_place_makes_what_is_missing_and_nothing_else() -> None:
+def test_every_place_makes_what_is_missing_and_nothing_else_and_needs_an_image(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    monkeypatch.delenv("TRILIGHT_IMAGE", raising=False)
+    with pytest.raises(TrilightError, match="submit kubernetes: --image is not given"):
+        _manifest(image=None)
     manifest = _manifest()
     spec = manifest["spec"]
     (container,) = spec["template"]["spec"]["containers"]
@@ -341,12 +346,6 @@ def test_kubernetes_takes_the_job_and_gives_its_pod_the_rights_of_others() -> No
     mounts = [{each["mountPath"] for each in one["volumeMounts"]} for one in (ours, other)]
     assert mounts[0] == mounts[1]
     assert not pod["automountServiceAccountToken"]
-
-
-def test_an_image_is_needed(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.delenv("TRILIGHT_IMAGE", raising=False)
-    with pytest.raises(TrilightError, match="submit kubernetes: --image is not given"):
-        _manifest(image=None)
 
 
 @for_each(

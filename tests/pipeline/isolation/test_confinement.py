@@ -37,7 +37,7 @@ from tests.for_each import case, for_each
 from tests.pipeline.isolation import called, probes
 from tests.pipeline.isolation.probes import PROBES
 
-LIMITS = ChildLimits(memory_bytes=2 << 30, wall_s=20, calls_per_child=100)
+LIMITS = ChildLimits(memory_bytes=2 << 30, wall_s=120, calls_per_child=100)
 needs_landlock = pytest.mark.skipif(not landlock_version(), reason="no Landlock here")
 needs_seccomp = pytest.mark.skipif(not seccomp_works(), reason="no seccomp here")
 
@@ -260,9 +260,6 @@ def test_the_filter_refuses_calls_by_number_and_by_argument(machine: str, column
         assert _decide(machine, number, given_up) == refuse, name
 
 
-PATIENT = ChildLimits(memory_bytes=2 << 30, wall_s=120, calls_per_child=9)
-
-
 @pytest.fixture(autouse=True)
 def _no_pauses(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(call_failures, "_PAUSE_S", 0.0)
@@ -270,7 +267,7 @@ def _no_pauses(monkeypatch: pytest.MonkeyPatch) -> None:
 
 @pytest.fixture
 def plain_child() -> Iterator[IsolatedChild]:
-    with closing(IsolatedChild(limits=PATIENT)) as plain_child:
+    with closing(IsolatedChild(limits=LIMITS)) as plain_child:
         yield plain_child
 
 
@@ -320,7 +317,7 @@ def test_kills_in_a_call_or_its_set_up_are_tried_again_and_end_the_run_at_last(
     call = called.count_and_die, str(tmp_path / "call"), signal.SIGKILL, 2
     assert call_with_retries(plain_child, *call) == 3
     (tmp_path / "once").mkdir()
-    dying_child = functools.partial(IsolatedChild, limits=PATIENT, factory=called.count_and_die)
+    dying_child = functools.partial(IsolatedChild, limits=LIMITS, factory=called.count_and_die)
     with closing(dying_child(args=(str(tmp_path / "once"), signal.SIGKILL, 2))) as child:
         assert child.call(called.double, 4) == 8
     assert len(list((tmp_path / "once").iterdir())) == 3
@@ -333,7 +330,7 @@ def test_kills_in_a_call_or_its_set_up_are_tried_again_and_end_the_run_at_last(
 
 def test_a_set_up_that_cannot_succeed_is_tried_once_at_each_call(tmp_path: Path) -> None:
     """And no call is made in a child that was not set up."""
-    child = IsolatedChild(limits=PATIENT, factory=called.fail_set_up, args=(str(tmp_path),))
+    child = IsolatedChild(limits=LIMITS, factory=called.fail_set_up, args=(str(tmp_path),))
     with closing(child):
         for calls in (1, 2):
             with pytest.raises(EnvironmentFailure, match="cannot be set up.*a library is broken"):

@@ -152,18 +152,17 @@ def test_a_bucket_is_listed_at_once_and_what_is_not_wanted_stays_there(
     assert sorted(bucket.fetched) == ["bucket/set/a?b#c%20.obj", "bucket/set/x/d.obj"]
 
 
-def test_a_folder_is_no_catalogue_whatever_its_name(bucket: _Bucket) -> None:
-    bucket.files = {"bucket/objects.csv/a.obj": b"a"}
-    (record,) = find("s3://bucket").records
-    assert record.uid == "objects.csv/a"
-
-
-def test_a_catalogue_that_changed_nothing_is_looked_up_in_one_listing(bucket: _Bucket) -> None:
+def test_a_catalogue_that_changed_nothing_is_looked_up_in_one_listing_and_a_folder_is_none(
+    bucket: _Bucket,
+) -> None:
     rows = [{"uid": name, "path": f"{name}.obj", "licence": "MIT"} for name in "abc"]
     bucket.files["bucket/objects.jsonl"] = "\n".join(map(json.dumps, rows)).encode()
     found = find("s3://bucket")
     bucket.listed.clear()
     assert find("s3://bucket") == found and len(bucket.listed) == 1
+    bucket.files = {"bucket/objects.csv/a.obj": b"a"}
+    (record,) = find("s3://bucket").records
+    assert record.uid == "objects.csv/a"
 
 
 def gltf(*uris: str) -> str:
