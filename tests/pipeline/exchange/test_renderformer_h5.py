@@ -181,8 +181,11 @@ def test_other_packings_are_read(path: Path, packing: dict[str, object]) -> None
     assert after == pytest.approx(before, abs=2**-11)  # one step of a half float below 1
 
 
-def test_a_ramp_has_the_means_of_its_cells() -> None:
-    """u is the weight of the first vertex and v that of the second: cell (x, y) is their middle."""
+def test_a_ramp_has_the_means_of_its_cells_and_a_fine_checker_is_grey_in_each() -> None:
+    """u is the weight of the first vertex and v that of the second: cell (x, y) is their middle.
+
+    Of a checker samples at the middle would be black or white.
+    """
     ramp = (np.arange(256, dtype=np.float32) + 0.5) / 256 / 2
     along = np.broadcast_to(ramp[None, :, None], (256, 256, 3)).astype(np.float32)
     rough = np.broadcast_to(ramp[:, None, None], (256, 256, 1)).astype(np.float32)
@@ -196,16 +199,11 @@ def test_a_ramp_has_the_means_of_its_cells() -> None:
         middle = (0.01 + 0.97 * (place + 0.5) / CELLS) / 2
         assert found[whole] == pytest.approx(middle[whole], abs=1e-4)
     assert (diffuse[:, ~FILLED_CELLS] == 0).all()
-
-
-def test_a_fine_checker_is_grey_in_every_cell() -> None:
-    """A mean over the area: samples at the middle would be black or white."""
     checker = (np.indices((64, 64)).sum(axis=0) % 2).astype(np.float32)
     texels = np.repeat(0.8 * checker[..., None], 3, axis=-1)
     scene = textured_scene(0, Texture(texels=texels), number_texture())
     corners = np.array([[4, 0], [0, 4], [0, 0]], np.float32)  # 8 texels a cell
     scene = dataclasses.replace(scene, uv=np.tile(corners, (3, 1)))
-    x, y = np.meshgrid(np.arange(CELLS), np.arange(CELLS))
     assert compute_cells(scene, 0)[0][1][0][x + y < CELLS - 1] == pytest.approx(0.4, abs=0.01)
 
 

@@ -33,14 +33,6 @@ CAMERA = {"position": [0, -2, 0], "look_at": [0, 0, 0], "up": [0, 0, 1], "fov": 
 
 
 @pytest.fixture
-def no_child(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Accept files without a child, of which each costs seconds."""
-    here = SimpleNamespace(call=lambda function, *args: function(*args), close=lambda: None)
-    child = "pipeline.generation.scene_origins.asset_child"
-    monkeypatch.setattr(child, lambda confined_to: here)
-
-
-@pytest.fixture
 def folder(tmp_path: Path, shared: Path) -> Path:
     """A folder of two small scenes that share a mesh."""
     root = tmp_path / "scenes"
@@ -161,8 +153,13 @@ def test_without_wish_there_are_as_many_views_as_every_file_has(folder: Path) ->
         GenerateOptions(views=1)
 
 
-@pytest.mark.usefixtures("no_child")
-def test_files_are_frozen_by_digest_with_the_users_licence(folder: Path, tmp_path: Path) -> None:
+def test_files_are_frozen_by_digest_with_the_users_licence(
+    folder: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Without a child, of which each costs seconds."""
+    here = SimpleNamespace(call=lambda function, *args: function(*args), close=lambda: None)
+    child = "pipeline.generation.scene_origins.asset_child"
+    monkeypatch.setattr(child, lambda confined_to: here)
     with pytest.raises(TrilightError, match="--allow-licence 'CC-BY-NC-4.0'"):
         _accept(folder, tmp_path / "theirs", "CC-BY-NC-4.0")
     out = tmp_path / "set"

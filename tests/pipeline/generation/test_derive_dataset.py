@@ -435,16 +435,6 @@ def test_a_column_that_is_not_declared_here_is_no_damage(tmp_path: Path) -> None
     assert "'coat' is not declared here" in said and "damaged" not in said
 
 
-def test_nothing_is_overwritten_and_nothing_grows(tmp_path: Path) -> None:
-    a, out, derive = finished(tmp_path / "a", scenes(0)), tmp_path / "c", reshard(3)
-    out.mkdir()
-    derive_dataset([str(a)], derive, out)  # an empty folder is no reason to refuse
-    with pytest.raises(TrilightError, match="is there already"):
-        derive_dataset([str(a)], derive, out)
-    with pytest.raises(TrilightError, match=r"made by `trilight shards reshard`.*cannot grow"):
-        begin_tiny(out)
-
-
 KILLED = """
 import sys
 from pathlib import Path
@@ -462,7 +452,9 @@ flow.derive_dataset([sys.argv[1]], derive, Path(sys.argv[2]), progress=stop)
 """
 
 
-def test_a_kill_leaves_no_dataset_and_the_next_run_makes_it(tmp_path: Path) -> None:
+def test_a_kill_leaves_no_dataset_the_next_run_makes_it_and_no_other_changes_it(
+    tmp_path: Path,
+) -> None:
     a, out, derive = finished(tmp_path / "a", scenes(0)), tmp_path / "c", reshard(3)
     run = subprocess.Popen(
         [sys.executable, "-c", KILLED, str(a), str(out)], stdout=subprocess.PIPE, text=True
@@ -475,6 +467,11 @@ def test_a_kill_leaves_no_dataset_and_the_next_run_makes_it(tmp_path: Path) -> N
     assert not out.exists()
     assert list(tmp_path.glob(".c.part/*.tar"))
     (tmp_path / ".c.part" / "train-000009.tar").write_bytes(b"of a larger one")
-    derive_dataset([str(a)], derive, out)
+    out.mkdir()
+    derive_dataset([str(a)], derive, out)  # an empty folder is no reason to refuse
     assert verify_dataset(out).problems == []
     assert sorted(path.name for path in tmp_path.iterdir()) == ["a", "c"]
+    with pytest.raises(TrilightError, match="is there already"):
+        derive_dataset([str(a)], derive, out)
+    with pytest.raises(TrilightError, match=r"made by `trilight shards reshard`.*cannot grow"):
+        begin_tiny(out)
