@@ -83,6 +83,9 @@ def test_scenes_objects_surfaces_and_rejections_are_counted(found: Distributions
     }  # fmt: skip
     assert read["object_uses"]["max"] == 4
     assert read["scenes"][0] == {"template": "plane", "split": "train", "count": 3}
+    for name, values in VALUES:
+        assert np.sort(found.all(name)) == pytest.approx(np.sort(values), rel=FLOAT32), name
+    assert {name for name, _ in VALUES} == set(QUANTITIES)
 
 
 VALUES: list[tuple[str, Sequence[float]]] = [
@@ -117,12 +120,6 @@ VALUES: list[tuple[str, Sequence[float]]] = [
     ("spp", [256, 256] + [128] * 8),
     ("camera_attempt", [0] * 4 + [0, 0, 2, 2] + [0] * 2),
 ]
-
-
-def test_values(found: Distributions) -> None:
-    for name, values in VALUES:
-        assert np.sort(found.all(name)) == pytest.approx(np.sort(values), rel=FLOAT32), name
-    assert {name for name, _ in VALUES} == set(QUANTITIES)
 
 
 def test_textures_and_skies(tmp_path: Path) -> None:

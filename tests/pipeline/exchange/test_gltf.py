@@ -172,9 +172,7 @@ def test_a_mesh_without_coordinates_takes_the_mean_and_one_texel_is_a_constant(
     one = read(tmp_path, kit.picture_bytes(PICTURE[:1, 1:])).scene
     assert not one.textures
     assert one.materials[0, :3] == pytest.approx(kit.shown(GREEN), abs=1e-6)
-
-
-def test_coordinates_that_are_not_finite_are_refused(tmp_path: Path) -> None:
+    # Coordinates that are not finite are refused.
     broken = kit.UV_UP.copy()
     broken[0, 0] = np.nan
     with pytest.raises(TrilightError, match="TEXCOORD_0 is not finite"):

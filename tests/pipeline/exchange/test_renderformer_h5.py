@@ -416,15 +416,12 @@ def test_hostile_arrays_are_refused(path: Path) -> None:
             read_renderformer_h5(hostile)
 
 
-def test_a_normal_of_a_face_without_area_cannot_be_made(path: Path) -> None:
+def test_a_normal_of_a_face_without_area_and_a_file_that_is_cut_are_refused(path: Path) -> None:
     with h5py.File(path, "r+") as file:
         file["vn"][1] = 0
         file["triangles"][1] = 1
     with pytest.raises(TrilightError, match=r"vn\[1\] is zero"):
         read_renderformer_h5(path)
-
-
-def test_a_file_that_is_cut_is_refused(path: Path) -> None:
     whole = path.read_bytes()
     for keep in (0, 7, 100, 2000, -500):
         path.write_bytes(whole[:keep])

@@ -84,7 +84,9 @@ def _accept(folder: Path, out: Path, licence: str = "CC-BY-4.0") -> object:
     return accept_scene_files(found, licence, settings, publication).origin
 
 
-def test_a_scene_says_where_it_comes_from(folder: Path) -> None:
+def test_a_scene_says_where_it_comes_from_and_remesh_keeps_its_place_and_number(
+    folder: Path,
+) -> None:
     scene = _build(folder)
     green, light = scene.objects
     assert (green.name, green.kind, green.uid) == ("green", "object", "meshes/green.obj")
@@ -93,6 +95,16 @@ def test_a_scene_says_where_it_comes_from(folder: Path) -> None:
     assert (scene.provenance["scene_index"], scene.provenance["seed"]) == (3, 9)
     assert scene.provenance["scene_file"]["name"] == "a.json"
     assert str(folder) not in json.dumps(dict(scene.provenance))
+    plain = scene
+    _change(folder, "a.json", remesh=True, remesh_target_face_num=60)
+    scene = _build(folder)
+    mine, theirs = scene.object_index == 0, plain.object_index == 0
+    assert 30 < mine.sum() <= 60
+    assert theirs.sum() == 84
+    for corner in ("min", "max"):
+        found = getattr(scene.vertex_positions[scene.faces[mine]], corner)(axis=(0, 1))
+        wanted = getattr(plain.vertex_positions[plain.faces[theirs]], corner)(axis=(0, 1))
+        assert abs(found - wanted).max() < 0.05  # of an object that is 0.3 high
 
 
 def test_links_are_followed_within_the_folder_alone_and_a_pipe_is_no_scene_file(
@@ -126,20 +138,9 @@ def test_folders_that_give_nothing(tmp_path: Path) -> None:
         find_scene_files(str(tmp_path))
 
 
-def test_remesh_keeps_the_place_and_the_number(folder: Path) -> None:
-    plain = _build(folder)
-    _change(folder, "a.json", remesh=True, remesh_target_face_num=60)
-    scene = _build(folder)
-    mine, theirs = scene.object_index == 0, plain.object_index == 0
-    assert 30 < mine.sum() <= 60
-    assert theirs.sum() == 84
-    for corner in ("min", "max"):
-        found = getattr(scene.vertex_positions[scene.faces[mine]], corner)(axis=(0, 1))
-        wanted = getattr(plain.vertex_positions[plain.faces[theirs]], corner)(axis=(0, 1))
-        assert abs(found - wanted).max() < 0.05  # of an object that is 0.3 high
-
-
-def test_without_wish_there_are_as_many_views_as_every_file_has(folder: Path) -> None:
+def test_without_wish_there_are_as_many_views_as_every_file_has_and_no_maps_are_drawn(
+    folder: Path, tmp_path: Path
+) -> None:
     assert _settings(folder).scenes.num_views == 1
     found = find_scene_files(str(folder))
     assert found.unused_camera_notes(1) == ("b.json: 1 of 2 cameras not used, from cameras[1] on",)
@@ -151,6 +152,10 @@ def test_without_wish_there_are_as_many_views_as_every_file_has(folder: Path) ->
         _settings(folder, views=0)
     with pytest.raises(TrilightError, match="only with --scenes-from"):
         GenerateOptions(views=1)
+    shares = {"scenes.textures.share": 0.5, "scenes.textures.own_share": 1.0}
+    options = GenerateOptions(scenes_from=str(folder), changes=shares)
+    with pytest.raises(TrilightError, match="textures.own_share is 1, but --textures is not given"):
+        resolve_inputs(options, DatasetFolder(tmp_path / "set"))
 
 
 def test_files_are_frozen_by_digest_with_the_users_licence(
@@ -229,13 +234,6 @@ def test_a_run_reads_files_in_a_confined_child(
     job.accepted.origin = NO_OBJECTS.origin
     with render_workers.job_children(job) as (_, nothing):
         assert nothing is None
-
-
-def test_shares_of_maps_that_no_scene_file_draws_are_refused(folder: Path, tmp_path: Path) -> None:
-    shares = {"scenes.textures.share": 0.5, "scenes.textures.own_share": 1.0}
-    options = GenerateOptions(scenes_from=str(folder), changes=shares)
-    with pytest.raises(TrilightError, match="textures.own_share is 1, but --textures is not given"):
-        resolve_inputs(options, DatasetFolder(tmp_path / "set"))
 
 
 def test_a_bad_file_keeps_its_number_and_stops_nobody(folder: Path, tmp_path: Path) -> None:

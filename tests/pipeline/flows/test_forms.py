@@ -242,17 +242,16 @@ def test_rendering_on_a_gpu_takes_its_limit(
     assert submit(pieces, job) == (job, pieces, held)
 
 
-def test_a_dask_worker_that_sees_another_folder_is_named_before_any_work(tmp_path: Path) -> None:
-    """There are two workers, of which the second is on another machine."""
+def test_a_dask_worker_that_sees_another_folder_and_a_silent_scheduler_are_named(
+    tmp_path: Path,
+) -> None:
+    """Before any work; there are two workers, of which the second is on another machine."""
     order = GenerateOptions(out=str(tmp_path / "set"))
     client: Any = Mock()
     client.run = lambda look, *more: {"tcp://a:1": look(*more), "tcp://b:1": False}
     with pytest.raises(TrilightError, match="1 of 2 Dask workers do not see.*such as tcp://b:1"):
         flow_executors._require_shared(client, order)
     assert list((tmp_path / "set" / ".staging").iterdir()) == []
-
-
-def test_a_dask_scheduler_that_does_not_answer_is_named() -> None:
     pytest.importorskip("distributed", reason="needs the package distributed (setup-all)")
     said = "--address http://127.0.0.1:1: no Dask scheduler"
     with pytest.raises(TrilightError, match=said), flow_executors._client("http://127.0.0.1:1"):

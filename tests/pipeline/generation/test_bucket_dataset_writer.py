@@ -123,10 +123,17 @@ def test_a_shard_that_was_deleted_is_made_again(bucket: Any, machines: Machines)
     assert verify_dataset(OUT).problems == []
 
 
-def test_a_shard_is_listed_only_when_it_is_in_the_bucket(bucket: Any, machines: Machines) -> None:
+def test_a_shard_that_is_sent_need_not_be_fetched_and_one_is_listed_only_in_the_bucket(
+    bucket: Any, machines: Machines, monkeypatch: pytest.MonkeyPatch
+) -> None:
     """A thread, or another process of this machine, packs it while somebody publishes."""
     with machines.maker("a") as writer:
         make(writer, 0)
+        assert not writer.folder.shard(FIRST).exists()
+        with monkeypatch.context() as patch:
+            patch.setattr("storage.remote.shard_cache.download", None)
+            dataset = open_dataset(OUT)
+            assert len(list(dataset.read_shard(dataset.manifest.shards[0]))) == 4
         folder, profile = writer.folder, _build().storage.profile
         for index in range(4, 8):
             stage_scene(folder.staged_shard(SECOND), index, _sample(index), [], profile)
@@ -147,21 +154,6 @@ def test_a_larger_wish_of_one_maker_is_known_to_all(bucket: Any, machines: Machi
             assert first.manifest.num_scenes == 8
     with machines.maker("c", 4) as third:
         assert third.num_shards == 2
-
-
-def test_a_sent_shard_need_not_be_fetched(
-    bucket: Any, machines: Machines, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    with machines.maker("a") as writer:
-        make(writer, 0)
-        assert not writer.folder.shard(FIRST).exists()
-
-        def never(*arguments: Any) -> None:
-            raise AssertionError("fetched")
-
-        monkeypatch.setattr("storage.remote.shard_cache.download", never)
-        dataset = open_dataset(OUT)
-        assert len(list(dataset.read_shard(dataset.manifest.shards[0]))) == 4
 
 
 def test_access_that_is_lost_in_the_middle_loses_nothing(

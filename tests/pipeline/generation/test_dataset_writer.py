@@ -260,19 +260,16 @@ def _most_entries(root: Path) -> int:
     return max(sum(1 for _ in folder.glob("[a-z0-9]*[0-9].*")) for folder in folders)
 
 
-def test_the_first_shards_stay_where_the_design_has_them() -> None:
-    splits = SplitSettings(scenes_per_shard=4)
-    assert shard_name(0, splits) == "train-000000.tar"
-    assert shard_name(4093, splits) == "test-004093.tar"
-    assert shard_name(4096, splits) == "part-0001/train-004096.tar"
-    assert shard_name(999_999, splits) == "part-0244/train-999999.tar"
-
-
 def test_a_dataset_in_parts_is_whole(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """Shards, rejections and logs move together; reading and verifying find them.
 
     Two files in a folder stand for 4,096: the rule is the same.
     """
+    splits = SplitSettings(scenes_per_shard=4)
+    assert shard_name(0, splits) == "train-000000.tar"
+    assert shard_name(4093, splits) == "test-004093.tar"
+    assert shard_name(4096, splits) == "part-0001/train-004096.tar"
+    assert shard_name(999_999, splits) == "part-0244/train-999999.tar"
     monkeypatch.setattr(layout, "FILES_PER_FOLDER", 2)
     writer = _dataset(tmp_path, scenes=20)
     shards = writer.manifest.shards

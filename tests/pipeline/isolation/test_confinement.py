@@ -189,10 +189,15 @@ def test_packages_that_a_path_of_pythons_names_are_read_and_its_other_folders_no
             child.call(called.read, other / "file")
 
 
-def test_off_confines_nothing(place: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_off_confines_nothing_and_an_unknown_word_is_refused_at_once_by_every_command(
+    place: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     monkeypatch.setenv(confinement.VARIABLE, "off")
     with closing(confined(place / "in")) as child:
         assert child.call(called.read, place / "outside" / "file") == "outside"
+    words, env = ["-m", "trilight", "doctor", "--help"], {confinement.VARIABLE: "maybe"}
+    run = run_program([sys.executable, *words], status=1, env={**os.environ, **env})
+    assert "'maybe'" in run.stderr
 
 
 @for_each(
@@ -215,12 +220,6 @@ def test_what_cannot_be_had_is_said(
     assert confinement.should_confine() and confinement.should_confine()
     assert [record.getMessage().count("lacks Landlock") for record in caplog.records] == [1]
     caplog.clear()
-
-
-def test_an_unknown_word_is_refused_at_once_by_every_command() -> None:
-    words, env = ["-m", "trilight", "doctor", "--help"], {confinement.VARIABLE: "maybe"}
-    run = run_program([sys.executable, *words], status=1, env={**os.environ, **env})
-    assert "'maybe'" in run.stderr
 
 
 def test_very_many_folders_become_those_above_and_never_the_whole_disk() -> None:

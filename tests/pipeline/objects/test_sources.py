@@ -398,7 +398,9 @@ def test_the_default_refuses_what_is_unknown_or_restricted() -> None:
         assert "expected an SPDX identifier" in failure.message
 
 
-def test_a_stated_licence_is_that_of_silent_files(tmp_path: Path) -> None:
+def test_a_stated_licence_is_that_of_silent_files_and_not_of_sources_that_state_their_own(
+    tmp_path: Path,
+) -> None:
     touch(tmp_path, "a.obj")
     (one,) = find(tmp_path, allowed_licences=["CC-BY-4.0"], licence="cc-by-4.0").records
     assert (one.licence, one.licence_source) == ("cc-by-4.0", "stated by the user (--licence)")
@@ -411,9 +413,6 @@ def test_a_stated_licence_is_that_of_silent_files(tmp_path: Path) -> None:
         for options in ({"licence": bad}, {"allowed_licences": [bad]}):
             with case(options):
                 refusal(tmp_path, "expected an SPDX identifier", **options)
-
-
-def test_sources_that_state_their_own(tmp_path: Path) -> None:
     for folder, name in with_folders(tmp_path, ("objects.jsonl", "objects.csv")):
         touch(folder, name)
         refusal(folder, f"--licence is 'MIT', but {name} states", work_dir=folder, licence="MIT")

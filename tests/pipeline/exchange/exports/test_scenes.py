@@ -352,12 +352,10 @@ def _coverage(made: Sample, view: int) -> NDArray[np.float64]:
     return np.asarray(view_passes(made.scene, ["coverage"], **asked)["coverage"], np.float64)
 
 
-def test_a_floor_and_a_seen_sky_are_behind_objects() -> None:
+def test_nerfstudio_pictures_have_straight_alpha(lone: Path) -> None:
+    """A floor and a seen sky are behind objects."""
     assert stands_alone(_alone()) and stands_alone(_alone(seen_sky=False))
     assert not (stands_alone(_alone(seen_sky=True)) or stands_alone(furnished(["a"])))
-
-
-def test_nerfstudio_pictures_have_straight_alpha(lone: Path) -> None:
     folder = exported(lone, "nerfstudio") / "000000000"
     (made,) = open_dataset(str(lone)).samples("train")
     for view, frame in enumerate(json.loads((folder / "transforms.json").read_text())["frames"]):

@@ -161,14 +161,6 @@ def test_a_change_that_no_column_holds_is_said(tmp_path: Path) -> None:
         assert [said] == [t for t in found.notes if "no place" in t]
 
 
-def test_an_added_column_is_read_as_it_was_changed(tmp_path: Path) -> None:
-    with declared(COAT):
-        scene = tiny_scene()
-        scene.materials[:, -1] = 0.5
-        found = edited(tmp_path, scene, set_values((".trilight:column:coat", 0.25)))
-        assert rows(found.scene)[:, -1].tolist() == [0.25, 0.25, 0.5]
-
-
 @pytest.mark.parametrize("specular", [False, True])
 def test_what_blender_loses_is_still_there(tmp_path: Path, specular: bool) -> None:
     scene = textured_scene(environment=sky())
@@ -230,7 +222,15 @@ def test_what_is_no_longer_so_is_said_and_of_several_changes_the_first_place_cou
         assert np.array_equal(rows(found.scene)[2], rows(tiny_scene())[2]), said
 
 
-def test_a_column_that_blender_drops_is_named(tmp_path: Path) -> None:
+def test_an_added_column_is_read_as_it_was_changed_and_named_where_blender_drops_it(
+    tmp_path: Path,
+) -> None:
+    with declared(COAT):
+        scene = tiny_scene()
+        scene.materials[:, -1] = 0.5
+        found = edited(tmp_path, scene, set_values((".trilight:column:coat", 0.25)))
+        assert rows(found.scene)[:, -1].tolist() == [0.25, 0.25, 0.5]
+
     def drop_array(layer: Any) -> None:
         as_blender_writes(layer)
         for material in layer.GetPrimAtPath("/Scene/Materials").nameChildren:
