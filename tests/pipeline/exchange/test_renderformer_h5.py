@@ -283,23 +283,20 @@ def test_geometry_lights_and_cameras_are_read_and_the_code_is_not(tmp_path: Path
     assert "learned code" in note and "gray of 0.5" in note
 
 
-@pytest.mark.parametrize("processed", [True, False])
-def test_its_environment_has_our_axes(tmp_path: Path, processed: bool) -> None:
+def test_its_environment_has_our_axes_a_turn_is_said_and_another_shape_refused(
+    tmp_path: Path,
+) -> None:
     """Raw ones are scaled by their strength; either may be the only light."""
     radiance = six_poles().radiance_rgb
-    more: dict[str, Any] = {"env_map": np.moveaxis(radiance, -1, 0) if processed else radiance / 2}
-    if not processed:
-        more |= {"env_map_strength": np.array(2, np.float32), "env_map_rotation": np.zeros(3, "f4")}
-    write_v2(tmp_path / "a.h5", lit=False, **more)
-    sky = read_renderformer_h5(tmp_path / "a.h5").scene.environment
-    assert sky is not None and not sky.is_seen
-    for name, direction in POLES.items():
-        assert environment_values(sky, direction) == pytest.approx(COLOURS[name]), name
-
-
-def test_a_turned_environment_is_said_and_another_shape_refused(tmp_path: Path) -> None:
+    raw = {"env_map_strength": np.array(2, np.float32), "env_map_rotation": np.zeros(3, "f4")}
+    for more in ({"env_map": np.moveaxis(radiance, -1, 0)}, {"env_map": radiance / 2, **raw}):
+        write_v2(tmp_path / "a.h5", lit=False, **more)
+        sky = read_renderformer_h5(tmp_path / "a.h5").scene.environment
+        assert sky is not None and not sky.is_seen
+        for name, direction in POLES.items():
+            assert environment_values(sky, direction) == pytest.approx(COLOURS[name]), name
     turn = np.array([0, 0, 90], "f4")
-    write_v2(tmp_path / "a.h5", env_map=six_poles().radiance_rgb, env_map_rotation=turn)
+    write_v2(tmp_path / "a.h5", env_map=radiance, env_map_rotation=turn)
     assert any("rotation of the" in text for text in read_renderformer_h5(tmp_path / "a.h5").notes)
     write_v2(tmp_path / "a.h5", env_map=np.ones((4, 8), np.float32))
     with pytest.raises(TrilightError, match=r"env_map: has shape \[4, 8\]; expected"):

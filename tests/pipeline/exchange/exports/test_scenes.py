@@ -51,13 +51,6 @@ def benchmark(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return root / "out"
 
 
-def loaded_as_published(path: Path) -> dict[str, NDArray]:
-    """What the published inference loads of a file: five arrays, as float32, nothing else."""
-    with h5py.File(path) as file:
-        names = ("triangles", "texture", "vn", "c2w", "fov")
-        return {name: np.array(file[name]).astype(np.float32) for name in names}
-
-
 def rays_as_published(pose: NDArray, fov_deg: float, pixels: int) -> tuple[NDArray, NDArray]:
     """Eye and unit directions [R, R, 3]: the first row on top, the camera looks along -Z, +Y up."""
     centres = np.linspace(0.5, pixels - 0.5, pixels)
@@ -72,8 +65,11 @@ def rays_as_published(pose: NDArray, fov_deg: float, pixels: int) -> tuple[NDArr
 def test_the_published_loader_reads_what_our_network_reads_and_our_pictures_show(
     benchmark: Path, key: str
 ) -> None:
+    """The published inference loads five arrays of a file, as float32, nothing else."""
     sample = toy_sample(int(key), resolution=PX)
-    scene, found = sample.scene, loaded_as_published(benchmark / f"h5/{key}.h5")
+    scene, names = sample.scene, ("triangles", "texture", "vn", "c2w", "fov")
+    with h5py.File(benchmark / f"h5/{key}.h5") as file:
+        found = {name: np.array(file[name]).astype(np.float32) for name in names}
     count = scene.num_triangles
     assert {name: array.shape for name, array in found.items()} == {
         "triangles": (count, 3, 3), "vn": (count, 3, 3), "texture": (count, 13, 32, 32),
@@ -338,13 +334,11 @@ def _alone(*, seen_sky: bool | None = None) -> Scene:
 
 @pytest.fixture
 def lone(tmp_path: Path) -> Path:
-    return attributed(tmp_path, {"train-000000.tar": [_covered(sample(0, _alone(seen_sky=False)))]})
-
-
-def _covered(made: Sample) -> Sample:
-    """Return a sample whose pictures are 0.6 times the share of each pixel that is covered."""
+    """A sample whose pictures are 0.6 times the share of each pixel that is covered."""
+    made = sample(0, _alone(seen_sky=False))
     pictures = [np.repeat(0.6 * _coverage(made, view)[..., None], 3, axis=-1) for view in (0, 1)]
-    return dataclasses.replace(made, radiance_rgb=np.stack(pictures).astype(np.float32))
+    made = dataclasses.replace(made, radiance_rgb=np.stack(pictures).astype(np.float32))
+    return attributed(tmp_path, {"train-000000.tar": [made]})
 
 
 def _coverage(made: Sample, view: int) -> NDArray[np.float64]:

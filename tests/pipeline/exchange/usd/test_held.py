@@ -28,7 +28,7 @@ from storage.records.material import EMISSION, PUBLISHED_COLUMNS
 from storage.records.retextured import with_textures
 from storage.records.scene import Scene
 from storage.records.scene_file import encode_scene
-from storage.records.texture import CONSTANT, Environment, MapSource, Texture
+from storage.records.texture import CONSTANT, MapSource, Texture
 from tests.columns_kit import COAT, WAVES, declared
 from tests.command_line import expect_output
 from tests.for_each import case, for_each, with_folders
@@ -108,32 +108,27 @@ EDITS = [
 """Column, changed attribute, its value, the value that is read, and the place in its note."""
 
 
-def assert_changed(found: LoadedScene, scene: Scene, column: str, value: Any, place: str) -> None:
-    """The column of the floor alone has the value, and one note says from where."""
-    expected = rows(scene).copy()
-    expected[:2, COLUMNS[column][0]] = value
-    emits = [2, 0, 1] if column == "emission" else [0, 1, 2]
-    sorted_rows = np.sort(rows(found.scene), axis=0)
-    wanted = np.sort(expected[emits], axis=0)
-    if place == "its shader OpenPBR":
-        assert sorted_rows == pytest.approx(wanted, rel=1e-5)
-    else:
-        assert np.array_equal(sorted_rows, wanted)
-    (said,) = [text for text in found.notes if " was changed since" in text]
-    assert said.startswith(f"{MATERIAL}: {column} was changed")
-    assert f"the value of {place} is used" in said
-
-
 @for_each("besides", [set_values(), move_light, as_blender_writes])
 def test_an_edit_changes_its_column_alone(tmp_path: Path, besides: Edit) -> None:
-    """Of each column in each place; Blender keeps what stands in the preview alone."""
+    """Of each column in each place, with a note; Blender keeps what is in the preview alone."""
     in_blender = besides is as_blender_writes
     kept = [e for e in EDITS if not in_blender or ("/Preview" in e[1] and e[0] != "specular")]
     assert len(kept) == 3 if in_blender else {e[0] for e in kept} == set(PUBLISHED_COLUMNS)
     for folder, (column, path, value, read, place) in with_folders(tmp_path, kept):
         with case(path):
             found = edited(folder, tiny_scene(), set_values((path, value), besides=besides))
-            assert_changed(found, tiny_scene(), column, read, place)
+            expected = rows(tiny_scene()).copy()
+            expected[:2, COLUMNS[column][0]] = read
+            emits = [2, 0, 1] if column == "emission" else [0, 1, 2]
+            sorted_rows = np.sort(rows(found.scene), axis=0)
+            wanted = np.sort(expected[emits], axis=0)
+            if place == "its shader OpenPBR":
+                assert sorted_rows == pytest.approx(wanted, rel=1e-5)
+            else:
+                assert np.array_equal(sorted_rows, wanted)
+            (said,) = [text for text in found.notes if " was changed since" in text]
+            assert said.startswith(f"{MATERIAL}: {column} was changed")
+            assert f"the value of {place} is used" in said
 
 
 def test_constants_beside_textures_are_read_where_they_were_changed(tmp_path: Path) -> None:
@@ -340,7 +335,11 @@ def test_the_tutorial_keeps_everything(
     if name == "map":
         assert scene.uv is not None
         mirrored = dataclasses.replace(scene, uv=scene.uv * np.array([-1, 1], np.float32))
-        turned = dataclasses.replace(scene, environment=_turned(scene.environment))
+        assert scene.environment is not None
+        quarter = np.array([[0, -1, 0], [1, 0, 0], [0, 0, 1]], np.float32)
+        rotation = (scene.environment.rotation @ quarter).astype(np.float32)
+        sky = dataclasses.replace(scene.environment, rotation=rotation)
+        turned = dataclasses.replace(scene, environment=sky)
         assert max(_db(mirrored, theirs), _db(turned, theirs)) < 25
     found = read_usd(tmp_path / "back.usdc")
     assert_kept(found, scene, lamp, painted)
@@ -410,12 +409,6 @@ def _worn(scene: Scene) -> list[tuple[Any, ...]]:
     return worn
 
 
-def _turned(sky: Environment | None) -> Environment:
-    assert sky is not None
-    quarter = np.array([[0, -1, 0], [1, 0, 0], [0, 0, 1]], np.float32)
-    return dataclasses.replace(sky, rotation=(sky.rotation @ quarter).astype(np.float32))
-
-
 def _db(scene: Scene, theirs: NDArray[np.float32]) -> float:
     return psnr_linear_db(ours(scene, RESOLUTION, SPP), theirs)
 
@@ -447,13 +440,9 @@ def test_a_scene_that_blender_exports_looks_as_blender_renders_it(
     record_property("psnr_linear_db", round(agreement, 2))
     assert agreement > 36
     assert ratio == pytest.approx([1, 1, 1], abs=0.05)
-    assert_read(found)
+    # What Blender says of the scene that it made: faces, colours, watts, angle, and losses.
     again = read_usd(tmp_path / "instances.usdc")
     assert sizes(again) == sizes(found)  # instances or copies: the same triangles
-
-
-def assert_read(found: LoadedScene) -> None:
-    """What Blender says of the scene that it made: faces, colours, watts, angle, and losses."""
     scene = found.scene
     assert sizes(found) == {
         "Grid": 512, "Plane": 2, "Cylinder": 12 * 2 + 2 * 10, "Sphere": 24 * 22, "Suzanne": 968,
