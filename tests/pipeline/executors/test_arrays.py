@@ -30,7 +30,7 @@ from storage.dataset.verify import verify_dataset
 from storage.errors import TrilightError
 from storage.number_ranges import number_ranges, numbers_of
 from tests.command_line import expect_json, trilight
-from tests.for_each import for_each
+from tests.for_each import case, for_each
 from tests.pipeline.generation.tiny_scenes_kit import Undocumented, tiny_order, without_rendering
 from tests.pipeline.programs import printed_by
 
@@ -61,9 +61,8 @@ def test_the_tasks_of_an_array_have_equal_shares() -> None:
     assert shares == ["0:4", "4:8", "28:32"], "a place is a task that is missing"
 
 
-@for_each(
-    ("on", "environment", "message"),
-    [
+def test_what_is_no_array_is_named() -> None:
+    rows: list[tuple[str, dict[str, str], str]] = [
         ("slurm", {}, "SLURM_ARRAY_TASK_ID is not set; expected a task of an array, .* Submit"),
         ("slurm", _array(3, 3, 7, 2, SHARDS_PER_TASK="0"), "SHARDS_PER_TASK is '0'; .* from 1"),
         ("slurm", _array(0, 0, 0, 1) | {"SLURM_ARRAY_TASK_ID": "x"}, "ID is 'x'; .* from 0"),
@@ -76,13 +75,12 @@ def test_the_tasks_of_an_array_have_equal_shares() -> None:
         ("kubernetes", {**GIVEN, PLACE: "0", "SHARDS_PER_TASK": "0"}, "_TASK is '0'; .* from 1"),
         ("kubernetes", {**GIVEN, PLACE: "0", "TASKS": "0,,2"}, "TASKS is '0,,2'; expected numbers"),
         ("kubernetes", {**GIVEN, PLACE: "0", "TASKS": "0-999999999"}, "at most 100000"),
-    ],
-)
-def test_what_is_no_array_is_named(on: str, environment: dict[str, str], message: str) -> None:
-    with pytest.raises(TrilightError, match=f"--runner {on}: .*{message}"):
-        if on == "slurm":
-            shards_of_task(environment, lambda: 8)
-        shards_of_place(environment)
+    ]
+    for on, environment, message in rows:
+        with case(message), pytest.raises(TrilightError, match=f"--runner {on}: .*{message}"):
+            if on == "slurm":
+                shards_of_task(environment, lambda: 8)
+            shards_of_place(environment)
 
 
 def test_an_array_makes_the_dataset_that_one_process_makes(
@@ -202,22 +200,18 @@ def test_tasks_that_died_are_all_that_is_submitted_again(
     assert trilight(["status", order.place, "--missing"]).stdout == ""
 
 
-@for_each(
-    ("given", "per_task", "message"),
-    [
+def test_what_no_array_can_make_is_refused_and_no_password_reaches_the_queue(cluster: Path) -> None:
+    rows: list[tuple[dict[str, Any], int | None, str]] = [
         ({"objects": "http://ada:secret@host/objects/"}, None, "holds a password"),
         ({"shards": "0:1"}, None, "submit slurm: expected no"),
         ({"scenes_from": "folder"}, None, "submit slurm: expected no"),
         ({"build": "pretrain-256", "scenes": 2_000_000}, 1,
          "shards-per-task is 1: .* task 7812; .* 8 shards"),
-    ],
-)  # fmt: skip
-def test_what_no_array_can_make_is_refused_and_no_password_reaches_the_queue(
-    cluster: Path, given: dict[str, Any], per_task: int | None, message: str
-) -> None:
-    with pytest.raises(TrilightError, match=message) as refused:
-        array_job(GenerateOptions(**given), per_task=per_task, at_once=None)
-    assert "secret" not in str(refused.value)
+    ]  # fmt: skip
+    for given, per_task, message in rows:
+        with case(given), pytest.raises(TrilightError, match=message) as refused:
+            array_job(GenerateOptions(**given), per_task=per_task, at_once=None)
+        assert "secret" not in str(refused.value)
 
 
 def test_refusals(cluster: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -348,19 +342,18 @@ def test_kubernetes_takes_the_job_and_gives_its_pod_the_rights_of_others() -> No
     assert not pod["automountServiceAccountToken"]
 
 
-@for_each(
-    ("asked", "message"),
-    [
+def test_files_of_this_machine_are_refused() -> None:
+    rows: list[tuple[dict[str, str], str]] = [
         ({"out": "data/mine"}, "--out is data/mine; expected a bucket"),
         ({"objects": "chairs"}, "--objects is chairs, a folder of this machine"),
         ({"objects": "builtin:", "skies": "file:///skies"}, "--skies is file:///skies, a folder"),
         ({"build": "mine.py:sunsets"}, "mine.py:sunsets, a file of this machine"),
-    ],
-)
-def test_files_of_this_machine_are_refused(asked: dict[str, str], message: str) -> None:
-    given: dict[str, Any] = {"scenes": 8, "out": "gs://sets/mine", **asked}
-    order = GenerateOptions(**given | {"build": "smoke"})
-    object.__setattr__(order, "build", asked.get("build", "smoke"))  # --extend has loaded it
-    job = ArrayJob(options=order, tasks=[0], per_task=1, at_once=1)
-    with pytest.raises(TrilightError, match=f"submit kubernetes: .*{message}"):
-        job_manifest(job, KubernetesOptions(image=IMAGE))
+    ]
+    for asked, message in rows:
+        given: dict[str, Any] = {"scenes": 8, "out": "gs://sets/mine", **asked}
+        order = GenerateOptions(**given | {"build": "smoke"})
+        object.__setattr__(order, "build", asked.get("build", "smoke"))  # --extend has loaded it
+        job = ArrayJob(options=order, tasks=[0], per_task=1, at_once=1)
+        said = f"submit kubernetes: .*{message}"
+        with case(asked), pytest.raises(TrilightError, match=said):
+            job_manifest(job, KubernetesOptions(image=IMAGE))

@@ -69,27 +69,21 @@ def test_units_axes_and_losses(stage: LoadedScene) -> None:
     assert stage.scene.fov_deg[0] == pytest.approx(2 * math.degrees(math.atan(18 / 50)), rel=1e-6)
 
 
-@for_each(
-    "name, area_vector, radiance",
-    [
+def test_lights_have_their_area_and_radiance(stage: LoadedScene) -> None:
+    for name, area_vector, radiance in (
         ("rect", [0, 0, -0.1], [20, 20, 20]),
         ("disk", [0, math.pi * 0.04, 0], [1, 0.5, 0.25]),
         ("lamp", [0, 0, 0.005], [7, 7, 7]),
         ("sphere", [0, 0, 0], [3 / (4 * math.pi * 10**2)] * 3),  # normalized: in centimetres
-    ],
-)
-def test_lights_have_their_area_and_radiance(
-    stage: LoadedScene, name: str, area_vector: list[float], radiance: list[float]
-) -> None:
-    corners, rows = object_of(stage.scene, name)
-    # sums of up to 128 areas in single precision
-    assert facing(corners) == pytest.approx(area_vector, abs=1e-6)
-    assert rows[:, EMISSION] == pytest.approx(np.tile(radiance, (len(rows), 1)), rel=1e-5)
-    if name == "sphere":
-        cross = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
-        area = np.linalg.norm(cross, axis=1).sum() / 2
-        assert area == pytest.approx(4 * math.pi * 0.01, rel=1e-5)
-        assert (np.einsum("ti,ti->t", cross, corners.mean(axis=1)) > 0).all()
+    ):
+        corners, rows = object_of(stage.scene, name)
+        # sums of up to 128 areas in single precision
+        assert facing(corners) == pytest.approx(area_vector, abs=1e-6), name
+        assert rows[:, EMISSION] == pytest.approx(np.tile(radiance, (len(rows), 1)), rel=1e-5), name
+    cross = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])  # of the sphere
+    area = np.linalg.norm(cross, axis=1).sum() / 2
+    assert area == pytest.approx(4 * math.pi * 0.01, rel=1e-5)
+    assert (np.einsum("ti,ti->t", cross, corners.mean(axis=1)) > 0).all()
 
 
 @pytest.mark.parametrize(("kelvin", "redder"), [(None, 1.0), (3000.0, 6.5)])
