@@ -30,7 +30,7 @@ from storage.dataset.verify import verify_dataset
 from storage.errors import TrilightError
 from storage.number_ranges import number_ranges, numbers_of
 from tests.command_line import expect_json, trilight
-from tests.for_each import case, for_each
+from tests.for_each import case
 from tests.pipeline.generation.tiny_scenes_kit import Undocumented, tiny_order, without_rendering
 from tests.pipeline.programs import printed_by
 
@@ -43,7 +43,7 @@ def _array(task: int, first: int, last: int, count: int, **more: str) -> dict[st
 GIVEN = {"TASKS": "0-1,7", "SHARDS_PER_TASK": "4"}
 
 
-def test_the_tasks_of_an_array_have_equal_shares() -> None:
+def test_the_tasks_of_an_array_have_equal_shares_and_are_written_as_ranges() -> None:
     assert [shards_of_task(_array(k, 0, 3, 4), lambda: 10) for k in range(4)] == [
         "0:2", "2:5", "5:7", "7:10",
     ]  # fmt: skip
@@ -59,6 +59,9 @@ def test_the_tasks_of_an_array_have_equal_shares() -> None:
     assert not unknown.called, "nobody needs to know: the dataset need not even be begun"
     shares = [shards_of_place({**GIVEN, PLACE: str(place)}) for place in range(3)]
     assert shares == ["0:4", "4:8", "28:32"], "a place is a task that is missing"
+    for text, numbers in ("", []), ("4", [4]), ("0-3,7", [3, 2, 1, 0, 7, 7]), ("0,2-3", [0, 2, 3]):
+        assert number_ranges(numbers) == text
+        assert numbers_of(text) == sorted(set(numbers))
 
 
 def test_what_is_no_array_is_named() -> None:
@@ -128,15 +131,6 @@ def cluster(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     monkeypatch.setenv("FAKE_SBATCH", str(tmp_path / "asked"))
     monkeypatch.chdir(tmp_path)
     return tmp_path
-
-
-@for_each(
-    ("numbers", "text"),
-    [((), ""), ((4,), "4"), ((3, 2, 1, 0, 7, 7), "0-3,7"), ((0, 2, 3), "0,2-3")],
-)
-def test_ranges(numbers: tuple[int, ...], text: str) -> None:
-    assert number_ranges(numbers) == text
-    assert numbers_of(text) == sorted(set(numbers))
 
 
 def test_an_array_fits_the_cluster_and_covers_every_shard_of_what_was_ordered(

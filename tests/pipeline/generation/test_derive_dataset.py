@@ -373,21 +373,16 @@ def test_the_same_scene_twice_is_refused(tmp_path: Path) -> None:
     assert "expected each scene once" in refused(tmp_path / "c", MERGE, a, a)
 
 
-@for_each(
-    ("group", "values", "name"),
-    [
-        ("renders", {"resolution": 32}, "renders.resolution is 32; expected 16"),
-        ("renders", {"per_light": True}, "renders.per_light is True; expected False"),
-        ("storage", {"passes": ["object"]}, "storage.passes is ['object']; expected False"),
-    ],
-)
-def test_what_does_not_fit_together_is_named(
-    tmp_path: Path, group: str, values: dict[str, Any], name: str
-) -> None:
-    settings = {**SETTINGS, group: {**SETTINGS.get(group, {}), **values}}
+def test_what_does_not_fit_together_is_named(tmp_path: Path) -> None:
     a = finished(tmp_path / "a", scenes(0))
-    b = finished(tmp_path / "b", scenes(1), settings=settings)
-    assert name in refused(tmp_path / "c", MERGE, a, b)
+    for group, field, value, name in (
+        ("renders", "resolution", 32, "renders.resolution is 32; expected 16"),
+        ("renders", "per_light", True, "renders.per_light is True; expected False"),
+        ("storage", "passes", ["object"], "storage.passes is ['object']; expected False"),
+    ):
+        settings = {**SETTINGS, group: {**SETTINGS.get(group, {}), field: value}}
+        b = finished(tmp_path / field, scenes(1), settings=settings)
+        assert name in refused(tmp_path / "c", MERGE, a, b)
     other = finished(tmp_path / "other", scenes(1), num_views=3)
     assert "number of views is 3; expected 2" in refused(tmp_path / "c", MERGE, a, other)
 
