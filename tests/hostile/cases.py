@@ -1,6 +1,7 @@
 """Files of somebody who means harm: they lead out, multiply, contradict themselves, and claim.
 
-Every function of cases yields a name, what writes the file, and what has to come of it.
+Every function of cases yields a name, what writes the file, and what has to come of it: `any`, or
+`read`, `refused` or `ended`, with words of what is said behind a colon.
 """
 
 import io
@@ -42,6 +43,7 @@ def Mesh "floor" (prepend apiSchemas = ["MaterialBindingAPI"]) {
 }
 """
 """What makes a scene, so that nothing but the harm is a reason to refuse."""
+UNDIVIDED = 'uniform token subdivisionScheme = "none"'
 
 LEAK = """
 def Mesh "LEAK" {
@@ -100,10 +102,12 @@ def with_file(name: str, content: str, body: str) -> Make:
     return make
 
 
-def textured(spoil: Callable[[Path], object], named: str = "./t.png", head: str = HEAD) -> Make:
+def textured(
+    spoil: Callable[[Path], object], named: str = "./t.png", head: str = HEAD, seen: str = SEEN
+) -> Make:
     def make(folder: Path) -> None:
         spoil(folder / "t.png")
-        text(MATERIAL.replace("FILE", named), head=head)(folder)
+        text(MATERIAL.replace("FILE", named), seen, head)(folder)
 
     return make
 
@@ -137,29 +141,32 @@ def leaks() -> Iterator[tuple[str, Make, str]]:
         "default prim": 'def "x" (references = @N@) {}',
         "with arguments": 'def "x" (references = @N:SDF_FORMAT_ARGS:a=1@</B>) {}',
     }
+    outside, fetched = "refused: which is outside of its folder", "refused: nothing is fetched"
     names = {
-        "absolute": "OUT",
-        "upwards": "../outside/secret.usda",
-        "by a link": "./link.usda",
-        "by a linked folder": "./linked/secret.usda",
-        "by an expression": '`"${X}"`',
-        "as a URL": "file:OUT",
+        "absolute": ("OUT", outside),
+        "upwards": ("../outside/secret.usda", outside),
+        "by a link": ("./link.usda", outside),
+        "by a linked folder": ("./linked/secret.usda", outside),
+        "by an expression": ('`"${X}"`', "refused: a variable expression; expected a name"),
+        "as a URL": ("file:OUT", fetched),
+        "of a server": ("https://x.y/z.usda", fetched),
     }
     head = '#usda 1.0\n(expressionVariables = {string X = "../outside/secret.usda"})\n'
     for arc, body in arcs.items():
-        for kind, name in names.items():
-            yield f"{arc} {kind}", text(body.replace("N", name), head=head), "refused"
-    for kind, name in names.items():
+        for kind, (name, said) in names.items():
+            said = "refused: arguments for its file" if arc == "with arguments" else said
+            yield f"{arc} {kind}", text(body.replace("N", name), head=head), said
+    for kind, (name, said) in names.items():
         sub = '#usda 1.0\n(expressionVariables = {string X = "../outside/secret.usda"}\n'
-        yield f"sublayer {kind}", text("", head=f"{sub}subLayers = [@{name}@])\n"), "refused"
+        yield f"sublayer {kind}", text("", head=f"{sub}subLayers = [@{name}@])\n"), said
         deep = f'def "A" (references = @{name}@</A>) {{\ndef "LEAK" {{}}\n}}'
         far = with_file("lib.usda", deep, 'def "x" (references = @./lib.usda@</A/LEAK>) {}')
-        yield f"of another file's ancestor {kind}", far, "refused"
+        yield f"of another file's ancestor {kind}", far, said
         picture = name.replace("secret.usda", "secret.png").replace("OUT", "PICTURE")
         variable = head.replace("secret.usda", "secret.png")
         yield f"texture {kind}", textured(_png, picture, variable), "refused"
     clip = 'def "A" (clips = {dictionary default = {asset[] assetPaths = [@OUT@]}}) {}'
-    yield "value clips", text(clip), "refused"
+    yield "value clips", text(clip), "refused: uses value clips"
 
 
 def packages() -> Iterator[tuple[str, Make, str]]:
@@ -212,8 +219,14 @@ def bombs() -> Iterator[tuple[str, Make, str]]:
         f'def "L{i}" {{\ndef "a" (ARC = </L{i + 1}>) {{}}\ndef "b" (ARC = </L{i + 1}>) {{}}\n}}\n'
         for i in range(40)
     )
+    too_many = "refused: composes more than 2000 prims"
     for arc in ("references", "payload", "inherits", "specializes"):
-        yield f"2^40 prims by {arc}", text(doubled.replace("ARC", arc)), "refused"
+        yield f"2^40 prims by {arc}", text(doubled.replace("ARC", arc)), too_many
+    tenfold = "".join(f'def "c{j}" (references = </L{{0}}>) {{{{}}}}\n' for j in range(10))
+    tens = "".join(f'def "L{i}" {{\n{tenfold.format(i + 1)}}}\n' for i in range(12))
+    heir = 'def "A" (references = @./lib.usda@</A>) {}\nclass "_c" (references = </L0>) {}\n'
+    of_class = with_file("lib.usda", 'class "_c" {}\ndef "A" (inherits = </_c>) {}', heir + tens)
+    yield "10^12 prims by a class that its heir brings", of_class, too_many
     inner = "".join(
         f'def "L{i}" (references = </L{i + 1}>) {{\ndef "in" {{\n'
         f'def "a" (references = </L{i + 1}/in>) {{}}\n'
@@ -223,12 +236,14 @@ def bombs() -> Iterator[tuple[str, Make, str]]:
     yield "2^40 prims by ancestors", text(inner), "refused"
     instanced = doubled.replace("ARC", "instanceable = true\nreferences") + 'def Mesh "L40" {}'
     yield "2^40 instances", text(instanced), "refused"
-    yield "a chain of 2100", text(chain(2100)), "refused"
+    slow = "refused: processor seconds to compose and more follow"
+    yield "a chain of 2100", text(chain(2100)), slow
     yield "2^30 sites in one prim", text(paired_arcs(30)), "refused"
     for deep in (200, 100_000):
         nested = text('def "a" {\n' * deep + "}\n" * deep)
         # USD's parser calls itself at every level, and crashes: that costs the child
-        yield f"{deep} prims deep", nested, "refused" if deep < 1000 else "ended"
+        said = "refused: nested more than 150 deep" if deep < 1000 else "ended"
+        yield f"{deep} prims deep", nested, said
     many, places = "0, " * 2001, "(0, 0, 0), " * 2001
     instancer = (
         'def PointInstancer "i" {\nrel prototypes = </floor>\n'
@@ -251,7 +266,7 @@ def circles() -> Iterator[tuple[str, Make, str]]:
         "its parent": 'def "x" {\ndef "y" (inherits = </x>) {}\n}',
     }
     for kind, body in pairs.items():
-        yield f"circle: {kind}", text(body), "refused"
+        yield f"circle: {kind}", text(body), "refused: refers to itself in a circle"
     yield "sublayer of itself", text("", head="#usda 1.0\n(subLayers = [@./s.usda@])\n"), "refused"
 
 
@@ -264,13 +279,14 @@ def odd_files() -> Iterator[tuple[str, Make, str]]:
         "link to itself": lambda path: path.symlink_to(path.name),
     }
     for kind, make_odd in kinds.items():
+        said = "refused" if kind in ("device", "link to itself") else "refused: is no plain file"
 
         def layer(folder: Path, make_odd: Callable[[Path], object] = make_odd) -> None:
             make_odd(folder / "odd.usda")
             text('def "x" (references = @./odd.usda@</A>) {}')(folder)
 
-        yield f"layer is a {kind}", layer, "refused"
-        yield f"texture is a {kind}", textured(make_odd), "refused"
+        yield f"layer is a {kind}", layer, said
+        yield f"texture is a {kind}", textured(make_odd), said
     header = b"\x89PNG\r\n\x1a\n\0\0\0\rIHDR"
     for kind, data in (("empty", b""), ("cut", header), ("noise", bytes(range(256)) * 9)):
         yield f"texture is {kind}", textured(partial(Path.write_bytes, data=data)), "read"
@@ -281,7 +297,7 @@ def odd_files() -> Iterator[tuple[str, Make, str]]:
 
 
 def contradictions() -> Iterator[tuple[str, Make, str]]:
-    points, counts, indices = SEEN.splitlines()[9:12]
+    points, counts, indices, coordinates = SEEN.splitlines()[9:13]
     moved = "    double3 xformOp:translate = (0, 0, 3)"
     values = {
         "points NaN": (points, "point3f[] points = [(nan, 0, 0), (1, 0, 0), (0, 1, 0)]"),
@@ -300,13 +316,35 @@ def contradictions() -> Iterator[tuple[str, Make, str]]:
         "intensity 1e38": ("inputs:intensity = 5", "inputs:intensity = 1e38"),
         "radius 1e38": ("inputs:radius = 0.2", "inputs:radius = 1e38"),
         "radius NaN": ("inputs:radius = 0.2", "inputs:radius = nan"),
+        # A layer may call an attribute of a schema by any type; so may one that a person wrote.
+        "points of doubles": (points, "double[] points = [1, 2]"),
+        "counts of tokens": (counts, 'token[] faceVertexCounts = ["a"]'),
+        "indices of floats": (indices, "float[] faceVertexIndices = [nan]"),
+        "normals of text": (points, f'{points}\n{UNDIVIDED}\nstring[] normals = ["a"]'),
+        "intensities": ("float inputs:intensity = 5", "float[] inputs:intensity = [1, 2]"),
+        "exposure 1e9": (moved, f"{moved}\nfloat inputs:exposure = 1e9"),
+    }
+    words = {
+        "points NaN": "refused: points are not finite",
+        "indices beyond": "refused: go from 0 to 2147483647; expected 0 to 2",
+        "counts negative": "refused: add up to -3; expected 3",
     }
     for kind, (old, new) in values.items():
         assert old in SEEN
-        yield f"mesh or light with {kind}", text("", seen=SEEN.replace(old, new)), "any"
+        changed = text("", seen=SEEN.replace(old, new))
+        yield f"mesh or light with {kind}", changed, words.get(kind, "any")
+    many = 'def PointInstancer "i" {\nrel prototypes = </floor>\npoint3f[] positions = [(0, 0, 0)]'
+    yield "instances of text", text(f'{many}\nstring[] protoIndices = ["a"]\n}}'), "any"
+    yield "more instances than places", text(f"{many}\nint[] protoIndices = [0, 0]\n}}"), "any"
+    yield "a lens NaN", text('def Camera "c" {\nfloat focalLength = nan\n}'), "any"
+    of_number = SEEN.replace(coordinates, "int primvars:st = 3")
+    yield "coordinates of a number", textured(_png, seen=of_number), "any"
+    rough = MATERIAL.replace("  color3f", '  string inputs:roughness = "smooth"\n    color3f')
+    yield "roughness of text", text(rough.replace("FILE", "./no.png")), "any"
     for kind, body in {"no prim": "", "half a prim": 'def "x" {', "zeros": "\0" * 99}.items():
         head = "" if kind == "zeros" else HEAD
-        yield f"text: {kind}", text(body, seen="", head=head), "refused"
+        said = "refused" if kind == "no prim" else "refused: not readable as USD"
+        yield f"text: {kind}", text(body, seen="", head=head), said
 
 
 def usd_cases() -> Iterator[tuple[str, Make, str]]:
@@ -410,13 +448,17 @@ def _mesh(spoil: Callable[[Path], object]) -> Make:
 def json_cases() -> Iterator[tuple[str, Make, str]]:
     """Yield name, what writes `s.json`, what comes of it; test_renderformer_json.py has more."""
     mesh = ("objects", "ANY", "mesh_path")
-    values: tuple[Any, ...] = (
+    outside: tuple[Any, ...] = (
         "../outside/secret.obj", "/etc/passwd", "linked/secret.obj", "link.obj", "", ".", "..",
-        "objects", "no.obj", "x\0y", "a" * 5000, "https://x.y/z.obj", "file:///etc/passwd",
-        "~/x.obj", "s.json", "objects/../../outside/secret.obj", 3, None, [], {},
+        "objects/../../outside/secret.obj",
     )  # fmt: skip
-    for value in values:
-        yield f"mesh {str(value)[:30]!r}", _changed(*mesh, value=value), "refused"
+    others: tuple[Any, ...] = (
+        "objects", "no.obj", "x\0y", "a" * 5000, "https://x.y/z.obj", "file:///etc/passwd",
+        "~/x.obj", "s.json", 3, None, [], {},
+    )  # fmt: skip
+    for value in (*outside, *others):
+        said = "refused: mesh_path is {value}, which leads out" if value in outside else "refused"
+        yield f"mesh {str(value)[:30]!r}", _changed(*mesh, value=value), said.format(value=value)
     kinds: dict[str, Callable[[Path], object]] = {
         "fifo": os.mkfifo,
         "device": lambda path: path.symlink_to("/dev/zero"),
@@ -428,7 +470,8 @@ def json_cases() -> Iterator[tuple[str, Make, str]]:
         "8 TB": _sparse,
     }
     for kind, spoil in kinds.items():
-        yield f"mesh is {kind}", _mesh(spoil), "refused"
+        said = "refused: is not a regular file" if kind in ("fifo", "folder") else "refused"
+        yield f"mesh is {kind}", _mesh(spoil), said
     over = _changed("objects", "ANY", "material", "specular", value=[0.9] * 3)
     yield "diffuse and specular", over, "any"
     bright = _changed("objects", "ANY", "material", "emissive", value=[1e9] * 3)
@@ -441,7 +484,8 @@ def json_cases() -> Iterator[tuple[str, Make, str]]:
     yield "remeshed to 10^9 faces", remesh, "refused"
     for kind, data in {"noise": bytes(range(256)), "cut": b'{"scene_name": "x"'}.items():
         yield f"JSON is {kind}", _bytes("s.json", data), "refused"
-    yield "JSON is a fifo", lambda folder: os.mkfifo(folder / "s.json"), "refused"
+    fifo = "refused: cannot be read (not a plain file)"
+    yield "JSON is a fifo", lambda folder: os.mkfifo(folder / "s.json"), fifo
     yield "JSON is endless", lambda f: (f / "s.json").symlink_to("/dev/zero"), "refused"
     yield "JSON of 8 TB", lambda folder: _sparse(folder / "s.json"), "refused"
 

@@ -83,6 +83,9 @@ def test_scenes_objects_surfaces_and_rejections_are_counted(found: Distributions
     }  # fmt: skip
     assert read["object_uses"]["max"] == 4
     assert read["scenes"][0] == {"template": "plane", "split": "train", "count": 3}
+    for name, values in VALUES:
+        assert np.sort(found.all(name)) == pytest.approx(np.sort(values), rel=FLOAT32), name
+    assert {name for name, _ in VALUES} == set(QUANTITIES)
 
 
 VALUES: list[tuple[str, Sequence[float]]] = [
@@ -117,12 +120,6 @@ VALUES: list[tuple[str, Sequence[float]]] = [
     ("spp", [256, 256] + [128] * 8),
     ("camera_attempt", [0] * 4 + [0, 0, 2, 2] + [0] * 2),
 ]
-
-
-def test_values(found: Distributions) -> None:
-    for name, values in VALUES:
-        assert np.sort(found.all(name)) == pytest.approx(np.sort(values), rel=FLOAT32), name
-    assert {name for name, _ in VALUES} == set(QUANTITIES)
 
 
 def test_textures_and_skies(tmp_path: Path) -> None:
@@ -209,9 +206,17 @@ def card_of(dataset: Dataset) -> tuple[dict[str, Any], str]:
 
 
 @pytest.mark.usefixtures("bare_reports")
-def test_the_front_matter_says_what_hubs_ask(tmp_path: Path) -> None:
-    dataset = five_scenes(tmp_path)
+def test_the_front_matter_says_what_hubs_ask_and_equal_datasets_have_equal_documents(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Neither place, clock nor language is in them; of the report's figures see test_report."""
+    dataset, second = five_scenes(tmp_path), five_scenes(tmp_path / "other" / "b")
     write_documents(dataset, dataset.folder)
+    os.utime(second.folder.manifest, (0, 0))
+    monkeypatch.setenv("LC_ALL", "de_DE.UTF-8")
+    write_documents(second, second.folder)
+    for name in DOCUMENTS:
+        assert (tmp_path / name).read_bytes() == (second.folder.root / name).read_bytes()
     front, body = card_of(dataset)
     assert dataset.folder.card.read_text().endswith(f"---\n{body}")
     assert front["license"] == "other"
@@ -305,20 +310,6 @@ def test_the_example_of_the_card_runs_as_it_stands(tmp_path: Path, profiles: lis
     assert printed.getvalue().split("\n")[:-1] == [line for each in lines for line in each]
 
 
-@pytest.mark.usefixtures("bare_reports")
-def test_equal_datasets_have_equal_documents(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    """Neither place, clock nor language is in them; of the report's figures see test_report."""
-    first, second = five_scenes(tmp_path / "a"), five_scenes(tmp_path / "other" / "b")
-    write_documents(first, first.folder)
-    os.utime(second.folder.manifest, (0, 0))
-    monkeypatch.setenv("LC_ALL", "de_DE.UTF-8")
-    write_documents(second, second.folder)
-    for name in DOCUMENTS:
-        assert (first.folder.root / name).read_bytes() == (second.folder.root / name).read_bytes()
-
-
 HOSTILE = (
     "x\n---\nlicense: mit\n---\n# mine",
     '"; - evil: [1',
@@ -329,7 +320,7 @@ HOSTILE = (
 )
 
 
-def test_text_from_outside_stays_text_in_its_line_its_code_span_and_its_yaml(
+def test_text_from_outside_stays_text_in_its_line_its_code_span_its_yaml_and_its_json(
     tmp_path: Path,
 ) -> None:
     for escape in (text, code):
@@ -341,6 +332,9 @@ def test_text_from_outside_stays_text_in_its_line_its_code_span_and_its_yaml(
     }  # fmt: skip
     assert yaml.safe_load(front_matter(values).strip("-")) == values
     dataset = five_scenes(tmp_path)
+    for licence in ('"}, {', "x\n\ud800", "LicenseRef-a"):
+        document = json.loads(encode_croissant(dataset.manifest, [licence]))
+        assert document["license"] == [licence]
     lock, settings = dataset.folder.objects_lock, dataset.manifest.settings
     objects = read_objects_lock(lock)
     for value in HOSTILE:
@@ -385,39 +379,21 @@ def test_the_validator_has_no_error_and_every_shard_and_scene_is_found(tmp_path:
     assert not mlcroissant.Dataset(jsonld=str(path)).metadata.ctx.issues.errors
 
 
-@pytest.mark.parametrize("licence", ['"}, {', "x\n\ud800", "LicenseRef-a"])
-def test_it_is_json_whatever_the_licences_are_called(tmp_path: Path, licence: str) -> None:
-    dataset = five_scenes(tmp_path)
-    document = json.loads(encode_croissant(dataset.manifest, [licence]))
-    assert document["license"] == [licence]
-
-
-@pytest.fixture
-def eleven(tmp_path: Path) -> Dataset:
-    """Return 11 shards of one scene each, one of them for testing."""
+@pytest.mark.usefixtures("bare_reports")
+def test_described_shards_are_spread_over_each_split_and_documents_of_a_sample_say_so(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Eleven shards of one scene each, one of them for testing."""
     shards = {f"train-{row:06d}.tar": [sample(row, tiny_scene())] for row in range(10)}
     shards["test-000010.tar"] = [sample(10, tiny_scene())]
-    return write_dataset(tmp_path / "set", shards)
-
-
-def test_shards_are_spread_over_each_split(
-    eleven: Dataset, monkeypatch: pytest.MonkeyPatch
-) -> None:
+    eleven = write_dataset(tmp_path / "set", shards)
     monkeypatch.setattr("storage.dataset.statistics.MOST_SCENES", 11)
     assert described_shards(eleven) == list(eleven.manifest.shards)
-    monkeypatch.setattr("storage.dataset.statistics.MOST_SCENES", 4)
-    names = [shard.name for shard in described_shards(eleven)]
-    assert names == ["test-000010.tar", *(f"train-{row:06d}.tar" for row in (0, 3, 6, 9))]
-
-
-@pytest.mark.usefixtures("bare_reports")
-def test_documents_of_a_sample_say_so(
-    eleven: Dataset, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    mlcroissant = pytest.importorskip("mlcroissant", reason="run make setup-all")
     whole = dataset_statistics(eleven)
     assert whole.scene_digest and "what follows is" not in dict(whole.lines())
     monkeypatch.setattr("storage.dataset.statistics.MOST_SCENES", 4)
+    names = [shard.name for shard in described_shards(eleven)]
+    assert names == ["test-000010.tar", *(f"train-{row:06d}.tar" for row in (0, 3, 6, 9))]
     monkeypatch.setattr(dataset_documents, "MOST_LISTED", 3)
     out = DatasetFolder(tmp_path / "documents")
     out.root.mkdir()
@@ -429,6 +405,7 @@ def test_documents_of_a_sample_say_so(
     assert f"Views, errors and contents are those {said}." in out.card.read_text()
     assert said in out.report.read_text()
     assert dataset_distributions(eleven).sample == said
+    mlcroissant = pytest.importorskip("mlcroissant", reason="run make setup-all")
     record = json.loads(out.croissant.read_bytes())
     assert "train-000000.tar" not in json.dumps(record)  # 250,000 of them would take 200 MB
     assert not mlcroissant.Dataset(jsonld=str(out.croissant)).metadata.issues.errors

@@ -99,18 +99,6 @@ def test_text_from_outside_stays_text(tmp_path: Path) -> None:
     assert "javascript:alert(3)" in text_of(shown[tmp_path / "report" / "000000000.html"])
 
 
-@pytest.mark.usefixtures("bare_reports")
-def test_only_source_addresses_lead_elsewhere(tmp_path: Path) -> None:
-    address = 'https://example.org/a?b=1&c="x"'
-    scene = furnished(["a"], source_url=address, attribution="somebody")
-    dataset = write_dataset(tmp_path, {"test-000000.tar": [sample(0, scene)]})
-    shown = pages(report_of(dataset))
-    page = shown[tmp_path / "report" / "000000000.html"]
-    assert [link for link in page.links if urlsplit(link).scheme not in ("", "data")] == [address]
-    assert not [link for link in shown[tmp_path / "report.html"].links if "//" in link[:12]]
-    assert "somebody" in text_of(page)
-
-
 def test_links_lead_somewhere_in_the_order_of_the_gallery(
     dataset: Dataset, five: dict[str, Tags]
 ) -> None:
@@ -178,12 +166,17 @@ def test_the_report_says_which_objects_keep_their_materials(tmp_path: Path) -> N
 
 
 @pytest.mark.usefixtures("bare_reports")
-def test_one_scene_or_none_at_all(tmp_path: Path) -> None:
-    dataset = write_dataset(tmp_path, {"validation-000002.tar": [sample(9, furnished([]))]})
+def test_one_scene_or_none_at_all_and_only_source_addresses_lead_elsewhere(tmp_path: Path) -> None:
+    address = 'https://example.org/a?b=1&c="x"'
+    scene = furnished(["a"], source_url=address, attribution="somebody")
+    dataset = write_dataset(tmp_path, {"validation-000002.tar": [sample(9, scene)]})
     shown = pages(report_of(dataset))
     page = shown[tmp_path / "report" / "000000009.html"]
     assert page.links[0] == "../report.html#gallery" and "before" not in text_of(page)
     assert "1 of 1 scenes" in text_of(shown[tmp_path / "report.html"])
+    assert [link for link in page.links if urlsplit(link).scheme not in ("", "data")] == [address]
+    assert not [link for link in shown[tmp_path / "report.html"].links if "//" in link[:12]]
+    assert "somebody" in text_of(page)
     shown = pages(report_of(write_dataset(tmp_path / "none", {})))
     assert "scenes 0 (none)" in text_of(shown[tmp_path / "none" / "report.html"])
 

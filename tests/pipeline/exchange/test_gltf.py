@@ -145,16 +145,13 @@ def test_what_is_lost_is_said_once(tmp_path: Path) -> None:
     assert pictures and files.files == (tmp_path / "a.usda", *pictures)
 
 
-def test_a_missing_picture_leaves_the_factor(tmp_path: Path) -> None:
+def test_a_missing_picture_leaves_the_factor_and_one_elsewhere_is_refused(tmp_path: Path) -> None:
     found = read(tmp_path, "gone.png")
     assert any("left out: 'gone.png'" in text for text in found.notes)
     assert row_at(found.scene, 0.5, 0.5)[:3] == pytest.approx([1 - kit.F] * 3, abs=1e-6)
-
-
-@for_each("uri", ["../a.png", "http://example.com/a.png", "/etc/hostname"])
-def test_pictures_elsewhere_are_refused(tmp_path: Path, uri: str) -> None:
-    with pytest.raises(TrilightError, match=r"a\.glb: .*lies (outside|elsewhere)"):
-        read(tmp_path, uri)
+    for uri in ("../a.png", "http://example.com/a.png", "/etc/hostname"):
+        with pytest.raises(TrilightError, match=r"a\.glb: .*lies (outside|elsewhere)"):
+            read(tmp_path, uri)
 
 
 @for_each("value", [float("nan"), "red", -1, 2])
@@ -175,9 +172,7 @@ def test_a_mesh_without_coordinates_takes_the_mean_and_one_texel_is_a_constant(
     one = read(tmp_path, kit.picture_bytes(PICTURE[:1, 1:])).scene
     assert not one.textures
     assert one.materials[0, :3] == pytest.approx(kit.shown(GREEN), abs=1e-6)
-
-
-def test_coordinates_that_are_not_finite_are_refused(tmp_path: Path) -> None:
+    # Coordinates that are not finite are refused.
     broken = kit.UV_UP.copy()
     broken[0, 0] = np.nan
     with pytest.raises(TrilightError, match="TEXCOORD_0 is not finite"):
@@ -194,10 +189,9 @@ def test_a_scene_comes_back(tmp_path: Path, specular: tuple[float, float, float]
     assert found.num_triangles == scene.num_triangles
     for name in ("c2w", "fov_deg"):
         np.testing.assert_allclose(getattr(found, name), getattr(scene, name), atol=1e-6)
-    mine, theirs = (each.vertex_positions[each.faces] for each in (scene, found))
-    np.testing.assert_allclose(theirs, mine, atol=1e-6)
-    mine, theirs = (each.vertex_normals[each.faces] for each in (scene, found))
-    np.testing.assert_allclose(theirs, mine, atol=1e-6)
+    for name in ("vertex_positions", "vertex_normals"):
+        mine, theirs = (getattr(each, name)[each.faces] for each in (scene, found))
+        np.testing.assert_allclose(theirs, mine, atol=1e-6)
     rows = found.materials[found.material_index]
     np.testing.assert_allclose(rows, scene.materials[scene.material_index], rtol=1e-5, atol=1e-5)
     assert [entry.name for entry in found.objects] == ["floor", "light"]

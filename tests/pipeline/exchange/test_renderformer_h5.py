@@ -1,9 +1,7 @@
 """The published HDF5 layouts: what is written and comes back; and hostile files."""
 
 import dataclasses
-import resource
 import shutil
-import subprocess
 import sys
 import zlib
 from collections.abc import Callable
@@ -29,7 +27,7 @@ from storage.records.lookup import environment_values, textured_rows
 from storage.records.material import EMISSION
 from storage.records.scene import Scene
 from storage.records.texture import Texture
-from tests.conftest import ROOT
+from tests.command_line import run_program
 from tests.for_each import case, for_each, with_folders
 from tests.pipeline.exchange.exchange_kit import assert_h5_keeps_light, row_at
 from tests.scenes_by_hand import LIGHT, tiny_sample, tiny_scene
@@ -183,8 +181,11 @@ def test_other_packings_are_read(path: Path, packing: dict[str, object]) -> None
     assert after == pytest.approx(before, abs=2**-11)  # one step of a half float below 1
 
 
-def test_a_ramp_has_the_means_of_its_cells() -> None:
-    """u is the weight of the first vertex and v that of the second: cell (x, y) is their middle."""
+def test_a_ramp_has_the_means_of_its_cells_and_a_fine_checker_is_grey_in_each() -> None:
+    """u is the weight of the first vertex and v that of the second: cell (x, y) is their middle.
+
+    Of a checker samples at the middle would be black or white.
+    """
     ramp = (np.arange(256, dtype=np.float32) + 0.5) / 256 / 2
     along = np.broadcast_to(ramp[None, :, None], (256, 256, 3)).astype(np.float32)
     rough = np.broadcast_to(ramp[:, None, None], (256, 256, 1)).astype(np.float32)
@@ -198,16 +199,11 @@ def test_a_ramp_has_the_means_of_its_cells() -> None:
         middle = (0.01 + 0.97 * (place + 0.5) / CELLS) / 2
         assert found[whole] == pytest.approx(middle[whole], abs=1e-4)
     assert (diffuse[:, ~FILLED_CELLS] == 0).all()
-
-
-def test_a_fine_checker_is_grey_in_every_cell() -> None:
-    """A mean over the area: samples at the middle would be black or white."""
     checker = (np.indices((64, 64)).sum(axis=0) % 2).astype(np.float32)
     texels = np.repeat(0.8 * checker[..., None], 3, axis=-1)
     scene = textured_scene(0, Texture(texels=texels), number_texture())
     corners = np.array([[4, 0], [0, 4], [0, 0]], np.float32)  # 8 texels a cell
     scene = dataclasses.replace(scene, uv=np.tile(corners, (3, 1)))
-    x, y = np.meshgrid(np.arange(CELLS), np.arange(CELLS))
     assert compute_cells(scene, 0)[0][1][0][x + y < CELLS - 1] == pytest.approx(0.4, abs=0.01)
 
 
@@ -287,23 +283,20 @@ def test_geometry_lights_and_cameras_are_read_and_the_code_is_not(tmp_path: Path
     assert "learned code" in note and "gray of 0.5" in note
 
 
-@pytest.mark.parametrize("processed", [True, False])
-def test_its_environment_has_our_axes(tmp_path: Path, processed: bool) -> None:
+def test_its_environment_has_our_axes_a_turn_is_said_and_another_shape_refused(
+    tmp_path: Path,
+) -> None:
     """Raw ones are scaled by their strength; either may be the only light."""
     radiance = six_poles().radiance_rgb
-    more: dict[str, Any] = {"env_map": np.moveaxis(radiance, -1, 0) if processed else radiance / 2}
-    if not processed:
-        more |= {"env_map_strength": np.array(2, np.float32), "env_map_rotation": np.zeros(3, "f4")}
-    write_v2(tmp_path / "a.h5", lit=False, **more)
-    sky = read_renderformer_h5(tmp_path / "a.h5").scene.environment
-    assert sky is not None and not sky.is_seen
-    for name, direction in POLES.items():
-        assert environment_values(sky, direction) == pytest.approx(COLOURS[name]), name
-
-
-def test_a_turned_environment_is_said_and_another_shape_refused(tmp_path: Path) -> None:
+    raw = {"env_map_strength": np.array(2, np.float32), "env_map_rotation": np.zeros(3, "f4")}
+    for more in ({"env_map": np.moveaxis(radiance, -1, 0)}, {"env_map": radiance / 2, **raw}):
+        write_v2(tmp_path / "a.h5", lit=False, **more)
+        sky = read_renderformer_h5(tmp_path / "a.h5").scene.environment
+        assert sky is not None and not sky.is_seen
+        for name, direction in POLES.items():
+            assert environment_values(sky, direction) == pytest.approx(COLOURS[name]), name
     turn = np.array([0, 0, 90], "f4")
-    write_v2(tmp_path / "a.h5", env_map=six_poles().radiance_rgb, env_map_rotation=turn)
+    write_v2(tmp_path / "a.h5", env_map=radiance, env_map_rotation=turn)
     assert any("rotation of the" in text for text in read_renderformer_h5(tmp_path / "a.h5").notes)
     write_v2(tmp_path / "a.h5", env_map=np.ones((4, 8), np.float32))
     with pytest.raises(TrilightError, match=r"env_map: has shape \[4, 8\]; expected"):
@@ -420,20 +413,38 @@ def test_hostile_arrays_are_refused(path: Path) -> None:
             read_renderformer_h5(hostile)
 
 
-def test_a_normal_of_a_face_without_area_cannot_be_made(path: Path) -> None:
+def test_a_normal_of_a_face_without_area_and_a_file_that_is_cut_are_refused(path: Path) -> None:
     with h5py.File(path, "r+") as file:
         file["vn"][1] = 0
         file["triangles"][1] = 1
     with pytest.raises(TrilightError, match=r"vn\[1\] is zero"):
         read_renderformer_h5(path)
-
-
-def test_a_file_that_is_cut_is_refused(path: Path) -> None:
     whole = path.read_bytes()
     for keep in (0, 7, 100, 2000, -500):
         path.write_bytes(whole[:keep])
         with pytest.raises(TrilightError, match=r"a\.h5"):
             read_renderformer_h5(path)
+
+
+AUDITED = """
+import resource, sys, pathlib
+resource.setrlimit(resource.RLIMIT_AS, (2 << 30, 2 << 30))
+import h5py, h5py.h5ds, numpy
+from pipeline.exchange.renderformer_h5 import read_renderformer_h5
+from storage.errors import TrilightError
+good, *names = map(pathlib.Path, sys.argv[1:])
+read_renderformer_h5(good)
+bad = ("os.system", "subprocess.Popen", "os.exec", "exec", "import", "ctypes.dlopen")
+seen = []
+sys.addaudithook(lambda event, args: seen.append(event) if event in bad else None)
+for name in names:
+    try:
+        read_renderformer_h5(name)
+    except TrilightError:
+        continue
+    raise SystemExit(f"{name} was read")
+assert not seen, seen
+"""
 
 
 def test_nothing_runs_and_little_memory_is_taken(path: Path) -> None:
@@ -449,27 +460,4 @@ def test_nothing_runs_and_little_memory_is_taken(path: Path) -> None:
             del file["triangles"]
             HOSTILE[name][0](file)
         files.append(str(hostile))
-    code = (
-        "import sys, pathlib\n"
-        "import h5py, h5py.h5ds, numpy\n"
-        "from pipeline.exchange.renderformer_h5 import read_renderformer_h5\n"
-        "from storage.errors import TrilightError\n"
-        f"read_renderformer_h5(pathlib.Path({str(path)!r}))\n"
-        "bad = ('os.system', 'subprocess.Popen', 'os.exec', 'exec', 'import', 'ctypes.dlopen')\n"
-        "seen = []\n"
-        "sys.addaudithook(lambda event, args: seen.append(event) if event in bad else None)\n"
-        "for name in sys.argv[1:]:\n"
-        "    try:\n"
-        "        read_renderformer_h5(pathlib.Path(name))\n"
-        "    except TrilightError:\n"
-        "        continue\n"
-        "    raise SystemExit(name + ' was read')\n"
-        "assert not seen, seen\n"
-    )
-    limit = 2 << 30
-    result = subprocess.run(
-        [sys.executable, "-c", code, *files],
-        cwd=ROOT, capture_output=True, text=True, check=False,
-        preexec_fn=lambda: resource.setrlimit(resource.RLIMIT_AS, (limit, limit)),
-    )  # fmt: skip
-    assert result.returncode == 0, result.stdout + result.stderr
+    run_program([sys.executable, "-c", AUDITED, str(path), *files])

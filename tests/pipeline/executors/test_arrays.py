@@ -30,7 +30,7 @@ from storage.dataset.verify import verify_dataset
 from storage.errors import TrilightError
 from storage.number_ranges import number_ranges, numbers_of
 from tests.command_line import expect_json, trilight
-from tests.for_each import for_each
+from tests.for_each import case
 from tests.pipeline.generation.tiny_scenes_kit import Undocumented, tiny_order, without_rendering
 from tests.pipeline.programs import printed_by
 
@@ -43,7 +43,7 @@ def _array(task: int, first: int, last: int, count: int, **more: str) -> dict[st
 GIVEN = {"TASKS": "0-1,7", "SHARDS_PER_TASK": "4"}
 
 
-def test_the_tasks_of_an_array_have_equal_shares() -> None:
+def test_the_tasks_of_an_array_have_equal_shares_and_are_written_as_ranges() -> None:
     assert [shards_of_task(_array(k, 0, 3, 4), lambda: 10) for k in range(4)] == [
         "0:2", "2:5", "5:7", "7:10",
     ]  # fmt: skip
@@ -59,11 +59,13 @@ def test_the_tasks_of_an_array_have_equal_shares() -> None:
     assert not unknown.called, "nobody needs to know: the dataset need not even be begun"
     shares = [shards_of_place({**GIVEN, PLACE: str(place)}) for place in range(3)]
     assert shares == ["0:4", "4:8", "28:32"], "a place is a task that is missing"
+    for text, numbers in ("", []), ("4", [4]), ("0-3,7", [3, 2, 1, 0, 7, 7]), ("0,2-3", [0, 2, 3]):
+        assert number_ranges(numbers) == text
+        assert numbers_of(text) == sorted(set(numbers))
 
 
-@for_each(
-    ("on", "environment", "message"),
-    [
+def test_what_is_no_array_is_named() -> None:
+    rows: list[tuple[str, dict[str, str], str]] = [
         ("slurm", {}, "SLURM_ARRAY_TASK_ID is not set; expected a task of an array, .* Submit"),
         ("slurm", _array(3, 3, 7, 2, SHARDS_PER_TASK="0"), "SHARDS_PER_TASK is '0'; .* from 1"),
         ("slurm", _array(0, 0, 0, 1) | {"SLURM_ARRAY_TASK_ID": "x"}, "ID is 'x'; .* from 0"),
@@ -76,13 +78,12 @@ def test_the_tasks_of_an_array_have_equal_shares() -> None:
         ("kubernetes", {**GIVEN, PLACE: "0", "SHARDS_PER_TASK": "0"}, "_TASK is '0'; .* from 1"),
         ("kubernetes", {**GIVEN, PLACE: "0", "TASKS": "0,,2"}, "TASKS is '0,,2'; expected numbers"),
         ("kubernetes", {**GIVEN, PLACE: "0", "TASKS": "0-999999999"}, "at most 100000"),
-    ],
-)
-def test_what_is_no_array_is_named(on: str, environment: dict[str, str], message: str) -> None:
-    with pytest.raises(TrilightError, match=f"--runner {on}: .*{message}"):
-        if on == "slurm":
-            shards_of_task(environment, lambda: 8)
-        shards_of_place(environment)
+    ]
+    for on, environment, message in rows:
+        with case(message), pytest.raises(TrilightError, match=f"--runner {on}: .*{message}"):
+            if on == "slurm":
+                shards_of_task(environment, lambda: 8)
+            shards_of_place(environment)
 
 
 def test_an_array_makes_the_dataset_that_one_process_makes(
@@ -130,15 +131,6 @@ def cluster(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     monkeypatch.setenv("FAKE_SBATCH", str(tmp_path / "asked"))
     monkeypatch.chdir(tmp_path)
     return tmp_path
-
-
-@for_each(
-    ("numbers", "text"),
-    [((), ""), ((4,), "4"), ((3, 2, 1, 0, 7, 7), "0-3,7"), ((0, 2, 3), "0,2-3")],
-)
-def test_ranges(numbers: tuple[int, ...], text: str) -> None:
-    assert number_ranges(numbers) == text
-    assert numbers_of(text) == sorted(set(numbers))
 
 
 def test_an_array_fits_the_cluster_and_covers_every_shard_of_what_was_ordered(
@@ -202,22 +194,18 @@ def test_tasks_that_died_are_all_that_is_submitted_again(
     assert trilight(["status", order.place, "--missing"]).stdout == ""
 
 
-@for_each(
-    ("given", "per_task", "message"),
-    [
+def test_what_no_array_can_make_is_refused_and_no_password_reaches_the_queue(cluster: Path) -> None:
+    rows: list[tuple[dict[str, Any], int | None, str]] = [
         ({"objects": "http://ada:secret@host/objects/"}, None, "holds a password"),
         ({"shards": "0:1"}, None, "submit slurm: expected no"),
         ({"scenes_from": "folder"}, None, "submit slurm: expected no"),
         ({"build": "pretrain-256", "scenes": 2_000_000}, 1,
          "shards-per-task is 1: .* task 7812; .* 8 shards"),
-    ],
-)  # fmt: skip
-def test_what_no_array_can_make_is_refused_and_no_password_reaches_the_queue(
-    cluster: Path, given: dict[str, Any], per_task: int | None, message: str
-) -> None:
-    with pytest.raises(TrilightError, match=message) as refused:
-        array_job(GenerateOptions(**given), per_task=per_task, at_once=None)
-    assert "secret" not in str(refused.value)
+    ]  # fmt: skip
+    for given, per_task, message in rows:
+        with case(given), pytest.raises(TrilightError, match=message) as refused:
+            array_job(GenerateOptions(**given), per_task=per_task, at_once=None)
+        assert "secret" not in str(refused.value)
 
 
 def test_refusals(cluster: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -297,7 +285,12 @@ def _manifest(missing: list[int] = MISSING, **options: Any) -> dict[str, Any]:
     return job_manifest(job, KubernetesOptions(**{"image": IMAGE, **options}))
 
 
-def test_every_place_makes_what_is_missing_and_nothing_else() -> None:
+def test_every_place_makes_what_is_missing_and_nothing_else_and_needs_an_image(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    monkeypatch.delenv("TRILIGHT_IMAGE", raising=False)
+    with pytest.raises(TrilightError, match="submit kubernetes: --image is not given"):
+        _manifest(image=None)
     manifest = _manifest()
     spec = manifest["spec"]
     (container,) = spec["template"]["spec"]["containers"]
@@ -314,7 +307,9 @@ def test_every_place_makes_what_is_missing_and_nothing_else() -> None:
     assert _manifest([0])["metadata"]["name"] != manifest["metadata"]["name"]
 
 
-def test_kubernetes_takes_the_job() -> None:
+def test_kubernetes_takes_the_job_and_gives_its_pod_the_rights_of_others() -> None:
+    from tests.infra.setup.manifests_kit import job_template
+
     schemas = pytest.importorskip("kubernetes_validate", reason="make setup-all")
     manifest = _manifest(account="trilight-flow", machine_type="c7i.2xlarge", tries=4)
     schemas.validate(manifest, "1.37", strict=True)
@@ -329,13 +324,8 @@ def test_kubernetes_takes_the_job() -> None:
     assert [rule["action"] for rule in rules] == ["Ignore", "FailIndex"]
     assert rules[1]["onExitCodes"]["containerName"] == container["name"]
     assert manifest["metadata"]["namespace"] == "trilight"
-
-
-def test_the_pod_has_the_rights_of_the_other_manifests() -> None:
-    from tests.infra.setup.manifests_kit import job_template
-
-    manifest = job_template()["job_configuration"]["job_manifest"]
-    theirs = manifest["spec"]["template"]["spec"]
+    # Its pod has the rights of the other manifests.
+    theirs = job_template()["job_configuration"]["job_manifest"]["spec"]["template"]["spec"]
     pod = _manifest()["spec"]["template"]["spec"]
     (ours,), (other,) = pod["containers"], theirs["containers"]
     assert pod["securityContext"] == theirs["securityContext"]
@@ -346,25 +336,18 @@ def test_the_pod_has_the_rights_of_the_other_manifests() -> None:
     assert not pod["automountServiceAccountToken"]
 
 
-def test_an_image_is_needed(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.delenv("TRILIGHT_IMAGE", raising=False)
-    with pytest.raises(TrilightError, match="submit kubernetes: --image is not given"):
-        _manifest(image=None)
-
-
-@for_each(
-    ("asked", "message"),
-    [
+def test_files_of_this_machine_are_refused() -> None:
+    rows: list[tuple[dict[str, str], str]] = [
         ({"out": "data/mine"}, "--out is data/mine; expected a bucket"),
         ({"objects": "chairs"}, "--objects is chairs, a folder of this machine"),
         ({"objects": "builtin:", "skies": "file:///skies"}, "--skies is file:///skies, a folder"),
         ({"build": "mine.py:sunsets"}, "mine.py:sunsets, a file of this machine"),
-    ],
-)
-def test_files_of_this_machine_are_refused(asked: dict[str, str], message: str) -> None:
-    given: dict[str, Any] = {"scenes": 8, "out": "gs://sets/mine", **asked}
-    order = GenerateOptions(**given | {"build": "smoke"})
-    object.__setattr__(order, "build", asked.get("build", "smoke"))  # --extend has loaded it
-    job = ArrayJob(options=order, tasks=[0], per_task=1, at_once=1)
-    with pytest.raises(TrilightError, match=f"submit kubernetes: .*{message}"):
-        job_manifest(job, KubernetesOptions(image=IMAGE))
+    ]
+    for asked, message in rows:
+        given: dict[str, Any] = {"scenes": 8, "out": "gs://sets/mine", **asked}
+        order = GenerateOptions(**given | {"build": "smoke"})
+        object.__setattr__(order, "build", asked.get("build", "smoke"))  # --extend has loaded it
+        job = ArrayJob(options=order, tasks=[0], per_task=1, at_once=1)
+        said = f"submit kubernetes: .*{message}"
+        with case(asked), pytest.raises(TrilightError, match=said):
+            job_manifest(job, KubernetesOptions(image=IMAGE))

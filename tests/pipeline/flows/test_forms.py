@@ -52,7 +52,7 @@ from pipeline.generation.generation_run import TaskResult, shard_ranges
 from pipeline.presets.settings import DatasetSettings
 from storage.dataset.progress import read_status
 from storage.errors import EnvironmentFailure, TrilightError
-from tests.for_each import for_each
+from tests.for_each import case, for_each
 from tests.pipeline.generation.tiny_scenes_kit import Undocumented, tiny_order, without_rendering
 
 CANARY = "CANARY-7f3a"
@@ -112,9 +112,8 @@ def test_changes_become_dotted_names() -> None:
     assert options_of_form(_parameters(), GenerateOptions) == GenerateOptions()
 
 
-@for_each(
-    ("parameters", "message"),
-    [
+def test_wrong_values_are_refused_by_name() -> None:
+    rows: list[tuple[dict[str, Any], str]] = [
         ({"build": "nonsense"}, "build"),
         ({"scenes": "many"}, "scenes"),
         ({"scenes": 0}, "scenes"),
@@ -124,30 +123,26 @@ def test_changes_become_dotted_names() -> None:
         ),
         ({"changes": {"renders": {"most_spp": 4}}}, "changes.renders.most_spp"),
         ({"changes": {"renders": {"denoiser": "best"}}}, "changes.renders.denoiser"),
-    ],
-)
-def test_wrong_values_are_refused_by_name(parameters: dict[str, Any], message: str) -> None:
-    with pytest.raises(ParameterTypeError, match=message):
-        generate_scenes.validate_parameters(parameters)
+    ]
+    for parameters, message in rows:
+        with case(parameters), pytest.raises(ParameterTypeError, match=message):
+            generate_scenes.validate_parameters(parameters)
 
 
-@for_each(
-    "source",
-    [
+def test_secrets_are_refused_before_a_run_exists() -> None:
+    """The server checks the same schema when a run is made, so that it never stores one."""
+    for source in (
         f"https://user:{CANARY}@host/folder",
         f"https://host/folder?token={CANARY}",
         "env:PATH",
         "env:AWS_SECRET_ACCESS_KEY",
         "env:TRILIGHT_SOURCE_A/x",
-    ],
-)
-def test_secrets_are_refused_before_a_run_exists(source: str) -> None:
-    """The server checks the same schema when a run is made, so that it never stores one."""
-    with pytest.raises(ParameterTypeError, match="objects"):
-        generate_scenes.validate_parameters({"objects": source})
-    for parameter, given in (("data", [source]), ("begin_with", source), ("lpips", source)):
-        with pytest.raises(ParameterTypeError, match=parameter):
-            train_model.validate_parameters({parameter: given})
+    ):
+        with case(source), pytest.raises(ParameterTypeError, match="objects"):
+            generate_scenes.validate_parameters({"objects": source})
+        for parameter, given in (("data", [source]), ("begin_with", source), ("lpips", source)):
+            with case(source), pytest.raises(ParameterTypeError, match=parameter):
+                train_model.validate_parameters({parameter: given})
     known = (
         "builtin:500",
         "procedural:5",
@@ -202,22 +197,18 @@ def test_so_many_flow_runs_are_so_many_in_all(monkeypatch: pytest.MonkeyPatch) -
     assert shard_ranges(2, 5) == ["0:1", "1:2"], "no more ranges than shards"
 
 
-@for_each(
-    ("kind", "given", "message"),
-    [
+def test_numbers_of_runs_and_places_that_cannot_be_are_named() -> None:
+    """Before anything is begun: a flow makes its order first."""
+    rows: list[tuple[type, dict[str, Any], str]] = [
         (DatasetInRuns, {"flow_runs": 0}, "flow_runs is 0; expected a whole number from 1"),
         (DatasetInRuns, {"flow_runs": 10**6}, "flow_runs is 1000000"),
         (DatasetInRuns, {"shards": "0:2"}, "shards is '0:2'; expected no range"),
         *((GenerateOptions, {"out": out}, f"^out '{out}'")
           for out in ("https://host/set", "hf://datasets/ada/set", "ftp://host/set")),
-    ],
-)  # fmt: skip
-def test_numbers_of_runs_and_places_that_cannot_be_are_named(
-    kind: type, given: dict[str, Any], message: str
-) -> None:
-    """Before anything is begun: a flow makes its order first."""
-    with pytest.raises(TrilightError, match=message):
-        options_of_form(_parameters(kind, **given), kind)
+    ]  # fmt: skip
+    for kind, given, message in rows:
+        with case(given), pytest.raises(TrilightError, match=message):
+            options_of_form(_parameters(kind, **given), kind)
 
 
 @for_each(("device", "held"), [("gpu", [1]), ("cpu", [])])
@@ -242,17 +233,16 @@ def test_rendering_on_a_gpu_takes_its_limit(
     assert submit(pieces, job) == (job, pieces, held)
 
 
-def test_a_dask_worker_that_sees_another_folder_is_named_before_any_work(tmp_path: Path) -> None:
-    """There are two workers, of which the second is on another machine."""
+def test_a_dask_worker_that_sees_another_folder_and_a_silent_scheduler_are_named(
+    tmp_path: Path,
+) -> None:
+    """Before any work; there are two workers, of which the second is on another machine."""
     order = GenerateOptions(out=str(tmp_path / "set"))
     client: Any = Mock()
     client.run = lambda look, *more: {"tcp://a:1": look(*more), "tcp://b:1": False}
     with pytest.raises(TrilightError, match="1 of 2 Dask workers do not see.*such as tcp://b:1"):
         flow_executors._require_shared(client, order)
     assert list((tmp_path / "set" / ".staging").iterdir()) == []
-
-
-def test_a_dask_scheduler_that_does_not_answer_is_named() -> None:
     pytest.importorskip("distributed", reason="needs the package distributed (setup-all)")
     said = "--address http://127.0.0.1:1: no Dask scheduler"
     with pytest.raises(TrilightError, match=said), flow_executors._client("http://127.0.0.1:1"):

@@ -40,6 +40,7 @@ from pipeline.flows.submission import (
 from pipeline.generation.generate_options import GenerateOptions
 from storage.cache import open_private, private_folder
 from storage.errors import TrilightError
+from tests.command_line import run_program
 from tests.for_each import case, for_each
 from tests.http_server import serve
 
@@ -129,7 +130,7 @@ def test_a_run_is_looked_at_until_it_has_ended_and_one_that_failed_is_no_success
     assert (state.is_completed(), state.message) == (False, "no space")
 
 
-def test_no_server_a_closed_port_and_a_password() -> None:
+def test_no_server_a_closed_port_and_a_password_without_which_none_begins() -> None:
     with temporary_settings(restore_defaults={PREFECT_API_URL}):
         with pytest.raises(TrilightError, match="no Prefect server is set.*make serve"), server():
             pass
@@ -137,6 +138,9 @@ def test_no_server_a_closed_port_and_a_password() -> None:
     with pytest.raises(TrilightError, match="it requires a password.*PREFECT_API_AUTH_STRING"):
         with name_prefect_failures():
             httpx.Response(401, request=request).raise_for_status()
+    words = [sys.executable, "-m", "pipeline.flows.guarded_server", "--port", "1"]
+    done = run_program(words, status=1, env={"PATH": "/usr/bin:/bin"}, timeout=60)
+    assert "PREFECT_SERVER_API_AUTH_STRING is not set; expected USER:PASSWORD" in done.stderr
 
 
 def test_what_is_no_prefect_is_said_in_one_sentence_by_every_runner(
@@ -254,16 +258,6 @@ def test_half_requests_are_closed_and_slow_answers_are_not(monkeypatch: pytest.M
     finally:
         served.should_exit = True
         thread.join(20)
-
-
-def test_without_a_password_there_is_no_server() -> None:
-    done = subprocess.run(
-        [sys.executable, "-m", "pipeline.flows.guarded_server", "--port", "1"],
-        env={"PATH": "/usr/bin:/bin"}, cwd=Path(__file__).parents[3],
-        capture_output=True, text=True, check=False, timeout=60,
-    )  # fmt: skip
-    assert done.returncode == 1
-    assert "PREFECT_SERVER_API_AUTH_STRING is not set; expected USER:PASSWORD" in done.stderr
 
 
 def test_what_is_private_is_so_from_the_first_byte(tmp_path: Path) -> None:

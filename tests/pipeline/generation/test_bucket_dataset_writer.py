@@ -98,20 +98,6 @@ def test_an_old_list_that_arrives_late_is_mended(
     assert verify_dataset(OUT).problems == []
 
 
-def test_other_objects_and_other_settings_are_refused(bucket: Any, machines: Machines) -> None:
-    with machines.maker("a") as first, machines.maker("b") as second:
-        machines.use("a")
-        first.lock_objects([LOCKED])
-        machines.use("b")
-        with pytest.raises(TrilightError, match=rf"{OUT}: another worker has frozen other objects"):
-            second.lock_objects([dataclasses.replace(LOCKED, uid="b")])
-        second.lock_objects([LOCKED])
-    changed = {"renders.resolution": 32}
-    refusal = rf"{OUT}: this dataset was begun with another setting"
-    with pytest.raises(TrilightError, match=refusal), machines.maker("c", **changed):
-        pass
-
-
 def test_scenes_that_wait_are_kept_for_their_dataset_only(bucket: Any, machines: Machines) -> None:
     with machines.maker("a") as writer:
         make(writer)
@@ -137,10 +123,17 @@ def test_a_shard_that_was_deleted_is_made_again(bucket: Any, machines: Machines)
     assert verify_dataset(OUT).problems == []
 
 
-def test_a_shard_is_listed_only_when_it_is_in_the_bucket(bucket: Any, machines: Machines) -> None:
+def test_a_shard_that_is_sent_need_not_be_fetched_and_one_is_listed_only_in_the_bucket(
+    bucket: Any, machines: Machines, monkeypatch: pytest.MonkeyPatch
+) -> None:
     """A thread, or another process of this machine, packs it while somebody publishes."""
     with machines.maker("a") as writer:
         make(writer, 0)
+        assert not writer.folder.shard(FIRST).exists()
+        with monkeypatch.context() as patch:
+            patch.setattr("storage.remote.shard_cache.download", None)
+            dataset = open_dataset(OUT)
+            assert len(list(dataset.read_shard(dataset.manifest.shards[0]))) == 4
         folder, profile = writer.folder, _build().storage.profile
         for index in range(4, 8):
             stage_scene(folder.staged_shard(SECOND), index, _sample(index), [], profile)
@@ -161,21 +154,6 @@ def test_a_larger_wish_of_one_maker_is_known_to_all(bucket: Any, machines: Machi
             assert first.manifest.num_scenes == 8
     with machines.maker("c", 4) as third:
         assert third.num_shards == 2
-
-
-def test_a_sent_shard_need_not_be_fetched(
-    bucket: Any, machines: Machines, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    with machines.maker("a") as writer:
-        make(writer, 0)
-        assert not writer.folder.shard(FIRST).exists()
-
-        def never(*arguments: Any) -> None:
-            raise AssertionError("fetched")
-
-        monkeypatch.setattr("storage.remote.shard_cache.download", never)
-        dataset = open_dataset(OUT)
-        assert len(list(dataset.read_shard(dataset.manifest.shards[0]))) == 4
 
 
 def test_access_that_is_lost_in_the_middle_loses_nothing(
@@ -232,14 +210,16 @@ def test_who_freezes_late_takes_nothing_back(bucket: Any, machines: Machines) ->
         assert set(rejected) < set(open_dataset(OUT).failures())
 
 
-def test_the_first_writer_of_a_shard_wins_with_its_rejections(
+def test_other_objects_and_settings_are_refused_and_the_first_writer_of_a_shard_wins(
     bucket: Any, machines: Machines
 ) -> None:
-    """Also where the second has made other bytes, as another processor may."""
+    """With its rejections, and where the second has made other bytes, as another processor may."""
     with machines.maker("a") as first, machines.maker("b") as second:
         machines.use("a")
         first.lock_objects([LOCKED])
         machines.use("b")
+        with pytest.raises(TrilightError, match=rf"{OUT}: another worker has frozen other objects"):
+            second.lock_objects([dataclasses.replace(LOCKED, uid="b")])
         second.lock_objects([LOCKED])
         other = other_shard(second)
         machines.use("a")
@@ -254,6 +234,10 @@ def test_the_first_writer_of_a_shard_wins_with_its_rejections(
         assert listed in second.manifest.shards
     assert {row.reason for row in _failures(bucket)} == {"no_camera"}
     assert verify_dataset(OUT).problems == []
+    refusal = rf"{OUT}: this dataset was begun with another setting"
+    changed = {"renders.resolution": 32}
+    with pytest.raises(TrilightError, match=refusal), machines.maker("c", **changed):
+        pass
 
 
 def test_a_shard_whose_maker_died_at_once_gets_the_rejections_of_the_next(
@@ -267,10 +251,10 @@ def test_a_shard_whose_maker_died_at_once_gets_the_rejections_of_the_next(
     assert {row.reason for row in open_dataset(OUT).failures()} == {"other"}
 
 
-def test_a_worker_with_another_cache_is_named(
+def test_a_shard_that_another_machine_has_sent_is_listed_and_a_worker_with_another_cache_named(
     bucket: Any, machines: Machines, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """It has packed a shard that is neither here nor in the bucket."""
+    """The latter has packed a shard that is neither here nor in the bucket."""
     monkeypatch.setattr(dataset_writer.time, "sleep", lambda seconds: None)
     elsewhere = _dataset(tmp_path / "elsewhere").manifest.shards[1]
     with machines.maker("a") as writer:
@@ -278,11 +262,6 @@ def test_a_worker_with_another_cache_is_named(
         with pytest.raises(TrilightError, match="folder is not this one.*TRILIGHT_CACHE"):
             writer.add_shard(elsewhere)
         assert open_dataset(OUT).manifest.shards == ()
-
-
-def test_a_shard_that_another_machine_has_sent_is_listed(bucket: Any, machines: Machines) -> None:
-    with machines.maker("a") as writer:
-        writer.lock_objects([LOCKED])
         with machines.maker("b") as worker:
             make_tiny_shard(worker, 0)
             (entry,) = open_dataset(OUT).manifest.shards

@@ -191,16 +191,35 @@ def _make_again(writer: DatasetWriter, samples: list[Sample]) -> None:
     writer.finish()
 
 
-def test_an_object_of_another_split_is_named(tmp_path: Path) -> None:
+def test_an_object_of_another_split_and_share_alike_licences_that_meet_are_named(
+    tmp_path: Path,
+) -> None:
     writer = _dataset(tmp_path, 4)
     writer.folder.objects_lock.unlink()  # objects are frozen once
     writer.lock_objects([dataclasses.replace(LOCKED, split="test")])
     assert verify_dataset(tmp_path).problems == []  # the tiny scenes use no object
-    scene = tiny_scene()
-    used = dataclasses.replace(scene.objects[0], kind="object", uid="a")
-    sample = dataclasses.replace(_sample(0), scene=tiny_scene(objects=(used, *scene.objects[1:])))
+    floor, light = tiny_scene().objects
+    used = dataclasses.replace(floor, kind="object", uid="a")
+    sample = dataclasses.replace(_sample(0), scene=tiny_scene(objects=(used, light)))
     _make_again(writer, [sample] * 4)
     assert "belongs to split test" in verify_dataset(tmp_path).problems[0]
+    licences = ("CC-BY-SA-4.0", "CC-BY-SA-3.0", "CC-BY-SA-3.0")
+    writer.folder.objects_lock.unlink()
+    writer.lock_objects([dataclasses.replace(LOCKED, uid=uid) for uid in "abc"])
+    samples = []
+    for index in range(4):
+        placed = [
+            dataclasses.replace(floor, name=uid, kind="object", uid=uid, licence=licence)
+            for uid, licence in zip("abc", licences, strict=True)
+        ][index % 2 :]
+        objects = (floor, light, *placed)
+        samples.append(dataclasses.replace(_sample(index), scene=tiny_scene(objects=objects)))
+    _make_again(writer, samples)
+    problems = [text for text in verify_dataset(tmp_path).problems if "share-alike" in text]
+    assert [problem.split(":")[1] for problem in problems] == [
+        " sample 000000000", " sample 000000002",
+    ]  # fmt: skip
+    assert "CC-BY-SA-3.0 and CC-BY-SA-4.0 meet" in problems[0]
 
 
 @for_each("name", ["README.md", "LICENSE.md"])
@@ -212,30 +231,6 @@ def test_documents_of_others_are_not_replaced(tmp_path: Path, name: str) -> None
     (tmp_path / "train-000000.tar").write_bytes(b"")
     with pytest.raises(TrilightError, match=r"shards but no manifest\.json"):
         begin_tiny(tmp_path)
-
-
-def test_two_share_alike_licences_in_one_scene_are_named(tmp_path: Path) -> None:
-    writer = _dataset(tmp_path, 4)
-    licences = ("CC-BY-SA-4.0", "CC-BY-SA-3.0", "CC-BY-SA-3.0")
-    rows = [dataclasses.replace(LOCKED, uid=uid) for uid in "abc"]
-    writer.folder.objects_lock.unlink()  # objects are frozen once
-    writer.lock_objects(rows)
-    scene = tiny_scene()
-    floor = scene.objects[0]
-    samples = []
-    for index in range(4):
-        used = [
-            dataclasses.replace(floor, name=uid, kind="object", uid=uid, licence=licence)
-            for uid, licence in zip("abc", licences, strict=True)
-        ][index % 2 :]
-        objects = (*scene.objects, *used)
-        samples.append(dataclasses.replace(_sample(index), scene=tiny_scene(objects=objects)))
-    _make_again(writer, samples)
-    problems = [text for text in verify_dataset(tmp_path).problems if "share-alike" in text]
-    assert [problem.split(":")[1] for problem in problems] == [
-        " sample 000000000", " sample 000000002",
-    ]  # fmt: skip
-    assert "CC-BY-SA-3.0 and CC-BY-SA-4.0 meet" in problems[0]
 
 
 def test_a_shard_in_the_folder_of_a_worker_alone_is_no_shard(
@@ -265,19 +260,16 @@ def _most_entries(root: Path) -> int:
     return max(sum(1 for _ in folder.glob("[a-z0-9]*[0-9].*")) for folder in folders)
 
 
-def test_the_first_shards_stay_where_the_design_has_them() -> None:
-    splits = SplitSettings(scenes_per_shard=4)
-    assert shard_name(0, splits) == "train-000000.tar"
-    assert shard_name(4093, splits) == "test-004093.tar"
-    assert shard_name(4096, splits) == "part-0001/train-004096.tar"
-    assert shard_name(999_999, splits) == "part-0244/train-999999.tar"
-
-
 def test_a_dataset_in_parts_is_whole(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """Shards, rejections and logs move together; reading and verifying find them.
 
     Two files in a folder stand for 4,096: the rule is the same.
     """
+    splits = SplitSettings(scenes_per_shard=4)
+    assert shard_name(0, splits) == "train-000000.tar"
+    assert shard_name(4093, splits) == "test-004093.tar"
+    assert shard_name(4096, splits) == "part-0001/train-004096.tar"
+    assert shard_name(999_999, splits) == "part-0244/train-999999.tar"
     monkeypatch.setattr(layout, "FILES_PER_FOLDER", 2)
     writer = _dataset(tmp_path, scenes=20)
     shards = writer.manifest.shards

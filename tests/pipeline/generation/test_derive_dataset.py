@@ -228,7 +228,10 @@ def test_a_selection_keeps_keys_bytes_and_only_the_rights_of_what_it_holds(tmp_p
     assert "CC-BY-4.0" not in train.folder.attribution.read_text()
 
 
-def test_resharding_divides_each_split_evenly(tmp_path: Path) -> None:
+def test_resharding_divides_each_split_evenly_and_many_shards_stand_in_parts(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Two files in a folder stand for 4,096."""
     a = finished(tmp_path / "a", scenes(0))
     resharded = shards_made(tmp_path / "c", reshard(3), a)
     assert [(s.name, s.num_samples) for s in resharded.manifest.shards] == [
@@ -239,18 +242,12 @@ def test_resharding_divides_each_split_evenly(tmp_path: Path) -> None:
     back = shards_made(tmp_path / "d", reshard(2), tmp_path / "c")
     before = open_dataset(str(a)).manifest.shards
     assert [shard.sha256 for shard in back.manifest.shards] == [each.sha256 for each in before]
-
-
-def test_many_shards_stand_in_parts(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """Two files in a folder stand for 4,096."""
     monkeypatch.setattr(layout, "FILES_PER_FOLDER", 2)
-    of_training = {name: of for name, of in scenes(0).items() if "train" in name}
-    a = finished(tmp_path / "a", of_training)
-    resharded = shards_made(tmp_path / "c", reshard(1), a)
-    assert [shard.name for shard in resharded.manifest.shards[1:4]] == [
+    parts = shards_made(tmp_path / "e", reshard(1), tmp_path / "c")
+    assert [shard.name for shard in parts.manifest.shards[1:4]] == [
         "train-000001.tar", "part-0001/train-000002.tar", "part-0001/train-000003.tar",
     ]  # fmt: skip
-    assert samples_of(resharded) == given(of_training)
+    assert samples_of(parts) == given(scenes(0))
 
 
 def test_rejections_follow_their_scenes(tmp_path: Path) -> None:
@@ -346,10 +343,9 @@ def refused(out: Path, derive: DeriveOptions, *places: Path | str) -> str:
     """Return the message of a refusal that leaves nothing where the dataset would be."""
     with pytest.raises(TrilightError) as caught:
         derive_dataset([str(place) for place in places], derive, out)
-    message = str(caught.value)
-    assert "\n" not in message
+    assert "\n" not in str(caught.value)
     assert not out.exists() and not list(out.parent.glob(".*"))
-    return message
+    return str(caught.value)
 
 
 @for_each("uid, sha256", [("c", "1" * 64), ("x", TEST_OBJECT.asset_sha256)])
@@ -377,21 +373,16 @@ def test_the_same_scene_twice_is_refused(tmp_path: Path) -> None:
     assert "expected each scene once" in refused(tmp_path / "c", MERGE, a, a)
 
 
-@for_each(
-    ("group", "values", "name"),
-    [
-        ("renders", {"resolution": 32}, "renders.resolution is 32; expected 16"),
-        ("renders", {"per_light": True}, "renders.per_light is True; expected False"),
-        ("storage", {"passes": ["object"]}, "storage.passes is ['object']; expected False"),
-    ],
-)
-def test_what_does_not_fit_together_is_named(
-    tmp_path: Path, group: str, values: dict[str, Any], name: str
-) -> None:
-    settings = {**SETTINGS, group: {**SETTINGS.get(group, {}), **values}}
+def test_what_does_not_fit_together_is_named(tmp_path: Path) -> None:
     a = finished(tmp_path / "a", scenes(0))
-    b = finished(tmp_path / "b", scenes(1), settings=settings)
-    assert name in refused(tmp_path / "c", MERGE, a, b)
+    for group, field, value, name in (
+        ("renders", "resolution", 32, "renders.resolution is 32; expected 16"),
+        ("renders", "per_light", True, "renders.per_light is True; expected False"),
+        ("storage", "passes", ["object"], "storage.passes is ['object']; expected False"),
+    ):
+        settings = {**SETTINGS, group: {**SETTINGS.get(group, {}), field: value}}
+        b = finished(tmp_path / field, scenes(1), settings=settings)
+        assert name in refused(tmp_path / "c", MERGE, a, b)
     other = finished(tmp_path / "other", scenes(1), num_views=3)
     assert "number of views is 3; expected 2" in refused(tmp_path / "c", MERGE, a, other)
 
@@ -439,16 +430,6 @@ def test_a_column_that_is_not_declared_here_is_no_damage(tmp_path: Path) -> None
     assert "'coat' is not declared here" in said and "damaged" not in said
 
 
-def test_nothing_is_overwritten_and_nothing_grows(tmp_path: Path) -> None:
-    a, out, derive = finished(tmp_path / "a", scenes(0)), tmp_path / "c", reshard(3)
-    out.mkdir()
-    derive_dataset([str(a)], derive, out)  # an empty folder is no reason to refuse
-    with pytest.raises(TrilightError, match="is there already"):
-        derive_dataset([str(a)], derive, out)
-    with pytest.raises(TrilightError, match=r"made by `trilight shards reshard`.*cannot grow"):
-        begin_tiny(out)
-
-
 KILLED = """
 import sys
 from pathlib import Path
@@ -466,7 +447,9 @@ flow.derive_dataset([sys.argv[1]], derive, Path(sys.argv[2]), progress=stop)
 """
 
 
-def test_a_kill_leaves_no_dataset_and_the_next_run_makes_it(tmp_path: Path) -> None:
+def test_a_kill_leaves_no_dataset_the_next_run_makes_it_and_no_other_changes_it(
+    tmp_path: Path,
+) -> None:
     a, out, derive = finished(tmp_path / "a", scenes(0)), tmp_path / "c", reshard(3)
     run = subprocess.Popen(
         [sys.executable, "-c", KILLED, str(a), str(out)], stdout=subprocess.PIPE, text=True
@@ -479,6 +462,11 @@ def test_a_kill_leaves_no_dataset_and_the_next_run_makes_it(tmp_path: Path) -> N
     assert not out.exists()
     assert list(tmp_path.glob(".c.part/*.tar"))
     (tmp_path / ".c.part" / "train-000009.tar").write_bytes(b"of a larger one")
-    derive_dataset([str(a)], derive, out)
+    out.mkdir()
+    derive_dataset([str(a)], derive, out)  # an empty folder is no reason to refuse
     assert verify_dataset(out).problems == []
     assert sorted(path.name for path in tmp_path.iterdir()) == ["a", "c"]
+    with pytest.raises(TrilightError, match="is there already"):
+        derive_dataset([str(a)], derive, out)
+    with pytest.raises(TrilightError, match=r"made by `trilight shards reshard`.*cannot grow"):
+        begin_tiny(out)

@@ -47,7 +47,9 @@ TRAP = "from pathlib import Path\nPath(__file__).with_suffix('.ran').touch()\n"
 """Leaves a mark when it is imported."""
 
 
-def test_the_manifest_records_what_had_part_in_a_dataset_and_nothing_else(tmp_path: Path) -> None:
+def test_the_manifest_records_what_had_part_in_a_dataset_and_what_is_left_out_is_asked_for(
+    tmp_path: Path,
+) -> None:
     with loaded(TEMPLATE) as extension:
         begin_tiny(tmp_path)
     manifest = read_manifest(tmp_path / "manifest.json")
@@ -70,6 +72,16 @@ def test_the_manifest_records_what_had_part_in_a_dataset_and_nothing_else(tmp_pa
     job = shard_job(tmp_path, extensions={"template.py": "1" * 64})
     with pytest.raises(TrilightError, match=r"this worker: .* add --extend template\.py"):
         make_task(job, ())
+    # By commands an extension is asked for by its file where there are objects; else as possible.
+    words = ["generate", "smoke", "--set", "scenes.families=corridor", "--out", str(tmp_path)]
+    said = trilight(words).mistake
+    assert "setting 'scenes.families' is 'corridor'" in said
+    assert "alone, an extension's by --extend FILE, or one of its settings by name" in said
+    begun = dataclasses.replace(manifest, objects_lock_sha256="0" * 64)
+    write_manifest(tmp_path / "manifest.json", begun)
+    said = "begun with the extension template.py, which is not given; add --extend template.py"
+    assert said in trilight(words).mistake
+    assert "or an extension's by --extend FILE" in trilight(["generate", "corridor"]).mistake
 
 
 def test_children_know_what_is_registered() -> None:
@@ -183,22 +195,6 @@ def test_a_wrong_family_names_file_line_and_family(tmp_path: Path) -> None:
             preset_settings("smoke", changes={"scenes.families": "corridor"})
 
 
-def test_an_extension_that_is_left_out_is_asked_for(tmp_path: Path) -> None:
-    """Of a dataset that has objects, by its file; else as something that may be missing."""
-    words = ["generate", "smoke", "--set", "scenes.families=corridor", "--out", str(tmp_path)]
-    with loaded(TEMPLATE):
-        begin_tiny(tmp_path)
-    said = trilight(words).mistake
-    assert "setting 'scenes.families' is 'corridor'" in said
-    assert "alone, an extension's by --extend FILE, or one of its settings by name" in said
-    manifest = read_manifest(tmp_path / "manifest.json")
-    begun = dataclasses.replace(manifest, objects_lock_sha256="0" * 64)
-    write_manifest(tmp_path / "manifest.json", begun)
-    said = "begun with the extension template.py, which is not given; add --extend template.py"
-    assert said in trilight(words).mistake
-    assert "or an extension's by --extend FILE" in trilight(["generate", "corridor"]).mistake
-
-
 def test_a_build_of_ones_own_has_a_name_of_its_own(tmp_path: Path) -> None:
     text = """
 from pipeline.presets.registry import DATASET_PRESETS
@@ -254,7 +250,7 @@ def test_a_mistyped_source_leaves_nothing_behind(
     assert [path.name for path in tmp_path.iterdir()] == ["empty"]
 
 
-def test_what_was_only_begun_is_begun_anew_and_what_has_objects_or_scenes_is_not(
+def test_a_dataset_is_begun_anew_until_it_has_objects_or_scenes_and_then_keeps_its_settings(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """As a run leaves it that ended over its objects: other settings and fewer scenes are free."""
@@ -272,6 +268,17 @@ def test_what_was_only_begun_is_begun_anew_and_what_has_objects_or_scenes_is_not
     make_dataset(order, Undocumented())
     with pytest.raises(TrilightError, match="seed was 7, now 5"):
         prepare_dataset(other)
+    # One of removed settings is read and not resumed.
+    dataset = open_dataset(str(tmp_path / "set"))
+    settings = dict(dataset.manifest.settings)
+    settings["splits"] = {**settings["splits"], "object_parts": 2}
+    edit_manifest(dataset, settings=settings)
+    assert verify_dataset(str(tmp_path / "set")).problems == []
+    refusal = re.escape(removal_message("setting 'splits.object_parts'"))
+    with pytest.raises(TrilightError, match=refusal):
+        make_dataset(order, Undocumented())
+    with pytest.raises(TrilightError, match=refusal):
+        preset_settings("smoke", changes={"splits.object_parts": 2})
 
 
 def test_the_command_is_there_while_objects_are_prepared(
@@ -294,38 +301,16 @@ def test_the_command_is_there_while_objects_are_prepared(
     assert asked[1] == asked[0]
 
 
-def test_nobody_forgets_while_another_is_at_work(tmp_path: Path) -> None:
-    folder = DatasetFolder(tmp_path / "set")
-    with PublishedShards(folder).hold_lock():
-        begin_tiny(folder.root, seed=5)
-        with PublishedShards(folder).hold_lock():
-            assert read_manifest(folder.manifest).settings["seed"] == 5
-
-
-def test_who_was_replaced_all_the_same_stops(tmp_path: Path) -> None:
+def test_nobody_forgets_while_another_is_at_work_and_who_was_replaced_all_the_same_stops(
+    tmp_path: Path,
+) -> None:
     """Locks do not reach every machine: a maker whose manifest has become another's says so."""
     folder = DatasetFolder(tmp_path / "set")
-    with folder.hold_shared_lock():
+    with PublishedShards(folder).hold_lock():
         mine = begin_tiny(folder.root, seed=5)
+        with PublishedShards(folder).hold_lock():
+            assert read_manifest(folder.manifest).settings["seed"] == 5
         folder.manifest.unlink()
         begin_tiny(folder.root, seed=7)
         with pytest.raises(TrilightError, match="another dataset has been begun here"):
             mine.lock_objects([])
-
-
-def test_a_dataset_of_removed_settings_is_read_and_not_resumed(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    without_rendering(monkeypatch)
-    order = tiny_order(out=str(tmp_path / "set"), scenes=4)
-    make_dataset(order, Undocumented())
-    dataset = open_dataset(str(tmp_path / "set"))
-    settings = dict(dataset.manifest.settings)
-    settings["splits"] = {**settings["splits"], "object_parts": 2}
-    edit_manifest(dataset, settings=settings)
-    assert verify_dataset(str(tmp_path / "set")).problems == []
-    refusal = re.escape(removal_message("setting 'splits.object_parts'"))
-    with pytest.raises(TrilightError, match=refusal):
-        make_dataset(order, Undocumented())
-    with pytest.raises(TrilightError, match=refusal):
-        preset_settings("smoke", changes={"splits.object_parts": 2})

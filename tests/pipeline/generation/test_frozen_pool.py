@@ -51,10 +51,11 @@ from tests.scenes_by_hand import tiny_sample
 NUM_OBJECTS = 30
 
 
+Made = tuple[DatasetWriter, AcceptedObjects]
+
+
 @pytest.fixture(scope="module")
-def made(
-    tmp_path_factory: pytest.TempPathFactory,
-) -> Iterator[tuple[DatasetWriter, AcceptedObjects]]:
+def made(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Made]:
     folder = tmp_path_factory.mktemp("frozen")
     with pytest.MonkeyPatch.context() as patch:
         patch.setenv("TRILIGHT_CACHE", str(folder / "cache"))
@@ -71,9 +72,7 @@ def _rows(writer: DatasetWriter) -> list[LockedObject]:
     return [row for row in read_objects_lock(writer.folder.objects_lock) if row.split == "train"]
 
 
-def test_scenes_of_opened_objects_are_those_of_objects_in_memory(
-    made: tuple[DatasetWriter, AcceptedObjects],
-) -> None:
+def test_scenes_of_opened_objects_are_those_of_objects_in_memory(made: Made) -> None:
     """Those in memory are every object of the split."""
     writer, accepted = made
     stored = {
@@ -100,9 +99,7 @@ def test_scenes_of_opened_objects_are_those_of_objects_in_memory(
         assert np.array_equal(one.vertex_positions, other.vertex_positions)
 
 
-def test_only_a_few_objects_are_open(
-    made: tuple[DatasetWriter, AcceptedObjects], monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_only_a_few_objects_are_open(made: Made, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(scene_worker, "_MOST_OPEN", 3)
     decode = Mock(wraps=decode_asset)
     monkeypatch.setattr(scene_worker, "decode_asset", decode)
@@ -117,9 +114,7 @@ def test_only_a_few_objects_are_open(
             pool[row]
 
 
-def test_a_second_start_looks_at_no_object(
-    made: tuple[DatasetWriter, AcceptedObjects], monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_second_start_looks_at_no_object(made: Made, monkeypatch: pytest.MonkeyPatch) -> None:
     """And at all of them where it is asked for another source, or there is no index of the lock."""
     writer, accepted = made
 
@@ -142,9 +137,7 @@ def test_a_second_start_looks_at_no_object(
     assert asked(writer).load() == accepted
 
 
-def test_a_file_that_is_not_the_locked_one_is_away(
-    made: tuple[DatasetWriter, AcceptedObjects],
-) -> None:
+def test_a_file_that_is_not_the_locked_one_is_away(made: Made) -> None:
     pool = _opened(made[1])
     name = pool._index.asset_name(pool._first)
     path = asset_store().asset_path(name)
@@ -164,9 +157,7 @@ def test_a_file_that_is_not_the_locked_one_is_away(
     assert pool[0].locked.uid == uid
 
 
-def test_an_index_that_contradicts_the_objects_is_refused(
-    made: tuple[DatasetWriter, AcceptedObjects],
-) -> None:
+def test_an_index_that_contradicts_the_objects_is_refused(made: Made) -> None:
     """A wrong number of triangles would quietly change what is drawn."""
     path = made[0].folder.staged_index
     was = path.read_bytes()

@@ -314,7 +314,7 @@ def test_every_scene_is_in_one_task(
             assert scenes.start <= piece.first < piece.last <= scenes.stop
 
 
-def test_a_task_takes_the_time_that_it_should_by_what_is_measured() -> None:
+def test_a_task_takes_the_time_that_is_measured_and_a_run_at_most_a_thousand_tasks() -> None:
     """At 10 s a scene 24 of them: half a shard of 48, or six of 4."""
     cutter = _cutter(3, 30.0)
     for per_shard, pieces in ((48, 1), (4, 6)):
@@ -327,6 +327,13 @@ def test_a_task_takes_the_time_that_it_should_by_what_is_measured() -> None:
     assert len(_scenes([next(cut)])) == 4
     cutter.record(TaskResult(shards=(), scenes=4, seconds=4.0, core_s=4.0))
     assert len(_scenes([next(cut)])) == TASK_S
+    # All rounds of a run are at most a thousand tasks.
+    splits, cutter, rounds = SplitSettings(scenes_per_shard=1), TaskCutter(), list[int]()
+    with pytest.raises(EnvironmentFailure, match="run the same command again"):
+        while True:
+            rounds.append(sum(1 for _ in cutter.cut_round(range(5000), splits)))
+    assert rounds[:2] == [900, 90]
+    assert sum(rounds) == MAX_TASKS
 
 
 @for_each("at_once", [2, 8])
@@ -338,15 +345,6 @@ def test_several_at_once_all_have_work_until_the_end(at_once: int) -> None:
         assert size <= max(1, left / (2 * at_once))
         left -= size
     assert left == 0
-
-
-def test_all_rounds_of_a_run_are_at_most_a_thousand_tasks() -> None:
-    splits, cutter, rounds = SplitSettings(scenes_per_shard=1), TaskCutter(), list[int]()
-    with pytest.raises(EnvironmentFailure, match="run the same command again"):
-        while True:
-            rounds.append(sum(1 for _ in cutter.cut_round(range(5000), splits)))
-    assert rounds[:2] == [900, 90]
-    assert sum(rounds) == MAX_TASKS
 
 
 def test_wrong_orders_are_named() -> None:

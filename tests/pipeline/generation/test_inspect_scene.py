@@ -45,7 +45,7 @@ from tests.pipeline.scenes.small_pool import first_scene, small_pool
 from tests.scenes_by_hand import tiny_sample, tiny_scene
 
 
-def test_a_summary_and_a_sheet(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_summary_a_sheet_and_mistakes(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     use_children_here(monkeypatch)
     monkeypatch.setattr(inspecting, "_RESOLUTION", 32)
     monkeypatch.setattr(inspecting, "_SPP", 16)
@@ -60,6 +60,12 @@ def test_a_summary_and_a_sheet(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) 
     assert sheet.shape[0] * VIEWS == sheet.shape[1] * ROWS**2
     tiles = np.split(sheet, ROWS)
     assert all(tile.max() > 50 for row in tiles for tile in np.split(row, VIEWS // ROWS, axis=1))
+    for words, message in (
+        ([str(tmp_path / "a.usdz"), "--turntable", "x.jpg"], "the name of a file X.png"),
+        ([str(tmp_path), "--turntable", "x.png"], "expected one scene"),
+        ([str(tmp_path / "absent.usda")], "no such file"),
+    ):
+        assert message in expect_mistake("inspect", *words)
 
 
 def test_every_pose_sees_all_of_the_scene() -> None:
@@ -68,16 +74,6 @@ def test_every_pose_sees_all_of_the_scene() -> None:
     for pose in turntable_poses(scene):
         local = np.einsum("ij,vj->vi", np.linalg.inv(pose), points)
         assert (np.abs(local[:, :2]) < np.tan(np.radians(20)) * -local[:, 2:3]).all()
-
-
-def test_mistakes(tmp_path: Path) -> None:
-    write_usd(tmp_path / "a.usda", tiny_scene())
-    for words, message in (
-        ([str(tmp_path / "a.usda"), "--turntable", "x.jpg"], "the name of a file X.png"),
-        ([str(tmp_path), "--turntable", "x.png"], "expected one scene"),
-        ([str(tmp_path / "absent.usda")], "no such file"),
-    ):
-        assert message in expect_mistake("inspect", *words)
 
 
 def test_walls_before_the_objects_are_left_out() -> None:
@@ -111,20 +107,6 @@ def kill_children() -> int:
     return len(children)
 
 
-@pytest.fixture
-def source(tmp_path: Path) -> SceneSource:
-    path = tmp_path / "scene.safetensors"
-    path.write_bytes(encode_scene(tiny_scene()))
-    return SceneSource(path=path, key=None)
-
-
-def test_reading(source: SceneSource) -> None:
-    with SceneReader() as reader:
-        for _ in range(2):
-            assert encode_scene(reader.load(source).scene) == encode_scene(tiny_scene())
-            assert kill_children()
-
-
 def test_converting(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """Two scenes of a shard; the child is killed between them. Expected is what no child made."""
     shard, profile = tmp_path / "train-000000.tar", PROFILES[0]
@@ -156,8 +138,14 @@ def test_converting(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     assert kills == [1]
 
 
-def test_inspecting(source: SceneSource, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """The child is killed between the facts and the pictures."""
+def test_reading_and_inspecting(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """The child is killed between two scenes; then between the facts and the pictures."""
+    source = SceneSource(path=tmp_path / "scene.safetensors", key=None)
+    source.path.write_bytes(encode_scene(tiny_scene()))
+    with SceneReader() as reader:
+        for _ in range(2):
+            assert encode_scene(reader.load(source).scene) == encode_scene(tiny_scene())
+            assert kill_children()
 
     def kill_and_choose(device: Device) -> Variant:
         assert kill_children()

@@ -17,9 +17,10 @@ from pipeline.objects.licences import DEFAULT_ALLOWED
 from pipeline.objects.sources import list_objects
 from storage.errors import TrilightError
 from storage.records.objects import read_failures
-from tests.command_line import trilight
+from tests.command_line import expect_json, expect_mistake, expect_output, trilight
 from tests.for_each import case
 from tests.pipeline.assets.meshes_by_hand import cube, sphere, write_obj
+from tests.pipeline.documents.dataset_by_hand import files_of
 
 REAL = (
     "classic/suzanne.obj",
@@ -117,7 +118,9 @@ def test_every_object_has_its_outcome_in_every_document_and_meshes_open_elsewher
     assert not list(out.rglob("*.part"))
 
 
-def test_the_folder_is_a_source_of_objects(made: tuple[Path, AssetReport], tmp_path: Path) -> None:
+def test_the_folder_is_a_source_of_objects_and_is_made_the_same_again(
+    made: tuple[Path, AssetReport], source: Path, tmp_path: Path
+) -> None:
     out, report = made
     listed = list_objects(str(out), work_dir=tmp_path, allowed_licences=DEFAULT_ALLOWED)
     found = listed.fetch_selected()
@@ -129,13 +132,9 @@ def test_the_folder_is_a_source_of_objects(made: tuple[Path, AssetReport], tmp_p
     again = run(out, tmp_path / "again")
     assert [row.num_faces for row in again.rows] == [row.num_faces for row in report.rows]
     assert {row.method for row in again.rows} == {"source"}
-
-
-def test_again_gives_the_same_folder(made: tuple[Path, AssetReport], source: Path) -> None:
-    out, report = made
-    before = {path: path.read_bytes() for path in out.rglob("*") if path.is_file()}
+    before = files_of(out)
     assert run(source, out) == report
-    assert {path: path.read_bytes() for path in out.rglob("*") if path.is_file()} == before
+    assert files_of(out) == before
 
 
 def test_objects_that_are_gone_leave_no_mesh(source: Path, tmp_path: Path) -> None:
@@ -186,10 +185,7 @@ def few(source: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 def test_the_command_prints_json_and_nothing_else(few: Path, tmp_path: Path) -> None:
     out = tmp_path / "out"
-    options = ["--out", str(out), "--budget", "500", "--json"]
-    result = trilight(["assets", str(few), *options])
-    assert result.exit_code == 0, result.stderr
-    answer = json.loads(result.stdout)
+    answer = expect_json("assets", few, "--out", out, "--budget", "500")
     assert (answer["accepted"], answer["rejected"]) == (1, len(BAD))
     (row,) = answer["objects"]
     assert row["num_faces"] <= 500
@@ -214,9 +210,7 @@ def test_where_nothing_can_be_used_the_command_says_so_and_makes_a_folder_too(
 def test_the_command_for_people(few: Path, tmp_path: Path) -> None:
     """Epsilon as a share in percent; the table names what was refused."""
     out = tmp_path / "out"
-    result = trilight(["assets", str(few), "--out", str(out), "--epsilon", "1%"])
-    assert result.exit_code == 0, result.stderr
-    assert "archive_refused" in result.stdout
+    assert "archive_refused" in expect_output("assets", few, "--out", out, "--epsilon", "1%")
     (row,) = (json.loads(line) for line in (out / "objects.jsonl").read_text().splitlines())
     assert row["quality"]["error_p99"] <= 0.01
     assert row["num_faces"] < 0.9 * row["source"]["num_faces"]
@@ -225,9 +219,9 @@ def test_the_command_for_people(few: Path, tmp_path: Path) -> None:
 def test_a_mistake_is_one_line(tmp_path: Path) -> None:
     write_obj(tmp_path / "a.obj", cube())
     wrong = {"--epsilon": "half", "--budget": "0", "--profile": "fast", "--licence": "not one"}
-    words = ["assets", str(tmp_path), "--out", str(tmp_path / "out")]
     for option in wrong.items():
-        assert option[1] in trilight([*words, *option]).mistake, option
+        said = expect_mistake("assets", tmp_path, "--out", tmp_path / "out", *option)
+        assert option[1] in said, option
         assert not (tmp_path / "out/objects.jsonl").exists(), option
 
 

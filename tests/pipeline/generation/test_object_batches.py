@@ -60,7 +60,9 @@ def _prepare(
     return found, sum(counted)
 
 
-def test_nothing_is_made_twice(mesher: Mesher, tmp_path: Path) -> None:
+def test_nothing_is_made_twice_and_an_object_more_or_less_changes_one_batch(
+    mesher: Mesher, tmp_path: Path
+) -> None:
     """Not by a worker that resumes, nor for a later dataset; an object more costs its batch."""
     records = object_records(tmp_path / "objects")
     mesher.reasons["object 00003"] = "no_faces"
@@ -74,10 +76,6 @@ def test_nothing_is_made_twice(mesher: Mesher, tmp_path: Path) -> None:
     more = object_records(tmp_path / "objects", 31)
     _prepare(more, tmp_path / "two")
     assert sum(mesher.made.values()) == 30 + len(cut_objects(more)[-1])
-
-
-def test_an_object_more_or_less_changes_one_batch(mesher: Mesher, tmp_path: Path) -> None:
-    records = object_records(tmp_path / "objects")
     whole = cut_objects(records)
     assert [record for batch in whole for record in batch] == records
     assert len(whole) > 2

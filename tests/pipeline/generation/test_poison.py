@@ -8,6 +8,7 @@ import shutil
 import subprocess
 from collections.abc import Iterator
 from pathlib import Path
+from typing import Any
 
 import pytest
 
@@ -62,12 +63,17 @@ def expected(workshop: Path) -> str:
     return open_dataset(str(workshop / "plain")).digest
 
 
+def prepare_by(monkeypatch: pytest.MonkeyPatch, attempt: Any) -> None:
+    """Have children call this function of tests, which confined ones could not read."""
+    monkeypatch.setattr("pipeline.assets.stage.attempt_in_child", attempt)
+    monkeypatch.setenv("TRILIGHT_CONFINE", "off")
+
+
 def test_a_mesh_that_crashes_its_child_is_one_failure(
     workshop: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """The other objects are used, and the dataset is the one without it."""
-    monkeypatch.setattr("pipeline.assets.stage.attempt_in_child", poison.prepare_or_crash)
-    monkeypatch.setenv("TRILIGHT_CONFINE", "off")  # a confined child reads no function of tests
+    prepare_by(monkeypatch, poison.prepare_or_crash)
     poisoned = write_obj(workshop / "objects" / poison.OBJECT, knot(segments=64))
     try:
         outcome = make(workshop, tmp_path / "set")
@@ -80,39 +86,33 @@ def test_a_mesh_that_crashes_its_child_is_one_failure(
     assert rejected == [("poison", "crashed_signal_11")]
 
 
-@pytest.fixture
-def cold(workshop: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Path]:
-    """A folder with a cache in which no mesh is; the children of one object are killed."""
-    monkeypatch.setenv("TRILIGHT_CACHE", str(tmp_path / "cache"))
-    monkeypatch.setattr("pipeline.assets.stage.attempt_in_child", poison.prepare_or_die)
-    monkeypatch.setenv("TRILIGHT_CONFINE", "off")  # they count their deaths in a file
-    (workshop / poison.DEATHS).write_text("0")
-    yield tmp_path
-    (workshop / poison.DEATHS).unlink()
-
-
 def test_an_object_whose_children_are_all_killed_is_tried_again_by_the_next_run(
-    workshop: Path, cold: Path, caplog: pytest.LogCaptureFixture
+    workshop: Path,
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    caplog: pytest.LogCaptureFixture,
 ) -> None:
     """A dataset begun without it says so; one that was begun with it waits for it."""
+    monkeypatch.setenv("TRILIGHT_CACHE", str(tmp_path / "cache"))
+    prepare_by(monkeypatch, poison.prepare_or_die)
     deaths, small = workshop / poison.DEATHS, {"scenes": 4}
     deaths.write_text("3")
-    begun = prepare_dataset(order(workshop, cold / "without", **small))
+    begun = prepare_dataset(order(workshop, tmp_path / "without", **small))
     assert begun.job.accepted.num_objects == 7
-    (failure,) = open_dataset(str(cold / "without")).failures()
+    (failure,) = open_dataset(str(tmp_path / "without")).failures()
     assert (failure.item, failure.reason) == ("knot0", "killed")
     (record,) = caplog.records
     assert "1 could not be prepared this time (1 x killed)" in record.getMessage()
-    begun = prepare_dataset(order(workshop, cold / "with", **small))
+    begun = prepare_dataset(order(workshop, tmp_path / "with", **small))
     assert begun.job.accepted.num_objects == 8
-    shutil.rmtree(cold / "cache")
+    shutil.rmtree(tmp_path / "cache")
     begun.publication.folder.staged_index.unlink()
     deaths.write_text("3")
     killed = "'knot0', which .* begun with.*killed.*run the same"
     with pytest.raises(EnvironmentFailure, match=killed):
-        prepare_dataset(order(workshop, cold / "with", **small))
-    assert open_dataset(str(cold / "with")).failures() == []
-    again = prepare_dataset(order(workshop, cold / "with", **small))
+        prepare_dataset(order(workshop, tmp_path / "with", **small))
+    assert open_dataset(str(tmp_path / "with")).failures() == []
+    again = prepare_dataset(order(workshop, tmp_path / "with", **small))
     assert again.job.accepted == begun.job.accepted
 
 
@@ -122,8 +122,7 @@ def test_meshes_that_are_away_are_made_again_where_a_scene_draws_them(
     """Those of no scene are not, and one that has changed is refused."""
     begun = prepare_dataset(order(workshop, tmp_path / "set"))
     monkeypatch.setenv("TRILIGHT_CACHE", str(tmp_path / "cache"))
-    monkeypatch.setattr("pipeline.assets.stage.attempt_in_child", poison.prepare_or_die)
-    monkeypatch.setenv("TRILIGHT_CONFINE", "off")  # they count their deaths in a file
+    prepare_by(monkeypatch, poison.prepare_or_die)
     (workshop / poison.DEATHS).write_text("1000")
     samples = open_dataset(str(workshop / "plain")).samples()
     drawn = {row.uid for sample in samples for row in sample.scene.objects}
@@ -138,9 +137,7 @@ def test_meshes_that_are_away_are_made_again_where_a_scene_draws_them(
     with pytest.raises(TrilightError, match="'knot0' has changed; expected what"):
         make(workshop, tmp_path / "set")
     mesh.write_bytes(was)
-    outcome = make(workshop, tmp_path / "set")
-    (workshop / poison.DEATHS).unlink()
-    assert outcome.digest == expected(workshop)
+    assert make(workshop, tmp_path / "set").digest == expected(workshop)
     assert len(list((tmp_path / "cache").glob("assets/??/*.safetensors"))) <= len(drawn) + 1
 
 

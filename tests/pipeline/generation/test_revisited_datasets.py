@@ -192,19 +192,6 @@ def test_a_run_goes_on_after_a_kill_and_a_bad_shard_is_repaired(
     assert not verify_dataset(again).problems
 
 
-def test_a_repair_from_other_objects_is_refused_before_a_shard_is_moved(
-    source: Dataset, tmp_path: Path
-) -> None:
-    copy = tmp_path / "set"
-    shutil.copytree(source.folder.root, copy)
-    shard = source.manifest.shards[0].name
-    (copy / shard).write_bytes(b"not a shard")
-    before = {path.name: path.read_bytes() for path in copy.iterdir() if path.is_file()}
-    with pytest.raises(TrilightError, match="name the source that has it by --objects"):
-        repair(str(copy), [shard], objects="builtin:1", scenes_from=None)
-    assert {path.name: path.read_bytes() for path in copy.iterdir() if path.is_file()} == before
-
-
 def test_another_source_and_scenes_of_files_without_layout_are_refused(
     source: Dataset, tmp_path: Path
 ) -> None:
@@ -224,7 +211,10 @@ def test_another_source_and_scenes_of_files_without_layout_are_refused(
         assert not (tmp_path / "set" / "manifest.json").exists()
 
 
-def test_a_damaged_source_is_named(source: Dataset, tmp_path: Path) -> None:
+def test_a_damaged_source_is_named_and_not_repaired_from_other_objects(
+    source: Dataset, tmp_path: Path
+) -> None:
+    """That is refused before a shard is moved."""
     copy = tmp_path / "copy"
     shutil.copytree(source.folder.root, copy)
     shard = copy / source.manifest.shards[0].name
@@ -234,6 +224,10 @@ def test_a_damaged_source_is_named(source: Dataset, tmp_path: Path) -> None:
     with pytest.raises(TrilightError, match=r"not those of the manifest \(sha256 differs\)"):
         make_dataset(order_of(copy, tmp_path / "set", cameras="2"), Undocumented())
     assert not (tmp_path / "set" / shard.name).exists()
+    before = {path.name: path.read_bytes() for path in copy.iterdir() if path.is_file()}
+    with pytest.raises(TrilightError, match="name the source that has it by --objects"):
+        repair(str(copy), [shard.name], objects="builtin:1", scenes_from=None)
+    assert {path.name: path.read_bytes() for path in copy.iterdir() if path.is_file()} == before
 
 
 def test_words_that_mean_nothing_are_one_line(source: Dataset, tmp_path: Path) -> None:

@@ -75,10 +75,15 @@ def test_many_makers_of_one_shard_make_every_scene_once(tmp_path: Path) -> None:
     assert not list(tmp_path.rglob("*.part"))
 
 
-def test_whoever_makes_the_last_piece_packs(tmp_path: Path) -> None:
+def test_whoever_makes_the_last_piece_packs_and_what_somebody_else_is_making_is_left_to_them(
+    tmp_path: Path,
+) -> None:
     made: Counter[int] = Counter()
     assert _make(tmp_path, 2, 4, made) is None
-    shard = _make(tmp_path, 0, 2, made)
+    with _claim(DatasetFolder(tmp_path), 1):
+        assert _make(tmp_path, 0, 4, made) is None
+    assert made == {0: 1, 2: 1, 3: 1}
+    shard = _make(tmp_path, 0, 2, made)  # they died; now it is free
     assert shard is not None
     assert shard.num_samples == 4
     assert _make(tmp_path, 0, 4, made) is None  # there is nothing left to do
@@ -92,14 +97,6 @@ def test_the_first_scene_can_be_looked_at_at_once(tmp_path: Path) -> None:
     assert Image.open(sheet).size[0] > 2 * 192, "both views side by side"
     _make(tmp_path, 3, 4, made)
     assert sheet.read_bytes() == first, "later scenes leave it"
-
-
-def test_what_somebody_else_is_making_is_left_to_them(tmp_path: Path) -> None:
-    made: Counter[int] = Counter()
-    with _claim(DatasetFolder(tmp_path), 1):
-        assert _make(tmp_path, 0, 4, made) is None
-    assert made == {0: 1, 2: 1, 3: 1}
-    assert _make(tmp_path, 0, 4, made) is not None  # they died; now it is free
 
 
 def test_who_waits_for_others_says_for_whom(

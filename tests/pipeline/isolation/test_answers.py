@@ -40,7 +40,7 @@ from storage.errors import EnvironmentFailure, Rejected, TrilightError
 from storage.installation import module_name
 from storage.settings.fields import array_scalar
 from tests.conftest import ROOT
-from tests.for_each import for_each
+from tests.for_each import case, for_each
 from tests.pipeline.isolation import called
 from tests.scenes_by_hand import tiny_scene
 from trilight import write_scene
@@ -170,9 +170,8 @@ def test_values_come_back_as_they_were_and_damaged_ones_as_declared_or_a_sentenc
 F32 = NDArray[np.float32]
 
 
-@for_each(
-    ("value", "hint", "said"),
-    [
+def test_what_is_not_as_declared_is_refused_with_its_place() -> None:
+    rows: list[tuple[Any, Any, str]] = [
         (True, int, "valid integer"),
         (1.0, int, "valid integer"),
         ("1", float, "valid"),
@@ -190,13 +189,11 @@ F32 = NDArray[np.float32]
         ([-1, "float32", [2], "C"], F32, "0: .*greater"),
         ([9, "float32", [2], "C"], F32, "IndexError"),
         (9, bytes, "IndexError"),
-    ],
-)
-def test_what_is_not_as_declared_is_refused_with_its_place(
-    value: Any, hint: Any, said: str
-) -> None:
-    with pytest.raises(ChildFailed, match=f"nonsense: .*declaring.*{said}"):
-        read_value(value, hint, bytes(8))
+    ]
+    for value, hint, said in rows:
+        refusal = f"nonsense: .*declaring.*{said}"
+        with case((value, hint)), pytest.raises(ChildFailed, match=refusal):
+            read_value(value, hint, bytes(8))
 
 
 @for_each(
@@ -234,9 +231,8 @@ def test_a_type_that_could_not_be_checked_is_refused(hint: Any) -> None:
         result_reader(declaring(hint))
 
 
-@for_each(
-    ("error", "kind"),
-    [
+def test_errors_are_sentences_of_known_types() -> None:
+    rows: list[tuple[tuple[str, ...], type[Exception]]] = [
         (("rejected", "no_faces", "nothing\x1b[2Jthere"), Rejected),
         (("TrilightError", "x: is\x07 wrong."), TrilightError),
         (("EnvironmentFailure", "the disk is full."), EnvironmentFailure),
@@ -244,14 +240,13 @@ def test_a_type_that_could_not_be_checked_is_refused(hint: Any) -> None:
         (("rejected", "No Reason", "x"), ChildFailed),
         (("KeyError", "x"), ChildFailed),
         (("timeout_cpu", "a verdict"), ChildFailed),
-    ],
-)
-def test_errors_are_sentences_of_known_types(error: tuple[str, ...], kind: type) -> None:
-    with pytest.raises(kind) as caught:
-        read(encode_error(*error), int)
-    assert type(caught.value) is kind
-    assert str(caught.value).isprintable()
-    assert not getattr(caught.value, "is_verdict", False)
+    ]
+    for error, kind in rows:
+        with case(error), pytest.raises(kind) as caught:
+            read(encode_error(*error), int)
+        assert type(caught.value) is kind
+        assert str(caught.value).isprintable()
+        assert not getattr(caught.value, "is_verdict", False)
 
 
 class Hostile:
@@ -280,16 +275,13 @@ def test_a_hostile_pickle_makes_no_file(tmp_path: Path) -> None:
     assert (tmp_path / "made").exists(), "the bytes are hostile indeed"
 
 
-@for_each(
-    ("claim", "said"),
-    [([1, 1 << 60], "1152921504606846976 bytes"), ([1, 3 * 10**9], f"at most {1 << 30}"),
-     ([1 << 40], "parts"), ([3, *[(1 << 64) - 1] * 3], "bytes")],
-)  # fmt: skip
-def test_an_answer_that_is_larger_than_its_child_may_be_is_not_read(
-    child: IsolatedChild, claim: list[int], said: str
-) -> None:
-    with pytest.raises(ChildFailed, match=f"nonsense: its answer would have .*{said}"):
-        child.call(called.taken_over, [np.array(claim, "<u8").tobytes()], 0.0)
+def test_an_answer_that_is_larger_than_its_child_may_be_is_not_read(child: IsolatedChild) -> None:
+    for claim, said in (
+        ([1, 1 << 60], "1152921504606846976 bytes"), ([1, 3 * 10**9], f"at most {1 << 30}"),
+        ([1 << 40], "parts"), ([3, *[(1 << 64) - 1] * 3], "bytes"),
+    ):  # fmt: skip
+        with pytest.raises(ChildFailed, match=f"nonsense: its answer would have .*{said}"):
+            child.call(called.taken_over, [np.array(claim, "<u8").tobytes()], 0.0)
 
 
 def test_an_answer_that_never_ends_does_and_a_child_that_reads_no_more_is_given_up() -> None:

@@ -31,12 +31,13 @@ from pipeline.isolation.call_failures import ENDS, with_retries
 from pipeline.isolation.confinement import covers
 from pipeline.isolation.system_calls import landlock_version, seccomp_works
 from storage.errors import EnvironmentFailure, TrilightError
+from tests.command_line import run_program
 from tests.conftest import ROOT
 from tests.for_each import case, for_each
 from tests.pipeline.isolation import called, probes
 from tests.pipeline.isolation.probes import PROBES
 
-LIMITS = ChildLimits(memory_bytes=2 << 30, wall_s=20, calls_per_child=100)
+LIMITS = ChildLimits(memory_bytes=2 << 30, wall_s=120, calls_per_child=100)
 needs_landlock = pytest.mark.skipif(not landlock_version(), reason="no Landlock here")
 needs_seccomp = pytest.mark.skipif(not seccomp_works(), reason="no seccomp here")
 
@@ -116,7 +117,7 @@ from pipeline.isolation import ChildLimits, IsolatedChild, reach
 from tests.pipeline.isolation import called, probes
 limits = ChildLimits(memory_bytes=2 << 30, wall_s=60, calls_per_child=9)
 child = IsolatedChild(limits=limits, confined_to=reach([pathlib.Path("tests")]))
-print("terminals:", child.call(probes.open_terminals))
+print(f"terminals: {child.call(probes.open_terminals)}")
 """
 
 
@@ -188,40 +189,32 @@ def test_packages_that_a_path_of_pythons_names_are_read_and_its_other_folders_no
             child.call(called.read, other / "file")
 
 
-def test_off_confines_nothing(place: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_off_confines_nothing_and_an_unknown_word_is_refused_at_once_by_every_command(
+    place: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     monkeypatch.setenv(confinement.VARIABLE, "off")
     with closing(confined(place / "in")) as child:
         assert child.call(called.read, place / "outside" / "file") == "outside"
+    words, env = ["-m", "trilight", "doctor", "--help"], {confinement.VARIABLE: "maybe"}
+    run = run_program([sys.executable, *words], status=1, env={**os.environ, **env})
+    assert "'maybe'" in run.stderr
 
 
-@for_each(
-    ("word", "error", "said"),
-    [("no", TrilightError, "auto"), ("required", EnvironmentFailure, "lacks Landlock")],
-)
 def test_what_cannot_be_had_is_said(
-    monkeypatch: pytest.MonkeyPatch,
-    caplog: pytest.LogCaptureFixture,
-    word: str,
-    error: type[Exception],
-    said: str,
+    monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
 ) -> None:
-    monkeypatch.setenv(confinement.VARIABLE, word)
+    """At once: no child may be needed where all is cached."""
     monkeypatch.setattr(confinement, "landlock_version", lambda: 0)
-    with pytest.raises(error, match=said):  # at once: no child may be needed where all is cached
+    monkeypatch.setenv(confinement.VARIABLE, "no")
+    with pytest.raises(TrilightError, match="auto"):
+        asset_child()
+    monkeypatch.setenv(confinement.VARIABLE, "required")
+    with pytest.raises(EnvironmentFailure, match="lacks Landlock"):
         asset_child()
     monkeypatch.setenv(confinement.VARIABLE, "auto")
     confinement._warn.cache_clear()
     assert confinement.should_confine() and confinement.should_confine()
     assert [record.getMessage().count("lacks Landlock") for record in caplog.records] == [1]
-    caplog.clear()
-
-
-def test_an_unknown_word_is_refused_at_once_by_every_command() -> None:
-    run = subprocess.run(
-        [sys.executable, "-m", "trilight", "doctor", "--help"], capture_output=True, text=True,
-        env={**os.environ, confinement.VARIABLE: "maybe"}, check=False, cwd=ROOT,
-    )  # fmt: skip
-    assert (run.returncode, "'maybe'" in run.stderr) == (1, True)
 
 
 def test_very_many_folders_become_those_above_and_never_the_whole_disk() -> None:
@@ -261,9 +254,6 @@ def test_the_filter_refuses_calls_by_number_and_by_argument(machine: str, column
         assert _decide(machine, number, given_up) == refuse, name
 
 
-PATIENT = ChildLimits(memory_bytes=2 << 30, wall_s=120, calls_per_child=9)
-
-
 @pytest.fixture(autouse=True)
 def _no_pauses(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(call_failures, "_PAUSE_S", 0.0)
@@ -271,7 +261,7 @@ def _no_pauses(monkeypatch: pytest.MonkeyPatch) -> None:
 
 @pytest.fixture
 def plain_child() -> Iterator[IsolatedChild]:
-    with closing(IsolatedChild(limits=PATIENT)) as plain_child:
+    with closing(IsolatedChild(limits=LIMITS)) as plain_child:
         yield plain_child
 
 
@@ -321,7 +311,7 @@ def test_kills_in_a_call_or_its_set_up_are_tried_again_and_end_the_run_at_last(
     call = called.count_and_die, str(tmp_path / "call"), signal.SIGKILL, 2
     assert call_with_retries(plain_child, *call) == 3
     (tmp_path / "once").mkdir()
-    dying_child = functools.partial(IsolatedChild, limits=PATIENT, factory=called.count_and_die)
+    dying_child = functools.partial(IsolatedChild, limits=LIMITS, factory=called.count_and_die)
     with closing(dying_child(args=(str(tmp_path / "once"), signal.SIGKILL, 2))) as child:
         assert child.call(called.double, 4) == 8
     assert len(list((tmp_path / "once").iterdir())) == 3
@@ -334,7 +324,7 @@ def test_kills_in_a_call_or_its_set_up_are_tried_again_and_end_the_run_at_last(
 
 def test_a_set_up_that_cannot_succeed_is_tried_once_at_each_call(tmp_path: Path) -> None:
     """And no call is made in a child that was not set up."""
-    child = IsolatedChild(limits=PATIENT, factory=called.fail_set_up, args=(str(tmp_path),))
+    child = IsolatedChild(limits=LIMITS, factory=called.fail_set_up, args=(str(tmp_path),))
     with closing(child):
         for calls in (1, 2):
             with pytest.raises(EnvironmentFailure, match="cannot be set up.*a library is broken"):

@@ -239,22 +239,19 @@ def test_a_command_that_is_stopped_as_a_whole_goes_on_where_it_was(tmp_path: Pat
 _WORD = ctypes.c_uint64
 
 
-@pytest.fixture(scope="module")
-def compare_exchange() -> Any:
-    function = load_stand_in("libatomic.so.1").__getattr__("__atomic_compare_exchange_16")
-    function.restype = ctypes.c_bool
-    # the last argument is a number of 16 bytes, which two registers hold; then two memory orders
-    function.argtypes = [ctypes.c_void_p, ctypes.c_void_p, _WORD, _WORD, ctypes.c_int, ctypes.c_int]
-    return function
-
-
 def _aligned_pair() -> Any:
     """Return two numbers at a multiple of 16 bytes, which keep the memory that they are in."""
     room = ctypes.create_string_buffer(32)
     return (_WORD * 2).from_buffer(room, -ctypes.addressof(room) % 16)
 
 
-def test_it_exchanges_sixteen_bytes_where_all_are_as_expected(compare_exchange: Any) -> None:
+def test_sixteen_bytes_are_exchanged_where_all_are_as_expected_and_threads_lose_none() -> None:
+    """ctypes holds no lock of Python in a call, so two processors meet."""
+    compare_exchange = load_stand_in("libatomic.so.1").__getattr__("__atomic_compare_exchange_16")
+    compare_exchange.restype = ctypes.c_bool
+    # the last argument is a number of 16 bytes, which two registers hold; then two memory orders
+    pointer, number = ctypes.c_void_p, ctypes.c_int
+    compare_exchange.argtypes = [pointer, pointer, _WORD, _WORD, number, number]
     value = _aligned_pair()
     value[:] = 5, 6
     for expected in ((5, 7), (4, 6)):
@@ -264,12 +261,7 @@ def test_it_exchanges_sixteen_bytes_where_all_are_as_expected(compare_exchange: 
     found = (_WORD * 2)(5, 6)
     assert compare_exchange(ctypes.byref(value), found, 1, 2, 5, 5)
     assert list(value) == [1, 2]
-
-
-def test_threads_lose_no_exchange(compare_exchange: Any) -> None:
-    """ctypes holds no lock of Python in a call, so two processors meet."""
-    value = _aligned_pair()
-    times = 20_000
+    value, times = _aligned_pair(), 20_000
 
     def count() -> None:
         known = (_WORD * 2)(0, 0)

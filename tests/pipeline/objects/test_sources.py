@@ -63,9 +63,10 @@ def test_names_of_any_bytes_become_printable_uids(tmp_path: Path) -> None:
         assert Path(record.path).read_text() == "v 0 0 0"
 
 
-def test_files_that_differ_in_their_suffix_or_are_copies_are_objects_of_their_own(
+def test_files_that_differ_in_their_suffix_are_objects_of_their_own_and_of_names_alike_one_stays(
     tmp_path: Path,
 ) -> None:
+    """So are copies."""
     touch(tmp_path, "a.stl", "a.obj", "a.stl.obj", "a.OBJ", "b/a.ply", "b.gltf.glb", "b.glb")
     os.link(tmp_path / "a.obj", tmp_path / "hard.obj")
     (tmp_path / "soft.obj").symlink_to("a.obj")
@@ -75,11 +76,8 @@ def test_files_that_differ_in_their_suffix_or_are_copies_are_objects_of_their_ow
         "b": "b.glb", "b.gltf.glb": "b.gltf.glb", "b/a": "a.ply", "hard": "hard.obj",
         "soft": "soft.obj",
     }  # fmt: skip
-
-
-def test_names_that_print_alike_cannot_both_stay(tmp_path: Path) -> None:
-    touch(tmp_path, "a\nb.obj", r"a\nb.obj", r"a\nb.ply", "a\nb.ply")
-    found = find(tmp_path)
+    touch(tmp_path / "alike", "a\nb.obj", r"a\nb.obj", r"a\nb.ply", "a\nb.ply")
+    found = find(tmp_path / "alike")
     names = {record.uid: Path(record.path).name for record in found.records}
     assert names == {r"a\nb": "a\nb.obj", r"a\nb.obj": r"a\nb.obj", r"a\nb.ply": "a\nb.ply"}
     assert reasons(found) == {r"a\nb.ply": "name_clash"}
@@ -389,9 +387,7 @@ def test_the_default_refuses_what_is_unknown_or_restricted() -> None:
     assert {failure.stage for failure in failures} == {"objects"}
     assert {failure.reason for failure in failures} == {"licence_refused"}
     assert not any(mark in name for name in DEFAULT_ALLOWED for mark in ("NC", "ND", "unknown"))
-
-
-def test_a_refusal_says_how_to_allow_what_an_allow_list_can_name() -> None:
+    # A refusal says how to allow what an allow list can name.
     for licence in ("CC-BY-NC-4.0", "MIT OR Apache-2.0"):
         _, (failure,) = refuse_licences([record(licence)], DEFAULT_ALLOWED)
         assert f"--allow-licence '{licence}'" in failure.message
@@ -402,7 +398,9 @@ def test_a_refusal_says_how_to_allow_what_an_allow_list_can_name() -> None:
         assert "expected an SPDX identifier" in failure.message
 
 
-def test_a_stated_licence_is_that_of_silent_files(tmp_path: Path) -> None:
+def test_a_stated_licence_is_that_of_silent_files_and_not_of_sources_that_state_their_own(
+    tmp_path: Path,
+) -> None:
     touch(tmp_path, "a.obj")
     (one,) = find(tmp_path, allowed_licences=["CC-BY-4.0"], licence="cc-by-4.0").records
     assert (one.licence, one.licence_source) == ("cc-by-4.0", "stated by the user (--licence)")
@@ -415,9 +413,6 @@ def test_a_stated_licence_is_that_of_silent_files(tmp_path: Path) -> None:
         for options in ({"licence": bad}, {"allowed_licences": [bad]}):
             with case(options):
                 refusal(tmp_path, "expected an SPDX identifier", **options)
-
-
-def test_sources_that_state_their_own(tmp_path: Path) -> None:
     for folder, name in with_folders(tmp_path, ("objects.jsonl", "objects.csv")):
         touch(folder, name)
         refusal(folder, f"--licence is 'MIT', but {name} states", work_dir=folder, licence="MIT")

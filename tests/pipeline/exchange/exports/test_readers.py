@@ -11,6 +11,7 @@ import json
 import re
 import shutil
 from collections import Counter
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
@@ -24,7 +25,7 @@ from pipeline.presets.registry import preset_settings
 from scene_templates.sample_layout import scene_plan
 from storage.dataset.dataset import open_dataset
 from storage.records.sample import sample_key
-from tests.command_line import trilight
+from tests.command_line import expect_json, expect_mistake
 from tests.train.toy import VIEWS, toy_sample, write_toy_dataset
 
 PX = 16
@@ -38,8 +39,7 @@ def dataset(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """Return a dataset of three training shards and two for validation, with its card."""
     root = tmp_path_factory.mktemp("set") / "data"
     write_toy_dataset(root, train=TRAIN, validation=VALIDATION, per_shard=PER_SHARD, resolution=PX)
-    ended = trilight(["inspect", str(root), "--json"])
-    assert ended.exit_code == 0, ended.exception
+    expect_json("inspect", root)
     return root
 
 
@@ -48,19 +48,17 @@ def picture(data: bytes) -> NDArray:
     return OpenEXR.File(io.BytesIO(data)).channels()["RGB"].pixels
 
 
-def check_sample(key: str, members: dict[str, Any]) -> None:
-    """Assert that the members by suffix are those of the toy scene."""
-    sample = toy_sample(int(key), resolution=PX)
-    for view in range(VIEWS):
-        half = sample.radiance_rgb[view].astype(np.float16)
-        np.testing.assert_array_equal(picture(members[f"{view}.exr"]), half)
-    told = members["json"]
-    told = json.loads(told) if isinstance(told, bytes | str) else told
-    assert len(told["views"]) == VIEWS
-
-
-def keys(count: int, first: int = 0) -> list[str]:
-    return [sample_key(index) for index in range(first, first + count)]
+def check_samples(seen: Mapping[str, dict[str, Any]], count: int, first: int = 0) -> None:
+    """Assert that there are so many samples, whose members by suffix are those of toy scenes."""
+    assert sorted(seen) == [sample_key(index) for index in range(first, first + count)]
+    for key, members in seen.items():
+        sample = toy_sample(int(key), resolution=PX)
+        for view in range(VIEWS):
+            half = sample.radiance_rgb[view].astype(np.float16)
+            np.testing.assert_array_equal(picture(members[f"{view}.exr"]), half)
+        told = members["json"]
+        told = json.loads(told) if isinstance(told, bytes | str) else told
+        assert len(told["views"]) == VIEWS
 
 
 def test_webdataset_with_torch(dataset: Path) -> None:
@@ -72,10 +70,7 @@ def test_webdataset_with_torch(dataset: Path) -> None:
     assert len(urls) == 3
     source = webdataset.WebDataset(urls, shardshuffle=False)
     loader = torch.utils.data.DataLoader(source, batch_size=None, num_workers=2)
-    seen = {sample["__key__"]: sample for sample in loader}
-    assert sorted(seen) == keys(TRAIN)
-    for key, sample in seen.items():
-        check_sample(key, sample)
+    check_samples({sample["__key__"]: sample for sample in loader}, TRAIN)
     pictures = webdataset.WebDataset(urls, shardshuffle=False).to_tuple("0.exr")
     tensors = pictures.map_tuple(lambda data: torch.from_numpy(picture(data).astype(np.float32)))
     shapes = [tuple(batch.shape) for (batch,) in tensors.batched(PER_SHARD)]
@@ -89,24 +84,18 @@ def test_hugging_face_datasets_by_the_card(dataset: Path, tmp_path: Path) -> Non
     loaded = load_dataset(str(dataset), cache_dir=str(tmp_path / "cache"))
     counts = {name: rows.num_rows for name, rows in loaded.items()}
     assert counts == {"train": TRAIN, "validation": VALIDATION}
-    for row in loaded["train"]:
-        check_sample(row["__key__"], row)
+    check_samples({row["__key__"]: row for row in loaded["train"]}, TRAIN)
     urls = sorted(str(path) for path in dataset.glob("train-*.tar"))
     stream = load_dataset("webdataset", data_files={"train": urls}, split="train", streaming=True)
-    seen = {row["__key__"]: row for row in stream}
-    assert sorted(seen) == keys(TRAIN)
-    for key, row in seen.items():
-        check_sample(key, row)
+    check_samples({row["__key__"]: row for row in stream}, TRAIN)
 
 
 def test_energon(dataset: Path, tmp_path: Path, foreign: None) -> None:
     """Its loader reads the export; its own preparation makes the same index of the same shards."""
     energon: Any = pytest.importorskip("megatron.energon")
     out = tmp_path / "out"
-    words = ["export", str(dataset), "--form", "energon", "--out", str(out), "--json"]
-    ended = trilight(words)
-    assert ended.exit_code == 0, ended.exception
-    told = json.loads(ended.stdout)
+    words = ["export", str(dataset), "--form", "energon", "--out"]
+    told = expect_json(*words, out)
     assert (told["scenes"], told["views"]) == (TRAIN + VALIDATION, VIEWS * (TRAIN + VALIDATION))
     for shard in open_dataset(str(dataset)).manifest.shards:
         assert (out / shard.name).read_bytes() == (dataset / shard.name).read_bytes()
@@ -123,9 +112,7 @@ def test_energon(dataset: Path, tmp_path: Path, foreign: None) -> None:
             batch_size=None,
         )
         seen = {sample["__key__"].split("/")[-1]: sample for sample in energon.get_loader(opened)}
-        assert sorted(seen) == keys(count, first)
-        for key, sample in seen.items():
-            check_sample(key, sample)
+        check_samples(seen, count, first)
 
     # its own preparation of the shards alone
     bare = tmp_path / "bare"
@@ -148,10 +135,10 @@ def test_energon(dataset: Path, tmp_path: Path, foreign: None) -> None:
     ours = json.loads((out / ".nv-meta/.info.json").read_text())["shard_counts"]
     assert ours == theirs
 
-    refused = trilight([*words[:4], "--out", str(tmp_path / "one"), "--scene", "1"])
-    assert "copies whole shards, and --scene names a sample" in str(refused.exception)
-    refused = trilight([*words[:4], "--out", str(tmp_path / "one"), "--split", "test"])
-    assert "no shard in split test; expected one of train, validation" in str(refused.exception)
+    refused = expect_mistake(*words, tmp_path / "one", "--scene", "1")
+    assert "copies whole shards, and --scene names a sample" in refused
+    refused = expect_mistake(*words, tmp_path / "one", "--split", "test")
+    assert "no shard in split test; expected one of train, validation" in refused
 
 
 STUDIO_STAGES = {

@@ -23,7 +23,7 @@ from storage.records.material import DIFFUSE, EMISSION, SPECULAR
 from storage.records.passes import view_passes
 from storage.records.sample import PictureErrors, Sample
 from storage.records.scene import Scene
-from tests.command_line import trilight
+from tests.command_line import expect_json, expect_mistake
 from tests.for_each import for_each
 from tests.foreign_packages import nerfstudio_pictures
 from tests.pipeline.documents.dataset_by_hand import (
@@ -46,17 +46,9 @@ KEYS = ("000000000", "000000001")
 def benchmark(tmp_path_factory: pytest.TempPathFactory) -> Path:
     root = tmp_path_factory.mktemp("set")
     write_toy_dataset(root / "toy", train=2, validation=1, per_shard=2, resolution=PX)
-    words = ["export", str(root / "toy"), "--form", "benchmark", "--split", "train"]
-    result = trilight([*words, "--out", str(root / "out"), "--json"])
-    assert result.exit_code == 0, result.exception
+    words = ["--form", "benchmark", "--split", "train"]
+    expect_json("export", root / "toy", *words, "--out", root / "out")
     return root / "out"
-
-
-def loaded_as_published(path: Path) -> dict[str, NDArray]:
-    """What the published inference loads of a file: five arrays, as float32, nothing else."""
-    with h5py.File(path) as file:
-        names = ("triangles", "texture", "vn", "c2w", "fov")
-        return {name: np.array(file[name]).astype(np.float32) for name in names}
 
 
 def rays_as_published(pose: NDArray, fov_deg: float, pixels: int) -> tuple[NDArray, NDArray]:
@@ -70,9 +62,14 @@ def rays_as_published(pose: NDArray, fov_deg: float, pixels: int) -> tuple[NDArr
 
 
 @pytest.mark.parametrize("key", KEYS)
-def test_the_published_loader_reads_what_our_network_reads(benchmark: Path, key: str) -> None:
+def test_the_published_loader_reads_what_our_network_reads_and_our_pictures_show(
+    benchmark: Path, key: str
+) -> None:
+    """The published inference loads five arrays of a file, as float32, nothing else."""
     sample = toy_sample(int(key), resolution=PX)
-    scene, found = sample.scene, loaded_as_published(benchmark / f"h5/{key}.h5")
+    scene, names = sample.scene, ("triangles", "texture", "vn", "c2w", "fov")
+    with h5py.File(benchmark / f"h5/{key}.h5") as file:
+        found = {name: np.array(file[name]).astype(np.float32) for name in names}
     count = scene.num_triangles
     assert {name: array.shape for name, array in found.items()} == {
         "triangles": (count, 3, 3), "vn": (count, 3, 3), "texture": (count, 13, 32, 32),
@@ -95,11 +92,7 @@ def test_the_published_loader_reads_what_our_network_reads(benchmark: Path, key:
     filled = np.add.outer(np.arange(32), np.arange(32)) <= 32
     np.testing.assert_array_equal(found["texture"] != 0, (texel != 0)[:, :, None, None] & filled)
 
-
-@pytest.mark.parametrize("key", KEYS)
-def test_published_rays_meet_the_triangles_of_our_pictures(benchmark: Path, key: str) -> None:
-    sample = toy_sample(int(key), resolution=PX)
-    found = loaded_as_published(benchmark / f"h5/{key}.h5")
+    # Published rays meet the triangles of our pictures.
     solid = np.where(sample.scene.triangle_emits[:, None, None], np.nan, found["triangles"])
     for view in range(VIEWS):
         pose = found["c2w"][view].astype(np.float64)
@@ -177,8 +170,7 @@ def _by_lobe(whole: Sample) -> Sample:
 
 def exported(dataset: Path, form: str, *words: str) -> Path:
     out = dataset.parent / form
-    result = trilight(["export", str(dataset), "--form", form, "--out", str(out), *words, "--json"])
-    assert result.exit_code == 0, result.exception
+    expect_json("export", dataset, "--form", form, "--out", out, *words)
     assert (out / "attribution.csv").read_text() == "uid\na\n"
     return out
 
@@ -313,23 +305,18 @@ def test_the_same_dataset_gives_the_same_bytes(dataset: Path, form: str) -> None
 
 
 def test_mistakes(dataset: Path, tmp_path: Path) -> None:
-    def refused(*words: str) -> str:
-        result = trilight(["export", str(dataset), *words])
-        assert result.exit_code != 0 and "\n" not in str(result.exception)
-        return str(result.exception)
-
-    (tmp_path / "full").mkdir()
-    (tmp_path / "full/x").touch()
-    full = ("--out", str(tmp_path / "full"))
-    assert "is not empty; expected a new folder" in refused("--form", "coco", *full)
-    new = ("--out", str(tmp_path / "new"))
-    said = refused("--form", "coco", "--split", "validation", *new)
+    full, new = tmp_path / "full", tmp_path / "new"
+    full.mkdir()
+    (full / "x").touch()
+    said = expect_mistake("export", dataset, "--form", "coco", "--out", full)
+    assert "is not empty; expected a new folder" in said
+    words = ["--form", "coco", "--out", str(new)]
+    said = expect_mistake("export", dataset, *words, "--split", "validation")
     assert "no scene in split validation" in said
-    other = trilight(["export", str(tmp_path / "full"), "--form", "coco", *new])
-    assert "no manifest.json" in str(other.exception)
+    assert "no manifest.json" in expect_mistake("export", full, *words)
     shards = {"train-000000.tar": [sample(0, furnished(["a"]))]}
     write_dataset(tmp_path / "one", shards, objects=[locked("a", "CC-BY-4.0")])
-    whole = str(trilight(["export", str(tmp_path / "one"), "--form", "hypersim", *new]).exception)
+    whole = expect_mistake("export", tmp_path / "one", "--form", "hypersim", "--out", new)
     assert "keeps all light together; expected diffuse and specular light apart" in whole
     assert "--set renders.split_lobes=true" in whole
 
@@ -347,13 +334,11 @@ def _alone(*, seen_sky: bool | None = None) -> Scene:
 
 @pytest.fixture
 def lone(tmp_path: Path) -> Path:
-    return attributed(tmp_path, {"train-000000.tar": [_covered(sample(0, _alone(seen_sky=False)))]})
-
-
-def _covered(made: Sample) -> Sample:
-    """Return a sample whose pictures are 0.6 times the share of each pixel that is covered."""
+    """A sample whose pictures are 0.6 times the share of each pixel that is covered."""
+    made = sample(0, _alone(seen_sky=False))
     pictures = [np.repeat(0.6 * _coverage(made, view)[..., None], 3, axis=-1) for view in (0, 1)]
-    return dataclasses.replace(made, radiance_rgb=np.stack(pictures).astype(np.float32))
+    made = dataclasses.replace(made, radiance_rgb=np.stack(pictures).astype(np.float32))
+    return attributed(tmp_path, {"train-000000.tar": [made]})
 
 
 def _coverage(made: Sample, view: int) -> NDArray[np.float64]:
@@ -361,12 +346,10 @@ def _coverage(made: Sample, view: int) -> NDArray[np.float64]:
     return np.asarray(view_passes(made.scene, ["coverage"], **asked)["coverage"], np.float64)
 
 
-def test_a_floor_and_a_seen_sky_are_behind_objects() -> None:
+def test_nerfstudio_pictures_have_straight_alpha(lone: Path) -> None:
+    """A floor and a seen sky are behind objects."""
     assert stands_alone(_alone()) and stands_alone(_alone(seen_sky=False))
     assert not (stands_alone(_alone(seen_sky=True)) or stands_alone(furnished(["a"])))
-
-
-def test_nerfstudio_pictures_have_straight_alpha(lone: Path) -> None:
     folder = exported(lone, "nerfstudio") / "000000000"
     (made,) = open_dataset(str(lone)).samples("train")
     for view, frame in enumerate(json.loads((folder / "transforms.json").read_text())["frames"]):

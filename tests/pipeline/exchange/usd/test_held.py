@@ -28,9 +28,9 @@ from storage.records.material import EMISSION, PUBLISHED_COLUMNS
 from storage.records.retextured import with_textures
 from storage.records.scene import Scene
 from storage.records.scene_file import encode_scene
-from storage.records.texture import CONSTANT, Environment, MapSource, Texture
+from storage.records.texture import CONSTANT, MapSource, Texture
 from tests.columns_kit import COAT, WAVES, declared
-from tests.command_line import trilight
+from tests.command_line import expect_output
 from tests.for_each import case, for_each, with_folders
 from tests.pipeline.exchange.exchange_kit import edited_layer as edited
 from tests.pipeline.scenes.example_scenes import example_scene
@@ -108,32 +108,27 @@ EDITS = [
 """Column, changed attribute, its value, the value that is read, and the place in its note."""
 
 
-def assert_changed(found: LoadedScene, scene: Scene, column: str, value: Any, place: str) -> None:
-    """The column of the floor alone has the value, and one note says from where."""
-    expected = rows(scene).copy()
-    expected[:2, COLUMNS[column][0]] = value
-    emits = [2, 0, 1] if column == "emission" else [0, 1, 2]
-    sorted_rows = np.sort(rows(found.scene), axis=0)
-    wanted = np.sort(expected[emits], axis=0)
-    if place == "its shader OpenPBR":
-        assert sorted_rows == pytest.approx(wanted, rel=1e-5)
-    else:
-        assert np.array_equal(sorted_rows, wanted)
-    (said,) = [text for text in found.notes if " was changed since" in text]
-    assert said.startswith(f"{MATERIAL}: {column} was changed")
-    assert f"the value of {place} is used" in said
-
-
 @for_each("besides", [set_values(), move_light, as_blender_writes])
 def test_an_edit_changes_its_column_alone(tmp_path: Path, besides: Edit) -> None:
-    """Of each column in each place; Blender keeps what stands in the preview alone."""
+    """Of each column in each place, with a note; Blender keeps what is in the preview alone."""
     in_blender = besides is as_blender_writes
     kept = [e for e in EDITS if not in_blender or ("/Preview" in e[1] and e[0] != "specular")]
     assert len(kept) == 3 if in_blender else {e[0] for e in kept} == set(PUBLISHED_COLUMNS)
     for folder, (column, path, value, read, place) in with_folders(tmp_path, kept):
         with case(path):
             found = edited(folder, tiny_scene(), set_values((path, value), besides=besides))
-            assert_changed(found, tiny_scene(), column, read, place)
+            expected = rows(tiny_scene()).copy()
+            expected[:2, COLUMNS[column][0]] = read
+            emits = [2, 0, 1] if column == "emission" else [0, 1, 2]
+            sorted_rows = np.sort(rows(found.scene), axis=0)
+            wanted = np.sort(expected[emits], axis=0)
+            if place == "its shader OpenPBR":
+                assert sorted_rows == pytest.approx(wanted, rel=1e-5)
+            else:
+                assert np.array_equal(sorted_rows, wanted)
+            (said,) = [text for text in found.notes if " was changed since" in text]
+            assert said.startswith(f"{MATERIAL}: {column} was changed")
+            assert f"the value of {place} is used" in said
 
 
 def test_constants_beside_textures_are_read_where_they_were_changed(tmp_path: Path) -> None:
@@ -151,19 +146,6 @@ def test_constants_beside_textures_are_read_where_they_were_changed(tmp_path: Pa
     assert [t.sha256 for t in found.scene.textures] == [t.sha256 for t in textured_scene().textures]
 
 
-def test_of_several_changes_the_first_place_counts(tmp_path: Path) -> None:
-    cases = [
-        (((".trilight:roughness", 0.9), (PREVIEW, 0.7)), "not of its shader Preview or its"),
-        (((PREVIEW, 0.7), (OPENPBR, 0.8)), "not of its shader OpenPBR"),
-        (((PREVIEW, 0.7), (OPENPBR, 0.7)), "the value of its shader Preview is used"),
-        (((".trilight:roughness", 0.9), (OPENPBR, 0.8)), "not of its shader OpenPBR"),
-    ]
-    for folder, (changed, said) in with_folders(tmp_path, cases):
-        found = edited(folder, tiny_scene(), set_values(*changed))
-        assert rows(found.scene)[0, 6] == np.float32(changed[0][1]), changed
-        assert any(said in text for text in found.notes), changed
-
-
 def test_a_change_that_no_column_holds_is_said(tmp_path: Path) -> None:
     cases = {"/OpenPBR.inputs:base_diffuse_roughness": 0.5, "/Preview.inputs:ior": 1.5}
     cases |= {"/Preview.inputs:useSpecularWorkflow": 0}
@@ -172,14 +154,6 @@ def test_a_change_that_no_column_holds_is_said(tmp_path: Path) -> None:
         assert np.array_equal(rows(found.scene), rows(tiny_scene())), path
         said = f"{MATERIAL}{path.replace('inputs:', '')}: has no place here"
         assert [said] == [t for t in found.notes if "no place" in t]
-
-
-def test_an_added_column_is_read_as_it_was_changed(tmp_path: Path) -> None:
-    with declared(COAT):
-        scene = tiny_scene()
-        scene.materials[:, -1] = 0.5
-        found = edited(tmp_path, scene, set_values((".trilight:column:coat", 0.25)))
-        assert rows(found.scene)[:, -1].tolist() == [0.25, 0.25, 0.5]
 
 
 @pytest.mark.parametrize("specular", [False, True])
@@ -220,21 +194,38 @@ def spoil(layer: Any) -> None:
     layer.GetAttributeAtPath(f"{MATERIAL}.trilight:diffuseAlbedo").default = (0.5, np.nan, 7.0)
 
 
-def test_what_is_no_longer_so_is_said(tmp_path: Path) -> None:
-    cases: list[tuple[Edit, tuple[float, ...], str]] = [
-        (drop_shader, (0.5, 0.4, 0.3, 0.2, 0.2, 0.2), "the values that Trilight wrote are used"),
-        (to_metal, (0, 0, 0, 11 / 21, 9 / 21, 7 / 21), "became a metal"),
-        (spoil, (0.5, 0.4, 0.3, 0.2, 0.2, 0.2), "diffuseAlbedo: expected 3 numbers from 0 to 1"),
-        (drop_preview, (0.1, 0.4, 0.3, 0.2, 0.2, 0.2), "the value of its shader OpenPBR is used"),
+def test_what_is_no_longer_so_is_said_and_of_several_changes_the_first_place_counts(
+    tmp_path: Path,
+) -> None:
+    was, ours = [0.5, 0.4, 0.3, 0.2, 0.2, 0.2], ".trilight:roughness"
+    to_seven, to_eight, alike = (PREVIEW, 0.7), (OPENPBR, 0.8), (OPENPBR, 0.7)
+    cases: list[tuple[Edit, list[float], str]] = [
+        (drop_shader, was, "the values that Trilight wrote are used"),
+        (to_metal, [0, 0, 0, 11 / 21, 9 / 21, 7 / 21], "became a metal"),
+        (spoil, was, "diffuseAlbedo: expected 3 numbers from 0 to 1"),
+        (drop_preview, [0.1, *was[1:]], "the value of its shader OpenPBR is used"),
+        (set_values((ours, 0.9), to_seven), [*was, 0.9], "not of its shader Preview or its"),
+        (set_values(to_seven, to_eight), [*was, 0.7], "not of its shader OpenPBR"),
+        (set_values(to_seven, alike), [*was, 0.7], "the value of its shader Preview is used"),
+        (set_values((ours, 0.9), to_eight), [*was, 0.9], "not of its shader OpenPBR"),
     ]
-    for folder, (edit, albedos, said) in with_folders(tmp_path, cases):
+    for folder, (edit, values, said) in with_folders(tmp_path, cases):
         found = edited(folder, tiny_scene(), edit)
-        assert rows(found.scene)[0, :6] == pytest.approx(albedos, rel=1e-6), said
+        assert rows(found.scene)[0, : len(values)] == pytest.approx(values, rel=1e-6), said
+        assert len(values) == 6 or rows(found.scene)[0, 6] == np.float32(values[6]), said
         assert any(said in text for text in found.notes), said
         assert np.array_equal(rows(found.scene)[2], rows(tiny_scene())[2]), said
 
 
-def test_a_column_that_blender_drops_is_named(tmp_path: Path) -> None:
+def test_an_added_column_is_read_as_it_was_changed_and_named_where_blender_drops_it(
+    tmp_path: Path,
+) -> None:
+    with declared(COAT):
+        scene = tiny_scene()
+        scene.materials[:, -1] = 0.5
+        found = edited(tmp_path, scene, set_values((".trilight:column:coat", 0.25)))
+        assert rows(found.scene)[:, -1].tolist() == [0.25, 0.25, 0.5]
+
     def drop_array(layer: Any) -> None:
         as_blender_writes(layer)
         for material in layer.GetPrimAtPath("/Scene/Materials").nameChildren:
@@ -344,12 +335,16 @@ def test_the_tutorial_keeps_everything(
     if name == "map":
         assert scene.uv is not None
         mirrored = dataclasses.replace(scene, uv=scene.uv * np.array([-1, 1], np.float32))
-        turned = dataclasses.replace(scene, environment=_turned(scene.environment))
+        assert scene.environment is not None
+        quarter = np.array([[0, -1, 0], [1, 0, 0], [0, 0, 1]], np.float32)
+        rotation = (scene.environment.rotation @ quarter).astype(np.float32)
+        sky = dataclasses.replace(scene.environment, rotation=rotation)
+        turned = dataclasses.replace(scene, environment=sky)
         assert max(_db(mirrored, theirs), _db(turned, theirs)) < 25
     found = read_usd(tmp_path / "back.usdc")
     assert_kept(found, scene, lamp, painted)
-    done = trilight(["convert", str(tmp_path / "back.usdc"), str(tmp_path / "back.safetensors")])
-    assert done.exit_code == 0 and "diffuse was changed" in " ".join(done.output.split())
+    said = expect_output("convert", tmp_path / "back.usdc", tmp_path / "back.safetensors")
+    assert "diffuse was changed" in " ".join(said.split())
 
 
 def assert_shown(facts: dict[str, Any], scene: Scene) -> None:
@@ -414,12 +409,6 @@ def _worn(scene: Scene) -> list[tuple[Any, ...]]:
     return worn
 
 
-def _turned(sky: Environment | None) -> Environment:
-    assert sky is not None
-    quarter = np.array([[0, -1, 0], [1, 0, 0], [0, 0, 1]], np.float32)
-    return dataclasses.replace(sky, rotation=(sky.rotation @ quarter).astype(np.float32))
-
-
 def _db(scene: Scene, theirs: NDArray[np.float32]) -> float:
     return psnr_linear_db(ours(scene, RESOLUTION, SPP), theirs)
 
@@ -451,13 +440,9 @@ def test_a_scene_that_blender_exports_looks_as_blender_renders_it(
     record_property("psnr_linear_db", round(agreement, 2))
     assert agreement > 36
     assert ratio == pytest.approx([1, 1, 1], abs=0.05)
-    assert_read(found)
+    # What Blender says of the scene that it made: faces, colours, watts, angle, and losses.
     again = read_usd(tmp_path / "instances.usdc")
     assert sizes(again) == sizes(found)  # instances or copies: the same triangles
-
-
-def assert_read(found: LoadedScene) -> None:
-    """What Blender says of the scene that it made: faces, colours, watts, angle, and losses."""
     scene = found.scene
     assert sizes(found) == {
         "Grid": 512, "Plane": 2, "Cylinder": 12 * 2 + 2 * 10, "Sphere": 24 * 22, "Suzanne": 968,

@@ -33,7 +33,7 @@ from storage.records.lookup import environment_values
 from storage.records.scene import Scene, SceneObject
 from storage.records.scene_file import encode_scene, scene_digest
 from storage.records.texture import Environment, MapSource, Texture
-from tests.for_each import for_each, with_folders
+from tests.for_each import with_folders
 from tests.pipeline.exchange.exchange_kit import assert_usd_keeps_all, edited_layer, errors_of
 from tests.pipeline.foreign.test_light_pictures import radiance_hdr
 from tests.scenes_by_hand import FLOOR, LIGHT, tiny_scene
@@ -337,31 +337,27 @@ def test_a_dome_without_a_file_is_even_and_may_be_the_only_light(tmp_path: Path)
     np.testing.assert_allclose(_sky(found).radiance_rgb, [[[1, 0.5, 0.25]] * 2])
 
 
-@for_each(
-    "asset, expected",
-    [
-        ("./missing.exr", "is missing"),
-        ("./text.exr", "is not read"),
-        ("./wide.exr", "shape"),
-        ("./a.hdr", [0.5, 1, 0.25]),
-        ("./a.png", linear_from_srgb8()[[188] * 3]),
-    ],
-)
-def test_a_map_is_read_or_named(tmp_path: Path, asset: str, expected: Any) -> None:
+def test_a_map_is_read_or_named(tmp_path: Path) -> None:
     texels = np.full((2, 4, 4), (64, 128, 32, 130), np.uint8)
     (tmp_path / "a.hdr").write_bytes(radiance_hdr(texels, header="EXPOSURE=2\n"))
     Image.fromarray(np.full((2, 4, 3), 188, np.uint8)).save(tmp_path / "a.png")
     (tmp_path / "text.exr").write_bytes(b"no picture")
     wide = encode_channels({"RGB": np.ones((4, 4, 3), np.float32)})
     (tmp_path / "wide.exr").write_bytes(wide)
-    path = Sdf.AssetPath(asset)
-    found = edited(tmp_path / "a.usda", lambda stage, light: light.GetTextureFileAttr().Set(path))
-    if isinstance(expected, str):
-        assert found.scene.environment is None
-        assert any(expected in text for text in found.notes)
-    else:
-        radiance = _sky(found.scene).radiance_rgb
-        np.testing.assert_allclose(radiance, np.broadcast_to(expected, (2, 4, 3)), rtol=1e-6)
+
+    def read(name: str) -> LoadedScene:
+        asset = Sdf.AssetPath(f"./{name}")
+        path = tmp_path / f"{name}.usda"
+        return edited(path, lambda stage, light: light.GetTextureFileAttr().Set(asset))
+
+    wrong = {"missing.exr": "is missing", "text.exr": "is not read", "wide.exr": "shape"}
+    for name, said in wrong.items():
+        found = read(name)
+        assert found.scene.environment is None, name
+        assert any(said in text for text in found.notes), name
+    for name, rgb in (("a.hdr", [0.5, 1, 0.25]), ("a.png", linear_from_srgb8()[[188] * 3])):
+        radiance = _sky(read(name).scene).radiance_rgb
+        np.testing.assert_allclose(radiance, np.broadcast_to(rgb, (2, 4, 3)), rtol=1e-6)
 
 
 def _all_textured() -> Scene:

@@ -242,12 +242,20 @@ def test_a_sun_of_a_million_keeps_its_energy(height: int) -> None:
     np.testing.assert_allclose(solid_angle_means(ones, min(height, 7)), 1, rtol=1e-12)
 
 
-def test_means_are_those_of_the_overlaps() -> None:
-    """Against a slow twin that cuts both grids into a common one."""
+def test_means_are_those_of_the_overlaps_of_linear_values_and_of_widths() -> None:
+    """Against a slow twin that cuts both grids into a common one.
+
+    Black and white squares are half as bright together, which encoded ones are not.
+    """
     values = np.random.default_rng(0).random((6, 4, 2))
     fine = np.repeat(np.repeat(values, 10, axis=0), 9, axis=1)  # 60 x 36
     twin = fine.reshape(4, 15, 3, 12, 2).mean(axis=(1, 3))
     np.testing.assert_allclose(area_means(values, 4, 3), twin, rtol=1e-12)
+    squares: NDArray[np.float32] = np.zeros((8, 8, 1), np.float32)
+    squares[::2, 1::2] = squares[1::2, ::2] = 1
+    made = texture_set({"base": squares, "specular": _flat(0.0), "roughness": squares}, 2)
+    np.testing.assert_allclose(made.arrays["diffuse"], 0.5, rtol=1e-6)
+    np.testing.assert_allclose(made.arrays["roughness"], np.sqrt(0.5), rtol=1e-6)
 
 
 def _with(value: float) -> NDArray[np.float32]:
@@ -293,15 +301,6 @@ def test_a_base_colour_is_a_dielectric_or_a_metal_or_leaves_no_room_for_gloss() 
     white = texture_set({"base": _flat(1.0, 3), "specular": _flat(0.5)}, 8)
     assert white.arrays["diffuse"].min() == 1 and white.arrays["specular"].max() == 0
     assert white.arrays["specular"].shape == (4, 4, 3)
-
-
-def test_means_are_of_linear_values_and_of_widths() -> None:
-    """Black and white squares are half as bright together, which encoded ones are not."""
-    squares: NDArray[np.float32] = np.zeros((8, 8, 1), np.float32)
-    squares[::2, 1::2] = squares[1::2, ::2] = 1
-    made = texture_set({"base": squares, "specular": _flat(0.0), "roughness": squares}, 2)
-    np.testing.assert_allclose(made.arrays["diffuse"], 0.5, rtol=1e-6)
-    np.testing.assert_allclose(made.arrays["roughness"], np.sqrt(0.5), rtol=1e-6)
 
 
 def test_proportions_stay_parts_of_other_sizes_fit_and_the_content_is_the_base_colour() -> None:

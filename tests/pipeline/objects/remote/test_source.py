@@ -16,7 +16,7 @@ from pipeline.objects.sources import list_objects
 from storage.errors import TrilightError
 from storage.remote import url as remote_url
 from storage.remote.url import PACKAGES, RemoteUrl, open_driver, parse_url
-from tests.for_each import case, for_each
+from tests.for_each import case
 from tests.http_server import Fault, Site, serve
 from tests.pipeline.objects.conftest import find, reasons, refusal
 
@@ -152,18 +152,17 @@ def test_a_bucket_is_listed_at_once_and_what_is_not_wanted_stays_there(
     assert sorted(bucket.fetched) == ["bucket/set/a?b#c%20.obj", "bucket/set/x/d.obj"]
 
 
-def test_a_folder_is_no_catalogue_whatever_its_name(bucket: _Bucket) -> None:
-    bucket.files = {"bucket/objects.csv/a.obj": b"a"}
-    (record,) = find("s3://bucket").records
-    assert record.uid == "objects.csv/a"
-
-
-def test_a_catalogue_that_changed_nothing_is_looked_up_in_one_listing(bucket: _Bucket) -> None:
+def test_a_catalogue_that_changed_nothing_is_looked_up_in_one_listing_and_a_folder_is_none(
+    bucket: _Bucket,
+) -> None:
     rows = [{"uid": name, "path": f"{name}.obj", "licence": "MIT"} for name in "abc"]
     bucket.files["bucket/objects.jsonl"] = "\n".join(map(json.dumps, rows)).encode()
     found = find("s3://bucket")
     bucket.listed.clear()
     assert find("s3://bucket") == found and len(bucket.listed) == 1
+    bucket.files = {"bucket/objects.csv/a.obj": b"a"}
+    (record,) = find("s3://bucket").records
+    assert record.uid == "objects.csv/a"
 
 
 def gltf(*uris: str) -> str:
@@ -352,39 +351,31 @@ def grow_in_secret(site: Site) -> None:
     always("/b.obj", no_length=True)(site)
 
 
-@for_each(
-    "breaks, reason, message",
-    [
+def test_one_dead_link_costs_one_object(site: Site, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(remote_source, "MAX_BYTES", 1000)
+    monkeypatch.setattr(remote_url, "_SILENCE_S", 0.15)
+    rows: list[tuple[Callable[[Site], object], str, str]] = [
         (always("/b.obj", status=404), "download_failed", "no such file"),
         (always("/b.obj", status=500), "download_failed", "status 500"),
         (always("/b.obj", cut_after=3), "download_failed", "Payload"),
         (grow, "too_large_bytes", "2000 bytes; expected <= 1000"),
         (grow_in_secret, "too_large_bytes", "longer than 1000 bytes"),
         (always("/b.obj", silent=True), "download_failed", "no answer in time"),
-    ],
-)
-def test_one_dead_link_costs_one_object(
-    site: Site,
-    monkeypatch: pytest.MonkeyPatch,
-    breaks: Callable[[Site], object],
-    reason: str,
-    message: str,
-) -> None:
-    monkeypatch.setattr(remote_source, "MAX_BYTES", 1000)
-    monkeypatch.setattr(remote_url, "_SILENCE_S", 0.15)
-    site.always.clear()
-    site.requests.clear()
-    for name in "abc":
-        site.put(f"{name}.obj", f"content of {name}")
-    breaks(site)
-    found = find(f"{site.url.replace('//', '//lovelace:s3cret@')}/?key=s3cret")
-    assert [record.uid for record in found.records] == ["a", "c"]
-    assert reasons(found) == {"b": reason}
-    text = found.failures[0].message
-    assert message in text
-    assert "s3cret" not in text and "lovelace" not in text and "Traceback" not in text
-    assert not list(Path(found.records[0].path).parent.glob("b.obj*"))
-    assert breaks is not grow or not site.gets()["/b.obj"]
+    ]
+    for breaks, reason, message in rows:
+        site.always.clear()
+        site.requests.clear()
+        for name in "abc":
+            site.put(f"{name}.obj", f"content of {name}")
+        breaks(site)
+        found = find(f"{site.url.replace('//', '//lovelace:s3cret@')}/?key=s3cret")
+        assert [record.uid for record in found.records] == ["a", "c"], message
+        assert reasons(found) == {"b": reason}, message
+        text = found.failures[0].message
+        assert message in text
+        assert "s3cret" not in text and "lovelace" not in text and "Traceback" not in text
+        assert not list(Path(found.records[0].path).parent.glob("b.obj*")), message
+        assert breaks is not grow or not site.gets()["/b.obj"]
 
 
 def forbid(name: str) -> Callable[[Site], None]:
