@@ -10,7 +10,7 @@ that its lobe draws. Each direction counts by the density of all of them togethe
 heuristic, Veach and Guibas 1995). Unbiased.
 """
 
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from dataclasses import dataclass, fields
 
 import numpy as np
@@ -38,6 +38,9 @@ _LEAST = np.float32(1e-20)
 """Least density of rays towards the sky, so that nothing is divided by 0."""
 
 
+RowsOfPoints = NDArray[np.intp] | slice
+
+
 @dataclass(frozen=True, kw_only=True, eq=False)
 class DirectLight:
     """Light of lamps and the sky at P points, [3, P] each."""
@@ -52,8 +55,8 @@ class DirectLight:
     """Specular radiance towards the viewer, shadowed."""
 
 
-def no_light(points: Points) -> DirectLight:
-    """Return zeros, to which light may be added."""
+def _no_light(points: Points) -> DirectLight:
+    """Return zeros, to which light is added."""
     return DirectLight(
         **{each.name: np.zeros_like(points.position) for each in fields(DirectLight)}
     )
@@ -63,7 +66,9 @@ def direct_light(
     scene: LitScene,
     points: Points,
     gloss: Gloss | None,
-    on_lamps: Callable[[slice], Floats],
+    shift: Floats,
+    pixel: RowsOfPoints,
+    ray_index: NDArray[np.intp] | int,
     *,
     lobe_rays: int,
 ) -> DirectLight:
@@ -71,16 +76,19 @@ def direct_light(
 
     Args:
         gloss: the lobes there; None where the specular part is not wanted, which is then 0.
-        on_lamps: returns where on the triangles of some lamps, [2, l, P] in the unit square.
+        shift: [2, lamps, pixels] uniform numbers.
+        pixel: [P] column of `shift` of each point, or their range.
+        ray_index: which of the rays of its pixel a point is ([P]), whose places all differ.
         lobe_rays: 1 where a ray is drawn by the lobe at each of these points too: what such rays
             are better at finding is left to them (the power heuristic, Veach and Guibas 1995).
     """
-    light = no_light(points)
+    light = _no_light(points)
     lit_points = points.only(None)  # arrays are [3, l, P] and [l, P]
     gloss = None if gloss is None else gloss.only(None)
     for some in _some_lamps(scene, points):
         lamps = scene.lamps[some]
-        place = _on_triangle(scene, lamps[:, None], on_lamps(some))
+        u = spread(at_rows(shift[:, some], pixel), ray_index)
+        place = _on_triangle(scene, lamps[:, None], u)
         to_lamp = place - lit_points.position
         square = np.maximum(dot(to_lamp, to_lamp), np.float32(1e-12))
         to_lamp = to_lamp / np.sqrt(square)
@@ -245,27 +253,27 @@ def _on_triangle(scene: LitScene, rows: NDArray[np.intp], u: Floats) -> Floats:
     return place
 
 
-def add_sky_light(
-    light: DirectLight,
+def sky_light(
     scene: LitScene,
     points: Points,
     gloss: Gloss | None,
     shift: Floats,
+    pixel: RowsOfPoints,
     ray_index: NDArray[np.intp] | int,
     *,
     rays: int,
     lobe_rays: int,
-) -> None:
-    """Add the light of a scene's sky to that of its lamps.
+) -> DirectLight:
+    """Return the light of a scene's sky.
 
     Args:
-        light: what is added to.
         scene: has a sky.
-        points, gloss, lobe_rays: as in `direct_light`.
-        shift: [2, P] uniform numbers.
-        ray_index: which of the rays of its pixel a point is ([P]), whose directions all differ.
+        points, gloss, pixel, ray_index, lobe_rays: as in `direct_light`.
+        shift: [2, pixels] uniform numbers.
         rays: towards the sky from each point, half of them, or one more, by the map.
     """
+    light = _no_light(points)
+    shift = at_rows(shift, pixel)
     for number in range(rays):
         u = spread(shift, ray_index * rays + number)
         if number < _by_map(rays):
@@ -291,6 +299,7 @@ def add_sky_light(
             colored = gloss.color[:, useful] * specular[useful] * radiance
             light.open_specular[:, useful] += colored
             light.specular[:, useful] += colored * is_free
+    return light
 
 
 def _by_map(rays: int) -> int:
@@ -299,7 +308,7 @@ def _by_map(rays: int) -> int:
 
 
 def sky_density(scene: LitScene, direction: Floats, cosine: Floats, rays: int) -> Floats:
-    """Return the number of rays [P] that `add_sky_light` sends along directions, per steradian."""
+    """Return the number of rays [P] that `sky_light` sends along directions, per steradian."""
     density: Floats = _by_map(rays) * scene.drawn_sky.pdf(direction)
     density += (rays - _by_map(rays)) * _INV_PI * np.maximum(cosine, 0)
     return np.maximum(density, _LEAST)
@@ -310,13 +319,13 @@ def escaped_light(
 ) -> Floats:
     """Return the sky's light along directions [3, P] that the lobe has drawn, without shadows.
 
-    It is weighed for use with `add_sky_light` of so many rays and one by the lobe.
+    It is weighed for use with `sky_light` of so many rays and one by the lobe.
 
     Args:
         scene: has a sky.
         points, gloss: where the rays begin.
         direction, weight: of `sample_lobe`.
-        rays: as in `add_sky_light`.
+        rays: as in `sky_light`.
     """
     cosine = dot(points.normal, direction)
     _, of_lobe = lobe(gloss, points, direction, cosine)

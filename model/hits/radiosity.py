@@ -3,14 +3,14 @@
 One number a side of a triangle, which a scene's tokens and gathering rays read.
 """
 
-from collections.abc import Callable
 from dataclasses import dataclass, replace
 from functools import cached_property
+from itertools import product
 
 import numpy as np
 from numpy.typing import NDArray
 
-from model.hits.direct_light import add_sky_light, direct_light, no_light
+from model.hits.direct_light import direct_light, sky_light
 from model.hits.lit_scene import LitScene, Points
 from model.hits.vectors import Floats, cosine_direction, spread
 from storage.seeds import rng_for
@@ -72,7 +72,7 @@ def scene_light(scene: LitScene) -> SceneLight:
     direct = _direct(scene, rng)
     sky = None
     if scene.sky is not None:
-        sky = _from_sky(scene, rng_for(0, "radiosity of a sky"))
+        sky = _direct(scene, rng_for(0, "radiosity of a sky"), of_sky=True)
         direct = direct + sky
     indirect = _bounce_light(scene, direct, rng)
     weight = scene.area / max(float(2 * scene.area.sum()), 1e-12)
@@ -85,48 +85,23 @@ def scene_light(scene: LitScene) -> SceneLight:
     )
 
 
-def _direct(scene: LitScene, rng: np.random.Generator) -> Floats:
-    """Return the light of the lamps [2, T, 3], with its shadows."""
-    num_sides = 2 * scene.num_triangles
-    if not len(scene.lamps):
-        return np.zeros((2, scene.num_triangles, 3), np.float32)
-    on_triangle = rng.random((2, num_sides), np.float32)
-    on_lamps = rng.random((2, len(scene.lamps), num_sides), np.float32)
-
-    def from_lamps(points: Points, some: slice, trial: int) -> Floats:
-        def on_some(lamps: slice) -> Floats:
-            return spread(on_lamps[:, lamps, some], trial)
-
-        return direct_light(scene, points, None, on_some, lobe_rays=0).diffuse
-
-    return _mean_of_sides(scene, on_triangle, from_lamps)
-
-
-def _from_sky(scene: LitScene, rng: np.random.Generator) -> Floats:
-    """Return the light of the sky [2, T, 3], with its shadows."""
-    on_triangle = rng.random((2, 2 * scene.num_triangles), np.float32)
-    towards = rng.random((2, 2 * scene.num_triangles), np.float32)
-
-    def from_sky(points: Points, some: slice, trial: int) -> Floats:
-        light = no_light(points)
-        shift = towards[:, some]
-        add_sky_light(light, scene, points, None, shift, trial, rays=SKY_RAYS, lobe_rays=0)
-        return light.diffuse
-
-    return _mean_of_sides(scene, on_triangle, from_sky)
-
-
-def _mean_of_sides(
-    scene: LitScene, on_triangle: Floats, light_at: Callable[[Points, slice, int], Floats]
-) -> Floats:
-    """Return the mean [2, T, 3] of the light [3, P] at some points of each side, block by block."""
+def _direct(scene: LitScene, rng: np.random.Generator, *, of_sky: bool = False) -> Floats:
+    """Return the light of the lamps, or of the sky, [2, T, 3], with its shadows, block by block."""
     rows = np.arange(2 * scene.num_triangles)  # all sides, T front ones first
     total = np.zeros((3, len(rows)), np.float32)
-    for trial in range(DIRECT_POINTS):
-        places = spread(on_triangle, trial)
-        for first in range(0, len(rows), _BLOCK):
+    if of_sky or len(scene.lamps):
+        on_triangle = rng.random((2, len(rows)), np.float32)
+        lamps = () if of_sky else (len(scene.lamps),)
+        towards = rng.random((2, *lamps, len(rows)), np.float32)
+        for trial, first in product(range(DIRECT_POINTS), range(0, len(rows), _BLOCK)):
             some = slice(first, first + _BLOCK)
-            total[:, some] += light_at(_points(scene, rows[some], places[:, some]), some, trial)
+            points = _points(scene, rows[some], spread(on_triangle[:, some], trial))
+            drawn = towards, some, trial
+            if of_sky:
+                light = sky_light(scene, points, None, *drawn, rays=SKY_RAYS, lobe_rays=0)
+            else:
+                light = direct_light(scene, points, None, *drawn, lobe_rays=0)
+            total[:, some] += light.diffuse
     mean = total / np.float32(DIRECT_POINTS)
     return np.ascontiguousarray(mean.T).reshape(2, scene.num_triangles, 3)
 

@@ -27,11 +27,10 @@ from model.hits.anchors import (
 from model.hits.device_arrays import DeviceArray, aside
 from model.hits.direct_light import (
     DirectLight,
-    add_sky_light,
     direct_light,
     escaped_light,
     lobe_ray_weight,
-    no_light,
+    sky_light,
 )
 from model.hits.lit_scene import Gloss, LitScene, PerPoint, Points, gloss_at, sample_lobe
 from model.hits.vectors import Floats, at_rows, brightest, dot, spread
@@ -160,19 +159,14 @@ def _add_pixels(
         return
     with aside(scene.device) as join_direct:
         _add_surface(block, scene, rays.origin)
-
-        def on_lamps(some: slice) -> Floats:
-            return spread(at_rows(noise.on_lamps[:, some], block.pixel), block.ray_index)
-
-        lit = direct_light(scene, block.points, block.gloss, on_lamps, lobe_rays=int(has_lobe_rays))
+        lobe_rays = int(has_lobe_rays)
+        at = block.points, block.gloss
+        ray = block.pixel, block.ray_index
+        lit = direct_light(scene, *at, noise.on_lamps, *ray, lobe_rays=lobe_rays)
         _add_light(block, scene, lit)
         if noise.to_sky is not None:
-            lit = no_light(block.points)
-            shift = noise.to_sky[:, block.pixel]
-            add_sky_light(
-                lit, scene, block.points, block.gloss, shift, block.ray_index,
-                rays=config.sky_rays, lobe_rays=int(has_lobe_rays),
-            )  # fmt: skip
+            sky_rays = config.sky_rays
+            lit = sky_light(scene, *at, noise.to_sky, *ray, rays=sky_rays, lobe_rays=lobe_rays)
             _add_light(block, scene, lit)
     if has_lobe_rays:
         u = at_rows(noise.chance[:5], by_lobe.pixel)

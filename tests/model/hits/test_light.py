@@ -23,7 +23,7 @@ from model.hits.decoder import (
     LightFilter,
     _mean_around,
 )
-from model.hits.direct_light import add_sky_light, escaped_light, no_light, sees_sky
+from model.hits.direct_light import escaped_light, sees_sky, sky_light
 from model.hits.lit_scene import (
     Gloss,
     LitScene,
@@ -407,12 +407,11 @@ def test_the_lobe_ray_and_the_others_share_what_a_mirror_shows() -> None:
     hits = lit.first_hits(eye, rays)
     assert (hits.triangle >= 0).all()
     points = lit.points(hits.triangle, hits.uv, rays)
-    light, gloss = no_light(points), gloss_at(lit, points)
+    gloss = gloss_at(lit, points)
     shift = np.random.default_rng(0).random((2, 4_000), np.float32)
-    add_sky_light(light, lit, points, gloss, shift, 0, rays=8, lobe_rays=0)
+    light = sky_light(lit, points, gloss, shift, slice(None), 0, rays=8, lobe_rays=0)
     alone = light.specular.mean(axis=1)
-    shared = no_light(points)
-    add_sky_light(shared, lit, points, gloss, shift, 0, rays=8, lobe_rays=1)
+    shared = sky_light(lit, points, gloss, shift, slice(None), 0, rays=8, lobe_rays=1)
     direction, weight = sample_lobe(
         gloss, points, np.random.default_rng(1).random((2, 4_000), np.float32)
     )
