@@ -16,7 +16,7 @@ from typing import Any, cast
 
 import torch
 from torch import Tensor, nn
-from torch.nn.functional import interpolate, silu, softplus
+from torch.nn.functional import interpolate, pixel_shuffle, pixel_unshuffle, silu, softplus
 
 from model.attention import Packing, Windows, cut_windows
 from model.config import NUM_TAPS, ModelConfig
@@ -48,17 +48,13 @@ def ray_directions(fov_deg_V: Tensor, resolution: int) -> Tensor:
 
 def bundle_rays(direction_V3RR: Tensor, patch_px: int) -> Tensor:
     """[..., 3, R, R] -> [..., Q, 3 P P]: bundles row by row, each flattened channel-major."""
-    per_side = direction_V3RR.shape[-1] // patch_px
-    grid = direction_V3RR.unflatten(-1, (per_side, patch_px)).unflatten(-3, (per_side, patch_px))
-    bundles = torch.movedim(grid, (-4, -2), (-5, -4))
-    return bundles.flatten(-5, -4).flatten(-3)
+    return pixel_unshuffle(direction_V3RR, patch_px).flatten(-2).mT.contiguous()
 
 
 def unbundle(bundles_MQC: Tensor, patch_px: int) -> Tensor:
     """[M, Q, C P P] -> [M, C, R, R]: the inverse of `bundle_rays` for a square picture."""
     per_side = round(bundles_MQC.shape[1] ** 0.5)
-    grid = bundles_MQC.unflatten(2, (-1, patch_px, patch_px)).unflatten(1, (per_side, per_side))
-    return grid.permute(0, 3, 1, 4, 2, 5).flatten(4, 5).flatten(2, 3)
+    return pixel_shuffle(bundles_MQC.mT.unflatten(2, (per_side, per_side)), patch_px)
 
 
 _START_LIGHT = -1.5

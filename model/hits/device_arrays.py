@@ -11,6 +11,7 @@ import operator
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from dataclasses import is_dataclass
+from functools import partial
 from typing import Any
 
 import numpy as np
@@ -190,17 +191,10 @@ def _operand(value: Any, place: DevicePlace) -> Any:
     return value.item() if isinstance(value, np.ndarray | np.generic) else value
 
 
-def _clamp_or(least: Callable, number: str) -> Callable:
-    """Return a maximum or minimum that takes numbers too."""
-
-    def of(a: Any, b: Any) -> Tensor:
-        if isinstance(a, Tensor) and isinstance(b, Tensor):
-            result: Tensor = least(a, b)
-            return result
-        tensor, limit = (a, b) if isinstance(a, Tensor) else (b, a)
-        return tensor.clamp(**{number: limit})
-
-    return of
+def _limit(bound: str, a: Any, b: Any) -> Tensor:
+    """Return a maximum or minimum of tensors or a number."""
+    tensor, limit = (a, b) if isinstance(a, Tensor) else (b, a)
+    return tensor.clamp(**{bound: limit})
 
 
 _UFUNCS: dict[str, Callable] = {
@@ -221,8 +215,8 @@ _UFUNCS: dict[str, Callable] = {
     "bitwise_and": operator.and_,
     "bitwise_or": operator.or_,
     "invert": operator.invert,
-    "maximum": _clamp_or(torch.maximum, "min"),
-    "minimum": _clamp_or(torch.minimum, "max"),
+    "maximum": partial(_limit, "min"),
+    "minimum": partial(_limit, "max"),
     "radians": torch.deg2rad,
 }
 """Operations that torch has not under numpy's name, or not of numbers."""

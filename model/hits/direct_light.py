@@ -103,10 +103,8 @@ def direct_light(
         if gloss is not None:
             value, density = lobe(gloss, lit_points, to_lamp, cosine)
             specular = value * solid / (1 + np.square(lobe_rays * density * solid))
-        useful = np.flatnonzero(diffuse if specular is None else (diffuse > 0) | (specular > 0))
-        is_free = np.zeros_like(diffuse).reshape(-1)
-        is_free[useful] = _is_free(scene, lit_points, place, to_lamp, useful)
-        is_free = is_free.reshape(diffuse.shape)
+        useful = diffuse if specular is None else (diffuse > 0) | (specular > 0)
+        is_free = _is_free(scene, lit_points, place, to_lamp, useful)
         emission = scene.emission[:, lamps][:, :, None]
         np.add(light.open_diffuse, _total(diffuse * emission), out=light.open_diffuse)
         np.add(light.diffuse, _total(diffuse * is_free * emission), out=light.diffuse)
@@ -221,26 +219,27 @@ def chosen_lamp_light(
     value = value / (1 + np.where(has_lobe_ray, np.square(density * solid), np.float32(0)))
     albedo = scene.material_at(points, "diffuse")
     reflected = albedo * (np.maximum(cosine, 0) * _INV_PI) + gloss.color * value
-    useful = np.flatnonzero(brightest(reflected) > 0)
-    is_free = np.zeros_like(solid)
-    is_free[useful] = _is_free(scene, points, place, to_lamp, useful)
+    is_free = _is_free(scene, points, place, to_lamp, brightest(reflected) > 0)
     return np.take(scene.emission, lamp, axis=1) * reflected * (solid * is_free)
 
 
 def _is_free(
-    scene: LitScene, points: Points, place: Floats, to_lamp: Floats, rows: NDArray[np.intp]
-) -> NDArray[np.bool_]:
-    """Return True for those of some points whose segment to their place on a lamp is free."""
-    if not len(rows):
-        return np.zeros(0, np.bool_)
-    position, plane, place, to_lamp = (
-        at_rows(np.broadcast_to(each, place.shape).reshape(3, -1), rows)
-        for each in (points.position, points.geometric_normal, place, to_lamp)
-    )
-    start = off_surface(position, plane, to_lamp)
-    segment = place - start
-    length = np.sqrt(np.maximum(dot(segment, segment), np.float32(1e-20)))
-    return scene.everything.is_free(as_rows(start), as_rows(segment / length), length * _SHORTENING)
+    scene: LitScene, points: Points, place: Floats, to_lamp: Floats, useful: NDArray
+) -> Floats:
+    """Return 1 for useful points [...] whose segment to their place on a lamp is free, else 0."""
+    is_free = np.zeros_like(to_lamp[0]).reshape(-1)
+    rows = np.flatnonzero(useful)
+    if len(rows):
+        position, plane, place, along = (
+            at_rows(np.broadcast_to(each, place.shape).reshape(3, -1), rows)
+            for each in (points.position, points.geometric_normal, place, to_lamp)
+        )
+        start = off_surface(position, plane, along)
+        segment = place - start
+        length = np.sqrt(np.maximum(dot(segment, segment), np.float32(1e-20)))
+        ray = as_rows(start), as_rows(segment / length)
+        is_free[rows] = scene.everything.is_free(*ray, length * _SHORTENING)
+    return is_free.reshape(to_lamp.shape[1:])
 
 
 def _on_triangle(scene: LitScene, rows: NDArray[np.intp], u: Floats) -> Floats:
@@ -337,6 +336,6 @@ def escaped_light(
 
 def sees_sky(scene: LitScene, points: Points, direction: Floats) -> NDArray[np.bool_]:
     """Return True [P] for rays from points that meet nothing, lamps included."""
-    start = off_surface(points.position, points.geometric_normal, direction)
+    start = points.start(direction)
     far = np.full_like(direction[0], _FAR_M)
     return scene.everything.is_free(as_rows(start), as_rows(direction), far)
