@@ -7,6 +7,7 @@ A wheel moves the packages into `trilight`, so that a user's own `model` or `tra
 import os
 import site
 from collections.abc import Sequence
+from importlib import metadata
 from pathlib import Path
 
 _PREFIX = __name__.removesuffix("storage.installation")
@@ -21,6 +22,14 @@ IMPORT_ROOT = Path(__file__).parents[__name__.count(".")]
 def module_name(name: str) -> str:
     """Return the name under which a module such as `pipeline.assets.prepare` is imported here."""
     return f"{_PREFIX}{name}"
+
+
+def installed_version(library: str, otherwise: str = "") -> str:
+    """Return the version of an installed library, or `otherwise`."""
+    try:
+        return metadata.version(library)
+    except metadata.PackageNotFoundError:
+        return otherwise
 
 
 def child_environment() -> dict[str, str]:

@@ -12,7 +12,6 @@ import subprocess
 import time
 from collections import Counter
 from collections.abc import Callable
-from importlib import metadata
 from pathlib import Path
 from typing import Any
 
@@ -31,6 +30,7 @@ from infra.bench_options import BenchOptions
 from infra.torch_library import require_torch
 from pipeline.isolation import ChildFailed
 from storage.errors import Rejected, TrilightError
+from storage.installation import installed_version
 from storage.machine import processor
 
 ROOT = Path(__file__).parents[2]
@@ -129,12 +129,7 @@ def _points_of(experiment: Experiment, scale: BenchScale, options: BenchOptions)
 
 def machine_record(device: str) -> dict[str, Any]:
     """Return the record of this machine as JSON values; on the device `cuda` with its GPU."""
-    versions = {}
-    for library in _LIBRARIES:
-        try:
-            versions[library] = metadata.version(library)
-        except metadata.PackageNotFoundError:
-            continue
+    versions = {name: text for name in _LIBRARIES if (text := installed_version(name))}
     gpu = {}
     if device == "cuda":
         import torch

@@ -1,23 +1,15 @@
 """The recipe: its name, its methods and its libraries' versions; loads no mesh library."""
 
-from importlib.metadata import PackageNotFoundError, version
-
 from pipeline.assets.settings import Decimator, Profile
 from storage.errors import TrilightError
+from storage.installation import installed_version
 
 _LIBRARIES = ("embreex", "libigl", "numpy", "pymeshlab", "trimesh", "wasmtime")
 
 
 def library_versions() -> dict[str, str]:
     """Return the version of each library that the mesh stage calls, or `absent`."""
-    return {name: _installed_version(name) for name in _LIBRARIES}
-
-
-def _installed_version(name: str) -> str:
-    try:
-        return version(name)
-    except PackageNotFoundError:
-        return "absent"
+    return {name: installed_version(name, "absent") for name in _LIBRARIES}
 
 
 _WITH_PYMESHLAB = (
@@ -30,7 +22,7 @@ Raise the number (`assets-3`, without versions) when a change here or in a libra
 another result. `tests/pipeline/assets/test_prepare.py` fails until it does.
 """
 
-RECIPE = _WITH_PYMESHLAB if _installed_version("pymeshlab") != "absent" else "assets-3 libigl"
+RECIPE = _WITH_PYMESHLAB if installed_version("pymeshlab") else "assets-3 libigl"
 """Recipe name in asset files; it is part of their keys in the asset store."""
 
 READERS = 4
@@ -53,7 +45,7 @@ def methods_of(
     """
     if watertight and profile == "faithful":
         return _WATERTIGHT
-    with_pymeshlab = _installed_version("pymeshlab") != "absent"
+    with_pymeshlab = installed_version("pymeshlab")
     if profile == "uniform" and not with_pymeshlab:
         raise TrilightError(
             "profile uniform: pymeshlab is not installed; run `make setup`, or use faithful."
@@ -73,7 +65,7 @@ def missing_filters() -> list[str]:
 
     The call loads the native libraries (about one second), so run it in a child process.
     """
-    if _installed_version("pymeshlab") == "absent":
+    if not installed_version("pymeshlab"):
         return []
     from pipeline.assets.decimation.pymeshlab_filters import REQUIRED_FILTERS, pymeshlab
 

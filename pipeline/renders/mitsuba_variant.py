@@ -23,6 +23,7 @@ import tempfile
 import zlib
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from functools import partial
 from importlib import metadata
 from pathlib import Path
 from typing import Any, Literal
@@ -32,13 +33,15 @@ from storage.cache import cache_folder
 from storage.denoiser import DenoiserDevice, set_denoiser_device
 from storage.digests import canonical_json, sha256_hex
 from storage.errors import EnvironmentFailure, TrilightError
-from storage.installation import IMPORT_ROOT, child_environment
+from storage.installation import IMPORT_ROOT, child_environment, installed_version
 from storage.typed_json import read_json
 
 _PROBE_S = (180, 360)
 """Wall time of a probe, and of a second try where the first gave no answer: many may start at once,
 on a machine that is busy."""
 _REMEMBERED_TRIES = 32
+
+_version = partial(installed_version, otherwise="not installed")
 
 _RAYS_LEFT_OUT = "Disabling this ray tracing operation"
 """Dr.Jit only logs this where a kernel is too large for OptiX; it raises no error."""
@@ -383,13 +386,6 @@ def vector_extension() -> str:
     except OSError:
         return ""
     return next((name for name in _VECTOR_EXTENSIONS if name in flags), "")
-
-
-def _version(name: str) -> str:
-    try:
-        return metadata.version(name)
-    except metadata.PackageNotFoundError:
-        return "not installed"
 
 
 _DRIVER = Path("/proc/driver/nvidia")
