@@ -13,7 +13,6 @@ import itertools
 import math
 from collections import defaultdict
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
 from typing import Any
 
 import torch
@@ -35,33 +34,11 @@ def defers_sync(device: torch.device) -> bool:
     return device.type == "cuda"
 
 
-@dataclass(frozen=True, kw_only=True, eq=False)
-class Decision:
-    """Decision whether one step is applied, and the number of updates before it."""
-
-    applied: Tensor
-    """bool [], True if loss and gradient are finite."""
-    updates: Updates
-    """Number of steps that were applied before this one."""
-    defer_sync: bool
-    """True if only kernels read `applied`; the host does not wait for it."""
-
-    @property
-    def is_skipped(self) -> bool:
-        """True if the host knows that the step is skipped."""
-        return not self.defer_sync and not bool(self.applied)
-
-    @property
-    def skip_flag(self) -> Tensor:
-        """Flag of fused kernels, float32 []: 1 if they must write nothing."""
-        return (~self.applied).float()
-
-
 def move_towards(
     tensors: Sequence[Tensor],
     goals: Sequence[Tensor],
     fraction: float | Tensor,
-    decision: Decision | None = None,
+    skip: Tensor | None = None,
 ) -> None:
     """Interpolate each tensor towards its goal, in place.
 
@@ -69,13 +46,14 @@ def move_towards(
         tensors: updated in place.
         goals: tensors of the same shapes.
         fraction: from 0 to 1; float32 [] if only the device knows it.
-        decision: must not be skipped; kernels read it if its sync is deferred.
+        skip: flag that fused kernels read, float32 []: 1 if they must write nothing; None if the
+            host has read it, and the step is applied.
     """
-    if decision is None or not decision.defer_sync:
+    if skip is None:
         assert not isinstance(fraction, Tensor), "only deferred kernels read it from a device"
         torch._foreach_lerp_(list(tensors), list(goals), fraction)
     else:  # x + share (goal - x)
-        _run_fused_sgd(tensors, goals, rate=-fraction, decay=-1.0, decision=decision)
+        _run_fused_sgd(tensors, goals, rate=-fraction, decay=-1.0, skip=skip)
 
 
 def move_along(
@@ -83,7 +61,7 @@ def move_along(
     steps: Sequence[Tensor],
     rate: float,
     decay: float,
-    decision: Decision | None = None,
+    skip: Tensor | None = None,
 ) -> None:
     """Decay each weight and subtract `rate` times its step, in place.
 
@@ -92,13 +70,13 @@ def move_along(
         steps: tensors of the same shapes and types.
         rate: above 0.
         decay: fraction from 0 to 1.
-        decision: as in `move_towards`.
+        skip: as in `move_towards`.
     """
-    if decision is None or not decision.defer_sync:
+    if skip is None:
         torch._foreach_mul_(list(weights), 1 - decay)
         torch._foreach_add_(list(weights), list(steps), alpha=-rate)
     else:  # w - rate (step + decay / rate w), which reads and writes each weight once
-        _run_fused_sgd(weights, steps, rate=rate, decay=decay / rate, decision=decision)
+        _run_fused_sgd(weights, steps, rate=rate, decay=decay / rate, skip=skip)
 
 
 def _run_fused_sgd(
@@ -107,7 +85,7 @@ def _run_fused_sgd(
     *,
     rate: float | Tensor,
     decay: float,
-    decision: Decision,
+    skip: Tensor,
 ) -> None:
     """Subtract rate * (operand + decay * tensor) from each tensor, unless the step is skipped."""
     torch._fused_sgd_(
@@ -116,7 +94,7 @@ def _run_fused_sgd(
         [],
         weight_decay=decay,
         lr=rate,
-        found_inf=decision.skip_flag,
+        found_inf=skip,
         momentum=0.0, dampening=0.0, nesterov=False, maximize=False, is_first_step=False,
     )  # fmt: skip
 
@@ -150,8 +128,8 @@ class StackedMuon(torch.optim.Muon):
     same update. All processes keep the momentum.
     """
 
-    decision: Decision | None = None
-    """Decision of the next step, set by the caller; None applies it."""
+    found_inf: Tensor | None = None
+    """Flag of the next step by torch's name for it, as `skip` of `move_towards`."""
 
     def __init__(
         self,
@@ -203,7 +181,7 @@ class StackedMuon(torch.optim.Muon):
         rate = group["lr"] * 0.2 * math.sqrt(max(weights[0].shape))
         steps_SMN = steps_SMN.to(weights[0].dtype, memory_format=torch.contiguous_format)
         decay = group["lr"] * group["weight_decay"]
-        move_along(weights, list(steps_SMN), rate, decay, self.decision)
+        move_along(weights, list(steps_SMN), rate, decay, self.found_inf)
 
     def _momentum_directions(self, weights: Sequence[Tensor], momentum: float) -> Sequence[Tensor]:
         """Update the momentum, and return the gradients [M, N] with Nesterov's momentum."""
@@ -214,7 +192,7 @@ class StackedMuon(torch.optim.Muon):
             if "momentum_buffer" not in self.state[weight]:
                 self.state[weight]["momentum_buffer"] = torch.zeros_like(gradient)
         means: list[Tensor] = [self.state[weight]["momentum_buffer"] for weight in weights]
-        move_towards(means, gradients, 1 - momentum, self.decision)
+        move_towards(means, gradients, 1 - momentum, self.found_inf)
         return torch._foreach_lerp(gradients, means, momentum)
 
 
@@ -336,18 +314,12 @@ class Optimizer:
         for optimizer, _ in self._optimizers:
             optimizer.zero_grad(set_to_none=True)
 
-    def step(self, learning_rate: float, decision: Decision | None = None) -> None:
-        """Update every weight by its gradient, unless the decision skips the step."""
-        if decision is not None and decision.is_skipped:
-            return
+    def step(self, learning_rate: float, skip: Tensor | None = None) -> None:
+        """Update every weight by its gradient; `skip` as in `move_towards`."""
         for optimizer, factor in self._optimizers:
             for group in optimizer.param_groups:
                 group["lr"] = learning_rate * factor * group[_SCALE]
-            if isinstance(optimizer, StackedMuon):
-                optimizer.decision = decision
-            else:  # torch's name for it
-                deferred = decision is not None and decision.defer_sync
-                optimizer.found_inf = decision.skip_flag if decision and deferred else None  # type: ignore[attr-defined]
+            optimizer.found_inf = skip  # type: ignore[attr-defined]
             optimizer.step()
 
     def optimizer_state(self) -> dict[str, Tensor]:
