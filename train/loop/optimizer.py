@@ -21,7 +21,7 @@ from torch import Tensor
 
 from model.precision import PRECISIONS
 from model.renderformer import RenderFormer
-from model.width_scales import width_scales
+from model.width_scales import WidthScale, width_scales
 from train.loop.distributed import DistributedContext
 from train.settings import Precision, TrainSettings
 
@@ -133,21 +133,18 @@ class StackedMuon(torch.optim.Muon):
 
     def __init__(
         self,
-        matrices: Sequence[Tensor] | Sequence[dict[str, Any]],
-        weight_decay: float,
+        groups: Sequence[dict[str, Any]],
         precision: Precision,
         thirds: Sequence[Tensor] = (),
     ) -> None:
         """Create the optimizer of matrices [M, N].
 
         Args:
-            matrices: weights, or parameter groups as torch's optimizers take them, each with its
-                decay.
-            weight_decay: decay of weights without a group.
+            groups: parameter groups as torch's optimizers take them, each with its decay.
             precision: precision of its products.
             thirds: those of the weights that are three stacked matrices.
         """
-        super().__init__(matrices, weight_decay=weight_decay, adjust_lr_fn="match_rms_adamw")
+        super().__init__(groups, adjust_lr_fn="match_rms_adamw")
         self._products = PRECISIONS[precision].dtype
         self._thirds = set(thirds)
 
@@ -246,9 +243,6 @@ _KEPT: dict[type, tuple[str, ...]] = {
 _SCALE = "width_scale"
 """Key of an optimizer's parameter group that holds the factor of its rate."""
 
-_Scaled = tuple[Tensor, float]
-"""A weight, and the factor of its learning rate."""
-
 
 class Optimizer:
     """Updates the weights of a network with AdamW, and the matrices with Muon if configured.
@@ -269,45 +263,16 @@ class Optimizer:
         """Create the optimizers; `precision` is that of Muon's products."""
         device = next(model.parameters()).device
         self._names: dict[Tensor, str] = {weight: name for name, weight in model.named_parameters()}
-        scales = width_scales(model, settings.base_widths)
-        muon_weights = list[_Scaled]()
-        adamw_weights = list[_Scaled]()
-        for weight, name in self._names.items():
-            is_taken = settings.muon_takes == "matrices" or _LAYERS in name
-            if settings.muon_rate and weight.ndim == 2 and is_taken:
-                muon_weights.append((weight, scales[name].muon))
-            else:
-                adamw_weights.append((weight, scales[name].adamw))
-        adamw = torch.optim.AdamW(
-            self._groups(adamw_weights, settings),
-            betas=settings.betas,
-            fused=True if defers_sync(device) else None,
-        )
-        self._optimizers: list[tuple[torch.optim.Optimizer, float]] = [(adamw, 1.0)]
-        self.muon_precision = precision if muon_weights else None
-        if muon_weights:
-            by_thirds = settings.muon_takes == "hidden"
-            names = self._names
-            thirds = [w for w, _ in muon_weights if by_thirds and names[w].endswith(_QKV)]
-            groups = self._groups(muon_weights, settings)
-            optimizer = StackedMuon(groups, settings.weight_decay, precision, thirds)
-            self._optimizers.append((optimizer, settings.muon_rate))
-
-    def _groups(self, weights: Sequence[_Scaled], settings: TrainSettings) -> list[dict[str, Any]]:
-        """Return parameter groups of equal rate factor and equal decay.
-
-        The decay of a step is independent of the rate factor: decay that shrank with the rate would
-        be too weak for wide networks (Wortsman et al. 2023).
-        """
-        groups = defaultdict[tuple[float, float], list[Tensor]](list)
-        for weight, scale in weights:
-            is_matrix = weight.ndim > 1 and not self._names[weight].endswith(_TOKENS)
-            decays = settings.decayed == "all" or is_matrix
-            groups[scale, settings.weight_decay if decays else 0.0].append(weight)
-        return [
-            {"params": params, "weight_decay": decay / scale, _SCALE: scale}
-            for (scale, decay), params in groups.items()
+        muon, adamw = _groups(self._names, width_scales(model, settings.base_widths), settings)
+        fused = True if defers_sync(device) else None
+        self._optimizers: list[tuple[torch.optim.Optimizer, float]] = [
+            (torch.optim.AdamW(adamw, betas=settings.betas, fused=fused), 1.0)
         ]
+        self.muon_precision = precision if muon else None
+        if muon:
+            by_thirds = settings.muon_takes == "hidden"
+            thirds = [w for w, name in self._names.items() if by_thirds and name.endswith(_QKV)]
+            self._optimizers.append((StackedMuon(muon, precision, thirds), settings.muon_rate))
 
     def zero_grad(self) -> None:
         """Clear the gradients."""
@@ -346,6 +311,33 @@ class Optimizer:
                         float(updates), device=weight.device if fused else None
                     )
                 optimizer.state[weight] = state
+
+
+def _groups(
+    names: Mapping[Tensor, str], scales: Mapping[str, WidthScale], settings: TrainSettings
+) -> tuple[list[dict[str, Any]], list[dict[str, Any]]]:
+    """Return parameter groups of equal rate factor and equal decay, of Muon and of AdamW.
+
+    The decay of a step is independent of the rate factor: decay that shrank with the rate would be
+    too weak for wide networks (Wortsman et al. 2023).
+    """
+    groups = defaultdict[tuple[bool, float, float], list[Tensor]](list)
+    for weight, name in names.items():
+        is_taken = settings.muon_takes == "matrices" or _LAYERS in name
+        by_muon = settings.muon_rate > 0 and weight.ndim == 2 and is_taken
+        is_matrix = weight.ndim > 1 and not name.endswith(_TOKENS)
+        decay = settings.weight_decay if settings.decayed == "all" or is_matrix else 0.0
+        scale = scales[name].muon if by_muon else scales[name].adamw
+        groups[by_muon, scale, decay].append(weight)
+    muon, adamw = (
+        [
+            {"params": params, "weight_decay": decay / scale, _SCALE: scale}
+            for (by_muon, scale, decay), params in groups.items()
+            if by_muon == kind
+        ]
+        for kind in (True, False)
+    )
+    return muon, adamw
 
 
 _TOKENS = "registers_NW"
