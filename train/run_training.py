@@ -95,7 +95,8 @@ def finish_run(
     recorder: Recorder,
     seconds: float,
 ) -> TrainResult:
-    """Evaluate the finished network, and write its weights, sheet and summary."""
+    """End the recording, evaluate the network, and write its weights, sheet and summary."""
+    recorder.close()
     judge = recorder.judge
     settings = state.settings
     trained = TrainedRange(max_triangles=data.max_triangles, resolution=settings.resolution)
@@ -176,7 +177,6 @@ def run_training(
             checkpoint that is missing or of another run, LPIPS without its weights, a start that
             went dead, too little memory, or a signal that asked to stop.
     """
-    began = time.monotonic()
     watched = watched or WatchSettings()
     require_wandb(watched.wandb)
     dist_context = dist_context or DistributedContext(device=torch.device("cpu"))
@@ -184,57 +184,68 @@ def run_training(
         progress = TrainProgress()
     folder = RunFolder(out)
     start = start or StartOptions()
+    with claim_run(folder, dist_context):
+        return _train(settings, data, folder, start, dist_context, workers, watched, progress)
+
+
+def _train(
+    settings: TrainSettings,
+    data: Sequence[str],
+    folder: RunFolder,
+    start: StartOptions,
+    dist_context: DistributedContext,
+    workers: int | None,
+    watched: WatchSettings,
+    progress: TrainProgress,
+) -> TrainResult | None:
+    """Train and evaluate in a folder that is locked; arguments as in `run_training`."""
+    began = time.monotonic()
+    dataset = open_training_data(data, may_mix=True)
     notes: list[str] = []
 
     def note(text: str) -> None:
         progress.note(text)
         notes.append(text)  # until the run's folder may be written
 
-    with claim_run(folder, dist_context):
-        dataset = open_training_data(data, may_mix=True)
-        for text in (*dataset.notes, *(() if VALIDATION in dataset.splits else (UNJUDGED,))):
-            note(text)
-        if workers is None:
-            on_gpu = dist_context.device.type == "cuda"
-            threads = torch.get_num_threads()
-            workers, reason = choose_workers(settings, on_gpu=on_gpu, busy_threads=threads)
-            note(reason)
-        plan = plan_start(settings, folder, dataset.digest, start, dist_context, note)
-        settings = plan.settings
-        lpips = dist_context.run_once_per_machine(partial(load_lpips, start.lpips))
-        objective = TrainingLoss(settings.loss, lpips).to(dist_context.device)
-        _check_data(dataset, settings)
-        state = init_or_resume_state(plan, folder, dataset, dist_context, note)
-        recorder = None
-        if dist_context.is_first:
-            judge = _make_judge(dataset, settings, state.bad_samples)
-            recorder = Recorder(folder, judge, progress, state, wandb=watched.wandb)
-            how = "began" if plan.checkpoint is None or plan.branch is not None else "went on"
-            many = "process" if dist_context.world_size == 1 else "processes"
-            where = f"{how} on {dist_context.device}, {dist_context.world_size} {many}"
-            for text in (where, *notes):
-                add_note(folder.notes, state.step, text)
-        trainer = Trainer(state, objective, dist_context, folder, recorder, watched)
-        batches = load_batches(
-            dataset.split("train"),
-            settings,
-            state.step,
-            rank_slice=dist_context,
-            workers=workers,
-            unusable=state.bad_samples,
-            mixture=state.mixture,
-        )
-        cost = partial(scene_flops, settings)
-        most = settings.scenes_per_pass
-        with (
-            closing(batches),
-            closing(step_scenes(batches, cost, most, dist_context.device)) as steps,
-        ):
-            trainer.train(steps)
-        if recorder is None:
-            return None
-        recorder.close()
-        return finish_run(state, folder, dataset, recorder, time.monotonic() - began)
+    for text in (*dataset.notes, *(() if VALIDATION in dataset.splits else (UNJUDGED,))):
+        note(text)
+    if workers is None:
+        on_gpu = dist_context.device.type == "cuda"
+        threads = torch.get_num_threads()
+        workers, reason = choose_workers(settings, on_gpu=on_gpu, busy_threads=threads)
+        note(reason)
+    plan = plan_start(settings, folder, dataset.digest, start, dist_context, note)
+    settings = plan.settings
+    lpips = dist_context.run_once_per_machine(partial(load_lpips, start.lpips))
+    objective = TrainingLoss(settings.loss, lpips).to(dist_context.device)
+    _check_data(dataset, settings)
+    state = init_or_resume_state(plan, folder, dataset, dist_context, note)
+    recorder = None
+    if dist_context.is_first:
+        judge = _make_judge(dataset, settings, state.bad_samples)
+        recorder = Recorder(folder, judge, progress, state, wandb=watched.wandb)
+        how = "began" if plan.checkpoint is None or plan.branch is not None else "went on"
+        many = "process" if dist_context.world_size == 1 else "processes"
+        where = f"{how} on {dist_context.device}, {dist_context.world_size} {many}"
+        for text in (where, *notes):
+            add_note(folder.notes, state.step, text)
+    trainer = Trainer(state, objective, dist_context, folder, recorder, watched)
+    stream = load_batches(
+        dataset.split("train"),
+        settings,
+        state.step,
+        rank_slice=dist_context,
+        workers=workers,
+        unusable=state.bad_samples,
+        mixture=state.mixture,
+    )
+    cost = partial(scene_flops, settings)
+    steps = step_scenes(stream, cost, settings.scenes_per_pass, dist_context.device)
+    with closing(stream), closing(steps):
+        trainer.train(steps)
+    if recorder is None:
+        return None
+    return finish_run(state, folder, dataset, recorder, time.monotonic() - began)
 
 
 def _check_data(data: TrainingData, settings: TrainSettings) -> None:
