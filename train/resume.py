@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING, Any, Literal
 from storage.errors import TrilightError
 from storage.settings.described import checked, from_record, settings_record
 from storage.settings.fields import describe_fields
-from storage.settings.overrides import apply_overrides
+from storage.settings.overrides import apply_overrides, values_by_name
 from train.settings import TrainSettings, decay_start_step, known_settings
 
 if TYPE_CHECKING:
@@ -159,7 +159,7 @@ def plan_resume(
     """
     step = header["step"]
     before = from_record(TrainSettings, known_settings(header["settings"], "checkpoint"))
-    old = _by_dotted_name(settings_record(before))
+    old = dict(values_by_name(settings_record(before)))
     past_events = tuple(Event(**record) for record in header.get("history", ()))
     named_decisions = {name: value for name, value in decisions.items() if name != DATA}
     for name, value in named_decisions.items():
@@ -173,7 +173,7 @@ def plan_resume(
     settings = apply_overrides(before, execution_changes | named_decisions)
     new_values = _differing(old, settings)
     stated = _original_values(past_events)
-    stored_names = _by_dotted_name(header["settings"])
+    stored_names = dict(values_by_name(header["settings"]))
     events = list[Event]()
     undecided = dict[str, Any]()
     for name, value in typed_otherwise.items():
@@ -202,8 +202,8 @@ def plan_resume(
 
 def _differing(old: Mapping[str, Any], settings: TrainSettings) -> dict[str, Any]:
     """Return the values that are not the old ones, by dotted name."""
-    now = _by_dotted_name(settings_record(settings))
-    return {name: value for name, value in now.items() if value != old[name]}
+    now = values_by_name(settings_record(settings))
+    return {name: value for name, value in now if value != old[name]}
 
 
 def _original_values(past: Sequence[Event]) -> dict[str, list[Any]]:
@@ -318,12 +318,3 @@ def _short_digest(digest: str) -> str:
     """Return the first 12 digits of a digest of data, after its kind."""
     kind, _, digits = _with_prefix(digest).partition(":")
     return f"{kind}:{digits[:12]}"
-
-
-def _by_dotted_name(record: Mapping[str, Any], prefix: str = "") -> dict[str, Any]:
-    """Return the values of a record and of its groups."""
-    flat: dict[str, Any] = {}
-    for name, value in record.items():
-        is_group = isinstance(value, Mapping)
-        flat |= _by_dotted_name(value, f"{prefix}{name}.") if is_group else {prefix + name: value}
-    return flat

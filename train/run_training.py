@@ -92,10 +92,12 @@ def finish_run(
     state: TrainState,
     folder: RunFolder,
     data: TrainingData,
-    judge: Judge | None,
+    recorder: Recorder,
     seconds: float,
 ) -> TrainResult:
-    """Evaluate the finished network, and write its weights, sheet and summary."""
+    """End the recording, evaluate the network, and write its weights, sheet and summary."""
+    recorder.close()
+    judge = recorder.judge
     settings = state.settings
     trained = TrainedRange(max_triangles=data.max_triangles, resolution=settings.resolution)
     write_atomically(folder.weights, encode_weights(state.eval_model, trained))
@@ -103,7 +105,7 @@ def finish_run(
     count = max(len(losses) // LOSS_SHARE, 1)
     validation = None
     if judge is not None:
-        validation = judge.judge(state.eval_model)
+        validation = recorder.validation or judge.judge(state.eval_model)
         write_picture(folder.sheet, draw_validation_sheet(settings, judge, validation, state.step))
     result = TrainResult(
         folder=folder,
@@ -218,12 +220,11 @@ def _train(
     objective = TrainingLoss(settings.loss, lpips).to(dist_context.device)
     _check_data(dataset, settings)
     state = init_or_resume_state(plan, folder, dataset, dist_context, note)
-    judge = recorder = None
+    recorder = None
     if dist_context.is_first:
         judge = _make_judge(dataset, settings, state.bad_samples)
         recorder = Recorder(folder, judge, progress, state, wandb=watched.wandb)
-        resumes = plan.checkpoint is not None and plan.branch is None
-        how = "went on" if resumes else "began"
+        how = "began" if plan.checkpoint is None or plan.branch is not None else "went on"
         many = "process" if dist_context.world_size == 1 else "processes"
         where = f"{how} on {dist_context.device}, {dist_context.world_size} {many}"
         for text in (where, *notes):
@@ -238,15 +239,13 @@ def _train(
         unusable=state.bad_samples,
         mixture=state.mixture,
     )
-    with closing(stream) as batches:
-        cost = partial(scene_flops, settings)
-        most = settings.scenes_per_pass
-        with closing(step_scenes(batches, cost, most, dist_context.device)) as steps:
-            trainer.train(steps)
+    cost = partial(scene_flops, settings)
+    steps = step_scenes(stream, cost, settings.scenes_per_pass, dist_context.device)
+    with closing(stream), closing(steps):
+        trainer.train(steps)
     if recorder is None:
         return None
-    recorder.close()
-    return finish_run(state, folder, dataset, judge, time.monotonic() - began)
+    return finish_run(state, folder, dataset, recorder, time.monotonic() - began)
 
 
 def _check_data(data: TrainingData, settings: TrainSettings) -> None:

@@ -2,13 +2,14 @@
 
 import dataclasses
 import json
-from collections.abc import Iterator, Mapping
+from collections.abc import Mapping
 from typing import Any
 
 from infra.cli.console import console, print_json, print_rows, print_table
 from infra.cli.options import command
 from storage.aliases import NETWORKS, OBJECTS, PRESET_ALIASES, name_for_people
 from storage.settings.described import checked
+from storage.settings.overrides import values_by_name
 
 
 @checked()
@@ -87,22 +88,13 @@ def _print_settings(name: str) -> None:
         settings[f"trilight generate {name}"] = preset_settings(resolve_dataset_preset(name))
     if name in TRAINING_PRESETS:
         settings[f"trilight train {name}"] = TRAINING_PRESETS[name]()
-    tables = {title: dict(_values(dataclasses.asdict(each))) for title, each in settings.items()}
+    tables = {
+        title: dict(values_by_name(dataclasses.asdict(each))) for title, each in settings.items()
+    }
     print_json(tables)
     for title, values in tables.items():
         rows = [(dotted, json.dumps(value)) for dotted, value in values.items()]
         print_rows(f"{title} --set NAME=VALUE", rows)
-
-
-def _values(value: Any, name: str = "") -> Iterator[tuple[str, Any]]:
-    """Yield the values of a record by dotted name; groups in lists have numbers."""
-    groups = value if isinstance(value, dict) else {}
-    if isinstance(value, list | tuple) and value and isinstance(value[0], dict):
-        groups = {str(place): group for place, group in enumerate(value)}
-    if not groups:
-        yield name, value
-    for below, each in groups.items():
-        yield from _values(each, f"{name}.{below}" if name else below)
 
 
 def _name_for_people(name: str, aliases: Mapping[str, str]) -> str:

@@ -87,6 +87,17 @@ def apply_overrides(settings: Settings, overrides: Mapping[str, Any]) -> Setting
     return _replace_fields(settings, [(n.split("."), v, n) for n, v in overrides.items()])
 
 
+def values_by_name(value: Any, name: str = "") -> Iterator[tuple[str, Any]]:
+    """Yield (dotted name, value) for each value of a record; groups in lists have numbers."""
+    groups = value if isinstance(value, Mapping) else {}
+    if isinstance(value, list | tuple) and value and isinstance(value[0], Mapping):
+        groups = {str(place): group for place, group in enumerate(value)}
+    if not groups:
+        yield name, value
+    for below, each in groups.items():
+        yield from values_by_name(each, f"{name}.{below}" if name else below)
+
+
 def differences(
     before: Mapping[str, Any], now: Mapping[str, Any], prefix: str = "", *, alike: bool = False
 ) -> Iterator[tuple[str, Any, Any]]:

@@ -32,7 +32,6 @@ from train.data.order import (
     Mixture,
     RankSlice,
     Visit,
-    mix_visits,
     shuffled_shards,
     single_dataset,
     visits_from,
@@ -176,19 +175,26 @@ class _SceneMaker:
     ) -> Iterator[list[Visit]]:
         """Yield this process's visits batch by batch, and start to open their shards."""
         batch_size = self._settings.scenes_per_step
-        seed = self._settings.seed
-        window = self._settings.shuffle_shards
-        parts = self._shards.parts
-        position = first * batch_size
-        streams = [
-            visits_from(len(part), partial(self._count, part), start, seed=seed, window=window)
-            for part, start in zip(parts, mixture.counts_before(position), strict=True)
-        ]
-        visits = mix_visits(mixture, streams, parts, position)
+        visits = self._visits(mixture, first * batch_size)
         while True:
             mine = rank_slice.of_batch(tuple(itertools.islice(visits, batch_size)))
             self._opened.plan(visit.shard for visit in mine)
             yield mine
+
+    def _visits(self, mixture: Mixture, first: int) -> Iterator[Visit]:
+        """Yield the visits of the stream without end, from position `first` on."""
+        seed = self._settings.seed
+        window = self._settings.shuffle_shards
+        parts = self._shards.parts
+        counts, sources = mixture.order_from(first)
+        streams = [
+            visits_from(len(part), partial(self._count, part), start, seed=seed, window=window)
+            for part, start in zip(parts, counts, strict=True)
+        ]
+        for position, source in enumerate(sources, first):
+            visit = next(streams[source])
+            shard = parts[source].start + visit.shard
+            yield dataclasses.replace(visit, position=position, shard=shard, source=source)
 
     def batches_ahead(self, mixture: Mixture) -> int:
         """Return the number of batches to plan ahead: about a window, to open its shards in time.

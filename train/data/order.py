@@ -13,8 +13,6 @@ that every section of the stream holds each dataset's fraction to within a scene
 of scenes of each before a position follows from the weights alone.
 """
 
-import dataclasses
-import heapq
 import itertools
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
@@ -142,43 +140,24 @@ class Mixture:
         if len({len(self.digests), len(self.names), len(self.weights), len(self.before)}) > 1:
             raise TrilightError("mixture: expected as many names, weights and counts as digests.")
 
-    def counts_before(self, position: int) -> tuple[int, ...]:
-        """Return the number of scenes of each dataset before a position, `first` or later.
+    def order_from(self, position: int) -> tuple[tuple[int, ...], Iterator[int]]:
+        """Return the order from a position on, which is `first` or later.
 
         The time does not depend on the position.
+
+        Returns:
+            The number of scenes of each dataset before the position, and the number of the dataset
+            at each position from there on, without end.
         """
-        exact = self._exact_weights
+        # exact decimal numbers, so that rounding does not accumulate
+        exact = [Fraction(repr(weight)) for weight in self.weights]
         number = position - self.first
         time = max(number - len(exact), 0) / sum(exact)  # lower bounds of the counts, then the rest
         counts = [int(time * weight + Fraction(1, 2)) for weight in exact]
-        for source in itertools.islice(self._source_order(counts), number - sum(counts)):
+        order = _alternate([*counts], [1 / weight for weight in exact])
+        for source in itertools.islice(order, number - sum(counts)):
             counts[source] += 1
-        return tuple(now + then for now, then in zip(counts, self.before, strict=True))
-
-    def sources_from(self, position: int) -> Iterator[int]:
-        """Yield the number of the dataset at each position, from one on without end."""
-        counts = [
-            now - then for now, then in zip(self.counts_before(position), self.before, strict=True)
-        ]
-        return self._source_order(counts)
-
-    def _source_order(self, counts: Sequence[int]) -> Iterator[int]:
-        """Yield the number of the next dataset, without end, after `counts` scenes of each."""
-        waits = [1 / weight for weight in self._exact_weights]
-        due = [
-            ((count + Fraction(1, 2)) * wait, source)
-            for source, (count, wait) in enumerate(zip(counts, waits, strict=True))
-        ]
-        heapq.heapify(due)
-        while True:
-            time, source = due[0]
-            yield source
-            heapq.heapreplace(due, (time + waits[source], source))
-
-    @property
-    def _exact_weights(self) -> list[Fraction]:
-        """Exact decimal weights as fractions, so that rounding does not accumulate."""
-        return [Fraction(repr(weight)) for weight in self.weights]
+        return tuple(map(sum, zip(counts, self.before, strict=True))), order
 
     def __str__(self) -> str:
         """Return percentages and names, for a note."""
@@ -190,19 +169,13 @@ class Mixture:
         )
 
 
-def mix_visits(
-    mixture: Mixture, visits: Sequence[Iterator[Visit]], parts: Sequence[range], first: int
-) -> Iterator[Visit]:
-    """Yield the visits of the stream without end, from position `first` on.
-
-    Args:
-        visits: endless visits of each dataset, after the scenes of `mixture.counts_before`.
-        parts: shard numbers of each dataset among all.
-    """
-    for position, source in enumerate(mixture.sources_from(first), first):
-        visit = next(visits[source])
-        shard = parts[source].start + visit.shard
-        yield dataclasses.replace(visit, position=position, shard=shard, source=source)
+def _alternate(counts: Sequence[int], waits: Sequence[Fraction]) -> Iterator[int]:
+    """Yield the number of the next dataset, without end, after `counts` scenes of each."""
+    due = [(count + Fraction(1, 2)) * wait for count, wait in zip(counts, waits, strict=True)]
+    while True:
+        source = due.index(min(due))
+        yield source
+        due[source] += waits[source]
 
 
 def plan_mixture(
@@ -231,7 +204,7 @@ def plan_mixture(
     step = 0 if header is None else header["step"]
     seen_counts = dict[str, int]()
     if old is not None:
-        counts = old.counts_before(step * old.scenes_per_step)
+        counts, _ = old.order_from(step * old.scenes_per_step)
         seen_counts = dict(zip(old.digests, counts, strict=True))
     shards = data.split("train")
     weights = tuple(map(float, settings.data_weights)) or tuple(

@@ -13,7 +13,6 @@ import itertools
 import math
 from collections import defaultdict
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
 from typing import Any
 
 import torch
@@ -22,7 +21,7 @@ from torch import Tensor
 
 from model.precision import PRECISIONS
 from model.renderformer import RenderFormer
-from model.width_scales import width_scales
+from model.width_scales import WidthScale, width_scales
 from train.loop.distributed import DistributedContext
 from train.settings import Precision, TrainSettings
 
@@ -35,33 +34,11 @@ def defers_sync(device: torch.device) -> bool:
     return device.type == "cuda"
 
 
-@dataclass(frozen=True, kw_only=True, eq=False)
-class Decision:
-    """Decision whether one step is applied, and the number of updates before it."""
-
-    applied: Tensor
-    """bool [], True if loss and gradient are finite."""
-    updates: Updates
-    """Number of steps that were applied before this one."""
-    defer_sync: bool
-    """True if only kernels read `applied`; the host does not wait for it."""
-
-    @property
-    def is_skipped(self) -> bool:
-        """True if the host knows that the step is skipped."""
-        return not self.defer_sync and not bool(self.applied)
-
-    @property
-    def skip_flag(self) -> Tensor:
-        """Flag of fused kernels, float32 []: 1 if they must write nothing."""
-        return (~self.applied).float()
-
-
 def move_towards(
     tensors: Sequence[Tensor],
     goals: Sequence[Tensor],
     fraction: float | Tensor,
-    decision: Decision | None = None,
+    skip: Tensor | None = None,
 ) -> None:
     """Interpolate each tensor towards its goal, in place.
 
@@ -69,13 +46,14 @@ def move_towards(
         tensors: updated in place.
         goals: tensors of the same shapes.
         fraction: from 0 to 1; float32 [] if only the device knows it.
-        decision: must not be skipped; kernels read it if its sync is deferred.
+        skip: flag that fused kernels read, float32 []: 1 if they must write nothing; None if the
+            host has read it, and the step is applied.
     """
-    if decision is None or not decision.defer_sync:
+    if skip is None:
         assert not isinstance(fraction, Tensor), "only deferred kernels read it from a device"
         torch._foreach_lerp_(list(tensors), list(goals), fraction)
     else:  # x + share (goal - x)
-        _run_fused_sgd(tensors, goals, rate=-fraction, decay=-1.0, decision=decision)
+        _run_fused_sgd(tensors, goals, rate=-fraction, decay=-1.0, skip=skip)
 
 
 def move_along(
@@ -83,7 +61,7 @@ def move_along(
     steps: Sequence[Tensor],
     rate: float,
     decay: float,
-    decision: Decision | None = None,
+    skip: Tensor | None = None,
 ) -> None:
     """Decay each weight and subtract `rate` times its step, in place.
 
@@ -92,13 +70,13 @@ def move_along(
         steps: tensors of the same shapes and types.
         rate: above 0.
         decay: fraction from 0 to 1.
-        decision: as in `move_towards`.
+        skip: as in `move_towards`.
     """
-    if decision is None or not decision.defer_sync:
+    if skip is None:
         torch._foreach_mul_(list(weights), 1 - decay)
         torch._foreach_add_(list(weights), list(steps), alpha=-rate)
     else:  # w - rate (step + decay / rate w), which reads and writes each weight once
-        _run_fused_sgd(weights, steps, rate=rate, decay=decay / rate, decision=decision)
+        _run_fused_sgd(weights, steps, rate=rate, decay=decay / rate, skip=skip)
 
 
 def _run_fused_sgd(
@@ -107,7 +85,7 @@ def _run_fused_sgd(
     *,
     rate: float | Tensor,
     decay: float,
-    decision: Decision,
+    skip: Tensor,
 ) -> None:
     """Subtract rate * (operand + decay * tensor) from each tensor, unless the step is skipped."""
     torch._fused_sgd_(
@@ -116,7 +94,7 @@ def _run_fused_sgd(
         [],
         weight_decay=decay,
         lr=rate,
-        found_inf=decision.skip_flag,
+        found_inf=skip,
         momentum=0.0, dampening=0.0, nesterov=False, maximize=False, is_first_step=False,
     )  # fmt: skip
 
@@ -150,26 +128,23 @@ class StackedMuon(torch.optim.Muon):
     same update. All processes keep the momentum.
     """
 
-    decision: Decision | None = None
-    """Decision of the next step, set by the caller; None applies it."""
+    found_inf: Tensor | None = None
+    """Flag of the next step by torch's name for it, as `skip` of `move_towards`."""
 
     def __init__(
         self,
-        matrices: Sequence[Tensor] | Sequence[dict[str, Any]],
-        weight_decay: float,
+        groups: Sequence[dict[str, Any]],
         precision: Precision,
         thirds: Sequence[Tensor] = (),
     ) -> None:
         """Create the optimizer of matrices [M, N].
 
         Args:
-            matrices: weights, or parameter groups as torch's optimizers take them, each with its
-                decay.
-            weight_decay: decay of weights without a group.
+            groups: parameter groups as torch's optimizers take them, each with its decay.
             precision: precision of its products.
             thirds: those of the weights that are three stacked matrices.
         """
-        super().__init__(matrices, weight_decay=weight_decay, adjust_lr_fn="match_rms_adamw")
+        super().__init__(groups, adjust_lr_fn="match_rms_adamw")
         self._products = PRECISIONS[precision].dtype
         self._thirds = set(thirds)
 
@@ -203,7 +178,7 @@ class StackedMuon(torch.optim.Muon):
         rate = group["lr"] * 0.2 * math.sqrt(max(weights[0].shape))
         steps_SMN = steps_SMN.to(weights[0].dtype, memory_format=torch.contiguous_format)
         decay = group["lr"] * group["weight_decay"]
-        move_along(weights, list(steps_SMN), rate, decay, self.decision)
+        move_along(weights, list(steps_SMN), rate, decay, self.found_inf)
 
     def _momentum_directions(self, weights: Sequence[Tensor], momentum: float) -> Sequence[Tensor]:
         """Update the momentum, and return the gradients [M, N] with Nesterov's momentum."""
@@ -214,7 +189,7 @@ class StackedMuon(torch.optim.Muon):
             if "momentum_buffer" not in self.state[weight]:
                 self.state[weight]["momentum_buffer"] = torch.zeros_like(gradient)
         means: list[Tensor] = [self.state[weight]["momentum_buffer"] for weight in weights]
-        move_towards(means, gradients, 1 - momentum, self.decision)
+        move_towards(means, gradients, 1 - momentum, self.found_inf)
         return torch._foreach_lerp(gradients, means, momentum)
 
 
@@ -268,9 +243,6 @@ _KEPT: dict[type, tuple[str, ...]] = {
 _SCALE = "width_scale"
 """Key of an optimizer's parameter group that holds the factor of its rate."""
 
-_Scaled = tuple[Tensor, float]
-"""A weight, and the factor of its learning rate."""
-
 
 class Optimizer:
     """Updates the weights of a network with AdamW, and the matrices with Muon if configured.
@@ -291,63 +263,28 @@ class Optimizer:
         """Create the optimizers; `precision` is that of Muon's products."""
         device = next(model.parameters()).device
         self._names: dict[Tensor, str] = {weight: name for name, weight in model.named_parameters()}
-        scales = width_scales(model, settings.base_widths)
-        muon_weights = list[_Scaled]()
-        adamw_weights = list[_Scaled]()
-        for weight, name in self._names.items():
-            is_taken = settings.muon_takes == "matrices" or _LAYERS in name
-            if settings.muon_rate and weight.ndim == 2 and is_taken:
-                muon_weights.append((weight, scales[name].muon))
-            else:
-                adamw_weights.append((weight, scales[name].adamw))
-        adamw = torch.optim.AdamW(
-            self._groups(adamw_weights, settings),
-            betas=settings.betas,
-            fused=True if defers_sync(device) else None,
-        )
-        self._optimizers: list[tuple[torch.optim.Optimizer, float]] = [(adamw, 1.0)]
-        self.muon_precision = precision if muon_weights else None
-        if muon_weights:
-            by_thirds = settings.muon_takes == "hidden"
-            names = self._names
-            thirds = [w for w, _ in muon_weights if by_thirds and names[w].endswith(_QKV)]
-            groups = self._groups(muon_weights, settings)
-            optimizer = StackedMuon(groups, settings.weight_decay, precision, thirds)
-            self._optimizers.append((optimizer, settings.muon_rate))
-
-    def _groups(self, weights: Sequence[_Scaled], settings: TrainSettings) -> list[dict[str, Any]]:
-        """Return parameter groups of equal rate factor and equal decay.
-
-        The decay of a step is independent of the rate factor: decay that shrank with the rate would
-        be too weak for wide networks (Wortsman et al. 2023).
-        """
-        groups = defaultdict[tuple[float, float], list[Tensor]](list)
-        for weight, scale in weights:
-            is_matrix = weight.ndim > 1 and not self._names[weight].endswith(_TOKENS)
-            decays = settings.decayed == "all" or is_matrix
-            groups[scale, settings.weight_decay if decays else 0.0].append(weight)
-        return [
-            {"params": params, "weight_decay": decay / scale, _SCALE: scale}
-            for (scale, decay), params in groups.items()
+        muon, adamw = _groups(self._names, width_scales(model, settings.base_widths), settings)
+        fused = True if defers_sync(device) else None
+        self._optimizers: list[tuple[torch.optim.Optimizer, float]] = [
+            (torch.optim.AdamW(adamw, betas=settings.betas, fused=fused), 1.0)
         ]
+        self.muon_precision = precision if muon else None
+        if muon:
+            by_thirds = settings.muon_takes == "hidden"
+            thirds = [w for w, name in self._names.items() if by_thirds and name.endswith(_QKV)]
+            self._optimizers.append((StackedMuon(muon, precision, thirds), settings.muon_rate))
 
     def zero_grad(self) -> None:
         """Clear the gradients."""
         for optimizer, _ in self._optimizers:
             optimizer.zero_grad(set_to_none=True)
 
-    def step(self, learning_rate: float, decision: Decision | None = None) -> None:
-        """Update every weight by its gradient, unless the decision skips the step."""
-        if decision is not None and decision.is_skipped:
-            return
+    def step(self, learning_rate: float, skip: Tensor | None = None) -> None:
+        """Update every weight by its gradient; `skip` as in `move_towards`."""
         for optimizer, factor in self._optimizers:
             for group in optimizer.param_groups:
                 group["lr"] = learning_rate * factor * group[_SCALE]
-            if isinstance(optimizer, StackedMuon):
-                optimizer.decision = decision
-            else:  # torch's name for it
-                deferred = decision is not None and decision.defer_sync
-                optimizer.found_inf = decision.skip_flag if decision and deferred else None  # type: ignore[attr-defined]
+            optimizer.found_inf = skip  # type: ignore[attr-defined]
             optimizer.step()
 
     def optimizer_state(self) -> dict[str, Tensor]:
@@ -374,6 +311,33 @@ class Optimizer:
                         float(updates), device=weight.device if fused else None
                     )
                 optimizer.state[weight] = state
+
+
+def _groups(
+    names: Mapping[Tensor, str], scales: Mapping[str, WidthScale], settings: TrainSettings
+) -> tuple[list[dict[str, Any]], list[dict[str, Any]]]:
+    """Return parameter groups of equal rate factor and equal decay, of Muon and of AdamW.
+
+    The decay of a step is independent of the rate factor: decay that shrank with the rate would be
+    too weak for wide networks (Wortsman et al. 2023).
+    """
+    groups = defaultdict[tuple[bool, float, float], list[Tensor]](list)
+    for weight, name in names.items():
+        is_taken = settings.muon_takes == "matrices" or _LAYERS in name
+        by_muon = settings.muon_rate > 0 and weight.ndim == 2 and is_taken
+        is_matrix = weight.ndim > 1 and not name.endswith(_TOKENS)
+        decay = settings.weight_decay if settings.decayed == "all" or is_matrix else 0.0
+        scale = scales[name].muon if by_muon else scales[name].adamw
+        groups[by_muon, scale, decay].append(weight)
+    muon, adamw = (
+        [
+            {"params": params, "weight_decay": decay / scale, _SCALE: scale}
+            for (by_muon, scale, decay), params in groups.items()
+            if by_muon == kind
+        ]
+        for kind in (True, False)
+    )
+    return muon, adamw
 
 
 _TOKENS = "registers_NW"

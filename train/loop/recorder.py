@@ -16,7 +16,7 @@ from model.renderformer import count_parameters
 from storage.atomic import append_line
 from storage.errors import TrilightError
 from storage.settings.described import settings_record
-from train.evaluation.validation import Judge, draw_validation_sheet
+from train.evaluation.validation import Judge, ValidationResult, draw_validation_sheet
 from train.folder import RunFolder, add_note, copy_rows, read_rows
 from train.loop.train_state import TrainState
 from train.progress import TrainProgress
@@ -85,7 +85,9 @@ class Recorder:
         )
         self.progress = progress
         self._folder = folder
-        self._judge = judge
+        self.judge = judge
+        self.validation: ValidationResult | None = None
+        """Last validation of this call; None if nothing was trained."""
         copy_rows(folder.metrics, folder.metrics, state.step)  # later ones will be written again
         self._wandb_run = None
         # It begins before the writer, whose files it follows; each call of the trainer is one in a
@@ -121,7 +123,7 @@ class Recorder:
     def has_validated(self, step: int) -> bool:
         """Return whether the log has a validation of a step, or there is no validation split."""
         rows = read_rows(self._folder.metrics)
-        return self._judge is None or any(
+        return self.judge is None or any(
             "validation" in row and row["step"] == step for row in rows
         )
 
@@ -131,12 +133,12 @@ class Recorder:
         Args:
             between: as in `Judge.judge`; if it raises, nothing is written.
         """
-        if self._judge is None:
+        if self.judge is None:
             return
-        validation = self._judge.judge(state.eval_model, between)
+        self.validation = validation = self.judge.judge(state.eval_model, between)
         self.row({"step": state.step, "validation": validation.scores})
-        sheet = draw_validation_sheet(state.settings, self._judge, validation, state.step)
-        median = {"median_picture_log_l1": self._judge.median_scores["log_l1"]}
+        sheet = draw_validation_sheet(state.settings, self.judge, validation, state.step)
+        median = {"median_picture_log_l1": self.judge.median_scores["log_l1"]}
         self._show_scalars({"step": state.step, "validation": median})
         self._board.add_image("validation", np.asarray(sheet), state.step, dataformats="HWC")
         self.progress.report_validation(step=state.step, scores=validation.scores)

@@ -20,7 +20,7 @@ from model.renderformer import RenderFormer
 from storage.errors import TrilightError
 from train.data.buckets import TrainingBatch
 from train.loop.distributed import DistributedContext
-from train.loop.optimizer import Decision, defers_sync
+from train.loop.optimizer import defers_sync
 from train.loop.train_state import TrainState
 from train.loss.training_loss import Lpips, TrainingLoss
 from train.monitoring.process_monitor import Activity, LayerNorms
@@ -151,11 +151,14 @@ class Stepper:
     def _move(self, loss: Tensor, norm: Tensor, learning_rate: float) -> Tensor:
         """Update weights and EMA if the step is finite; return whether it is, bool []."""
         state = self._state
-        updates = self._updates if self.defer_sync else state.updates
         applied = torch.isfinite(loss) & torch.isfinite(norm)
-        decision = Decision(applied=applied, updates=updates, defer_sync=self.defer_sync)
-        state.optimizer.step(learning_rate, decision)
-        state.update_ema(decision)
+        if self.defer_sync:  # the kernels read whether the step is skipped
+            skip = (~applied).float()
+            state.optimizer.step(learning_rate, skip)
+            state.update_ema(self._updates, skip)
+        elif applied:
+            state.optimizer.step(learning_rate)
+            state.update_ema(state.updates, None)
         self._updates += applied
         return applied
 

@@ -17,7 +17,7 @@ from model.width_scales import scale_start, width_scales
 from storage.seeds import seed_for
 from train.data.bad_samples import BadSampleCounter
 from train.data.order import Mixture
-from train.loop.optimizer import Decision, Optimizer, Updates, move_towards
+from train.loop.optimizer import Optimizer, Updates, move_towards
 from train.resume import Event
 from train.settings import Precision, TrainSettings
 
@@ -70,16 +70,15 @@ class TrainState:
         return self.step - self.skipped_steps
 
     @torch.no_grad()
-    def update_ema(self, decision: Decision) -> None:
-        """Update the EMA after an update of the weights, unless the step was skipped.
+    def update_ema(self, updates: Updates, skip: Tensor | None) -> None:
+        """Update the EMA after an update of the weights, the first one after 0 `updates`.
 
         After n updates its decay is at most (1 + n) / (10 + n), so that it forgets the random
-        start.
+        start. `skip` is as in `move_towards`.
         """
-        if self.ema_model is None or decision.is_skipped:
-            return
-        share = ema_step(self.settings.ema_decay, decision.updates)
-        move_towards([*self.ema_model.parameters()], [*self.model.parameters()], share, decision)
+        if self.ema_model is not None:
+            share = ema_step(self.settings.ema_decay, updates)
+            move_towards([*self.ema_model.parameters()], [*self.model.parameters()], share, skip)
 
 
 def ema_step(decay: float, updates: Updates) -> float | Tensor:

@@ -89,15 +89,15 @@ def test_every_stretch_has_its_shares_and_may_be_entered_anywhere(
     weights: tuple[float, ...],
 ) -> None:
     mixed = mixture(*weights)
-    turns = list(itertools.islice(mixed.sources_from(0), 3000))
+    turns = list(itertools.islice(mixed.order_from(0)[1], 3000))
     for at in (0, 1, 17, 999, 2990):
         counts = tuple(turns[:at].count(source) for source in range(len(weights)))
-        assert mixed.counts_before(at) == counts
-        assert list(itertools.islice(mixed.sources_from(at), 10)) == turns[at : at + 10]
+        assert mixed.order_from(at)[0] == counts
+        assert list(itertools.islice(mixed.order_from(at)[1], 10)) == turns[at : at + 10]
         for source, weight in enumerate(weights):
             assert abs(counts[source] - at * weight / sum(weights)) < len(weights)
     far = 10**15
-    assert sum(mixed.counts_before(far)) == far, "in the time of the first"
+    assert sum(mixed.order_from(far)[0]) == far, "in the time of the first"
 
 
 WEIGHTS = (2.0, 1.0)
@@ -114,7 +114,7 @@ def test_each_dataset_keeps_the_order_that_it_has_alone(
     roots: list[str], whole: list[list[TrainingScene]]
 ) -> None:
     scenes = [scene for batch in whole for scene in batch]
-    turns = list(itertools.islice(mixture(*WEIGHTS).sources_from(0), len(scenes)))
+    turns = list(itertools.islice(mixture(*WEIGHTS).order_from(0)[1], len(scenes)))
     assert [turns.count(source) for source in (0, 1)] == [24, 12]
     for source, root in enumerate(roots):
         alone = list(
@@ -159,7 +159,7 @@ def test_a_dataset_that_is_known_goes_on_where_it_was(roots: list[str], data: Tr
     wider = plan_mixture(data, tiny_run(scenes_per_step=2 * BATCH), later)
     assert wider is not None and (wider.first, wider.before) == (80, (34, 6))
     second = plan_mixture(alone[1], run, later)
-    assert second is not None and second.before == (6,) and second.counts_before(44) == (10,)
+    assert second is not None and second.before == (6,) and second.order_from(44)[0] == (10,)
 
 
 def test_first_samples_come_from_every_dataset_and_mistakes_are_named(
@@ -189,7 +189,7 @@ def test_a_damaged_shard_is_replaced_by_its_own_datasets(tmp_path: Path) -> None
         open_training_data([str(tmp_path / "a"), str(tmp_path / "b")], may_mix=True),
         BadSampleCounter(2),
     )
-    turns = list(itertools.islice(mixture(1.0, 1.0).sources_from(0), 16))
+    turns = list(itertools.islice(mixture(1.0, 1.0).order_from(0)[1], 16))
     found = take(mixed, SETTINGS, 4, workers=2, unusable=unusable, mixture=mixture(1.0, 1.0))
     keys = itertools.chain(*keys_of(found))
     (message,) = unusable.messages

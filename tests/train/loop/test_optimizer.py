@@ -244,6 +244,10 @@ def exactly_moved(
     return weight
 
 
+def muon(weights: Sequence[Tensor], decay: float, precision: Precision) -> StackedMuon:
+    return StackedMuon([{"params": list(weights), "weight_decay": decay}], precision)
+
+
 def take_steps(
     weights: Sequence[Tensor], gradients: Sequence[Sequence[Tensor]], optimizer: torch.optim.Muon
 ) -> None:
@@ -272,7 +276,7 @@ def test_several_steps_are_those_of_the_slow_twin() -> None:
         )
         for index, weight in enumerate(weights)
     ]
-    optimizer = StackedMuon(weights, 5, "float32")
+    optimizer = muon(weights, 5, "float32")
     optimizer.param_groups[0]["lr"] = 0.01
     take_steps(weights, gradients, optimizer)
     for weight, exact in zip(weights, expected, strict=True):
@@ -283,8 +287,8 @@ def test_several_steps_are_those_of_the_slow_twin() -> None:
 def test_it_is_torchs_own_up_to_bfloat16() -> None:
     ours, stacked, theirs, before = (matrices(0, 0.1) for _ in range(4))
     gradients = [matrices(seed, 0.3) for seed in (1, 2, 3)]
-    take_steps(ours, gradients, StackedMuon(ours, 0.5, "float32"))
-    take_steps(stacked, gradients, StackedMuon(stacked, 0.5, "bfloat16"))
+    take_steps(ours, gradients, muon(ours, 0.5, "float32"))
+    take_steps(stacked, gradients, muon(stacked, 0.5, "bfloat16"))
     plain = torch.optim.Muon(theirs, weight_decay=0.5, adjust_lr_fn="match_rms_adamw")
     take_steps(theirs, gradients, plain)
     for our, near, their, old in zip(ours, stacked, theirs, before, strict=True):
@@ -300,12 +304,12 @@ def test_matrices_of_a_stack_do_not_meet() -> None:
     """And one without a gradient stays where it is, and is not remembered."""
     together, alone = matrices(0, 0.1), matrices(0, 0.1)
     gradients = matrices(1, 0.1)
-    take_steps(together, [gradients], StackedMuon(together, 0.5, "float32"))
+    take_steps(together, [gradients], muon(together, 0.5, "float32"))
     for index, weight in enumerate(alone):
-        take_steps([weight], [[gradients[index]]], StackedMuon([weight], 0.5, "float32"))
+        take_steps([weight], [[gradients[index]]], muon([weight], 0.5, "float32"))
         # a library may sum in another order for another size of stack
         torch.testing.assert_close(weight, together[index], rtol=1e-6, atol=1e-7)
-    spared, optimizer = alone[0].clone(), StackedMuon(alone, 0.5, "float32")
+    spared, optimizer = alone[0].clone(), muon(alone, 0.5, "float32")
     alone[0].grad = None
     optimizer.step()
     assert torch.equal(alone[0], spared) and alone[0] not in optimizer.state

@@ -35,7 +35,7 @@ from train.folder import RunFolder, read_rows
 from train.loop import optimizer
 from train.loop import step as step_module
 from train.loop.checkpoints import read_checkpoint
-from train.loop.optimizer import Decision, Optimizer, move_along, move_towards
+from train.loop.optimizer import Optimizer, move_along, move_towards
 from train.loop.step import Stepper, compile_parts, compiled_parts, predict_log10
 from train.loop.train_state import TrainState, ema_step, new_state
 from train.loss.training_loss import TrainingLoss
@@ -228,8 +228,7 @@ def test_kernels_update_as_the_host_does_but_for_rounding(
     host, late = with_gradients(), with_gradients()
     Optimizer(host, LATE, "float32").step(3e-3)
     request.getfixturevalue("late")
-    decision = Decision(applied=torch.tensor(True), updates=0, defer_sync=True)
-    Optimizer(late, LATE, "float32").step(3e-3, decision)
+    Optimizer(late, LATE, "float32").step(3e-3, torch.tensor(0.0))
     for found, wanted in zip(late.parameters(), host.parameters(), strict=True):
         # units of the last place: the fused kernels add up in another order
         torch.testing.assert_close(found, wanted, rtol=2e-6, atol=1e-8)
@@ -241,7 +240,7 @@ def test_kernels_move_as_the_host_does_or_touch_nothing(applied: bool) -> None:
     x, goal = (torch.randn(5, 7, generator=generator) for _ in range(2))
     if not applied:
         goal[0, 0] = math.nan
-    decision = Decision(applied=torch.tensor(applied), updates=torch.tensor(30.0), defer_sync=True)
+    skip = torch.tensor(float(not applied))
     share = ema_step(0.99, torch.tensor(30.0, dtype=torch.float64))
     assert float(share) == pytest.approx(ema_step(0.99, 30), rel=1e-7)
     assert isinstance(share, torch.Tensor) and share.dtype == torch.float32
@@ -251,7 +250,7 @@ def test_kernels_move_as_the_host_does_or_touch_nothing(applied: bool) -> None:
         (lambda y, late: move_along([y], [goal], 0.1, 0.02, late), 0.98 * x - 0.1 * goal),
     ):
         y = x.clone()
-        move(y, decision)
+        move(y, skip)
         torch.testing.assert_close(y, by_hand if applied else x, rtol=1e-6, atol=1e-7)
 
 
