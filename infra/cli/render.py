@@ -10,9 +10,8 @@ from rich.text import Text
 from infra.cli.console import Bars, print_result, suggest_look
 from infra.cli.options import command
 from infra.render.networks import NetworkRenderer
-from infra.render.options import RenderOptions
 from infra.render.path_tracer import PathTracer
-from infra.render.plan import RenderPlan, plan_render
+from infra.render.plan import RenderOptions, RenderPlan, plan_render
 from infra.render.run_render import FinishedShot, run_plan
 from infra.render.tone_mapping import enlargement
 from pipeline.exchange.reader import SceneReader
@@ -69,7 +68,7 @@ def print_outcome(
 ) -> None:
     """Print files and figures of the only picture, or a summary of many."""
     record: dict[str, Any] = {
-        "engine": plan.engine,
+        "engine": "both" if len(plan.renderers) > 1 else plan.renderers[0].name,
         "notes": list(notes),
         "resolution": plan.resolution,
         "seconds": round(seconds, 2),

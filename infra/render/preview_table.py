@@ -206,11 +206,6 @@ class Choice:
     """Source of the costs, as the end of a sentence."""
 
     @property
-    def engine(self) -> Literal["mitsuba", "neural"]:
-        """Engine that renders it."""
-        return "neural" if self.priced.samples is None else "mitsuba"
-
-    @property
     def sentence(self) -> str:
         """The choice as one line of text."""
         one = self.priced

@@ -25,7 +25,7 @@ from PIL import Image as Picture
 from PIL import ImageDraw, ImageFont
 
 from infra.render.plan import RenderPlan, load_av
-from infra.render.tone_mapping import display_pixels, enlarge
+from infra.render.tone_mapping import enlarge, tone_mapped
 from pipeline.documents.png import encode_png
 from pipeline.exchange.formats import FORMATS, SceneSource
 from pipeline.exchange.reader import SceneReader
@@ -287,10 +287,13 @@ class _SceneAtHand:
         """Write the files of a picture; return it, and the frame if there are both renderers."""
         if camera.view is None:  # of an orbit or a file
             camera = dataclasses.replace(camera, name=f"picture {stem.name}")
-        made = {each.name: self._picture(stem, camera, each) for each in self.plan.renderers}
+        plan = self.plan
+        made = {each.name: self._picture(stem, camera, each) for each in plan.renderers}
         files = {name: file for name, (file, _) in made.items()}
-        look = self.plan.look
-        tiles = {name: display_pixels(rgb, look) for name, (_, rgb) in made.items()}
+        tiles = {
+            name: enlarge(tone_mapped(rgb, plan.tone_map, plan.exposure_ev))
+            for name, (_, rgb) in made.items()
+        }
         now = None
         agreement = None
         if len(made) == 1:
@@ -299,7 +302,7 @@ class _SceneAtHand:
             traced = made["mitsuba"][1]
             neural = made["neural"][1]
             agreement = psnr_log_db(neural, traced)
-            stops = f", {look.exposure_ev:+g} EV" if look.exposure_ev else ""
+            stops = f", {plan.exposure_ev:+g} EV" if plan.exposure_ev else ""
             error = enlarge(error_picture(neural, traced))  # exposure changes no error
             pixels = captioned_row(
                 {

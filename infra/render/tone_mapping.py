@@ -5,7 +5,6 @@ OpenColorIO: highlights roll off and lose color instead of being clipped.
 """
 
 import functools
-from dataclasses import dataclass
 from typing import Any, Literal
 
 import numpy as np
@@ -26,30 +25,6 @@ _DISPLAY = "sRGB - Display"
 _VIEW = "ACES 2.0 - SDR 100 nits (Rec.709)"
 
 
-@dataclass(frozen=True, kw_only=True)
-class Look:
-    """Display options of pictures.
-
-    Raises:
-        TrilightError: the tone map needs a library that is not installed.
-    """
-
-    tone_map: ToneMap = "plain"
-    """Tone curve: plain (sRGB, clipped) or filmic (ACES 2.0)."""
-    exposure_ev: float = 0.0
-    """Exposure in stops, applied before the tone curve; each stop doubles the radiance."""
-
-    def __post_init__(self) -> None:
-        if self.tone_map == "filmic":
-            _filmic()
-
-
-def display_pixels(radiance_rgb: NDArray[np.float32], look: Look) -> NDArray[np.uint8]:
-    """Return linear radiance [R, R, 3] as display pixels, enlarged as by `enlarge`."""
-    exposed = radiance_rgb * np.float32(2.0**look.exposure_ev)
-    return enlarge(tone_mapped(exposed, look.tone_map))
-
-
 def enlargement(width: int) -> int:
     """Return the factor by which pictures of a width are enlarged."""
     return -(-SHOWN_PX // width)
@@ -61,21 +36,26 @@ def enlarge(pixels: NDArray[np.uint8]) -> NDArray[np.uint8]:
     return pixels.repeat(factor, axis=0).repeat(factor, axis=1)
 
 
-def tone_mapped(radiance_rgb: NDArray[np.float32], tone_map: ToneMap) -> NDArray[np.uint8]:
+def tone_mapped(
+    radiance_rgb: NDArray[np.float32], tone_map: ToneMap, exposure_ev: float = 0.0
+) -> NDArray[np.uint8]:
     """Return linear radiance of at least 0 as an sRGB-encoded picture [H, W, 3].
 
     `plain` is storage.conventions.preview_srgb8. `filmic` maps a radiance of 0.18 to middle gray
-    (about a tenth of the screen's light), and 1 to about half of the screen's light.
+    (about a tenth of the screen's light), and 1 to about half of the screen's light. Before that,
+    each stop of exposure doubles the radiance.
     """
+    exposed = radiance_rgb * np.float32(2.0**exposure_ev)
     if tone_map == "plain":
-        return preview_srgb8(radiance_rgb)
-    pixels = np.ascontiguousarray(radiance_rgb, np.float32).copy()
-    _filmic().applyRGB(pixels)
+        return preview_srgb8(exposed)
+    pixels = np.ascontiguousarray(exposed, np.float32)
+    load_filmic().applyRGB(pixels)
     return np.round(255 * np.clip(pixels, 0, 1)).astype(np.uint8)
 
 
 @functools.cache
-def _filmic() -> Any:
+def load_filmic() -> Any:
+    """Return the filmic curve; raises TrilightError where OpenColorIO is not installed."""
     try:
         import PyOpenColorIO as ocio
     except ImportError as error:

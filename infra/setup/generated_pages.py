@@ -12,7 +12,7 @@ from cyclopts import App
 
 from infra.cli.commands import COMMANDS, app
 from infra.cli.options import PRESETS
-from infra.render.options import RenderOptions
+from infra.render.plan import RenderOptions
 from infra.serving.train_model import TrainOptions
 from pipeline.flows.forms import DatasetInRuns
 from pipeline.generation.generate_options import CorePrice, RevisitOptions

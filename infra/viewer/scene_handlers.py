@@ -208,7 +208,7 @@ def _tone_map(radiance_rgb: NDArray[np.float32], query: Mapping[str, str]) -> ND
         raise TrilightError("ev: expected a number of stops.") from error
     if not -32 <= exposure_ev <= 32:
         raise TrilightError(f"ev is {exposure_ev}; expected -32 to 32.")
-    return tone_mapped(radiance_rgb * np.float32(2.0**exposure_ev), tone_map)
+    return tone_mapped(radiance_rgb, tone_map, exposure_ev)
 
 
 MOST_TRIANGLES = 1_500_000

@@ -16,7 +16,7 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from infra.render.options import RenderOptions
+from infra.render.plan import RenderOptions
 from infra.serving.train_model import TrainOptions
 from infra.setup.generated_pages import ROOTS, reachable
 from model.config import SIZES, ModelConfig

@@ -15,7 +15,7 @@ from PIL import Image
 from pxr import Usd, UsdGeom
 
 from infra.render import path_tracer
-from infra.render.options import RenderOptions
+from infra.render.plan import RenderOptions
 from infra.render.preview_table import shipped_table
 from model.inference import NeuralRenderer
 from pipeline.exchange.convert import write_scene

@@ -20,9 +20,9 @@ from infra.render.networks import (
     traced_network,
     untrained_network,
 )
-from infra.render.options import RenderOptions
 from infra.render.path_tracer import MOST_SCENES, PathTracer, RenderChild, RenderWorker
 from infra.render.plan import (
+    RenderOptions,
     pair_cameras,
     plan_render,
 )

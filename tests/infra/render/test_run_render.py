@@ -8,16 +8,16 @@ import numpy as np
 import pytest
 from PIL import Image as Picture
 
-from infra.render import tone_mapping as look_module
 from infra.render.networks import RendererHere, SceneHere
 from infra.render.plan import (
     OutputPaths,
+    Pairs,
     RenderPlan,
     output_paths,
     pair_cameras,
 )
 from infra.render.run_render import FinishedShot, orbit, run_plan, write_video
-from infra.render.tone_mapping import Look, tone_mapped
+from infra.render.tone_mapping import ToneMap, load_filmic, tone_mapped
 from pipeline.exchange.reader import SceneReader, SceneSource
 from storage.conventions import preview_srgb8
 from storage.errors import TrilightError
@@ -56,9 +56,6 @@ class FlatRenderer(RendererHere):
         return Image(radiance_rgb=picture, cpu_seconds=0.0, facts=facts)
 
 
-Pairs = list[tuple[SceneSource, Camera | int]]
-
-
 @pytest.fixture
 def turn(source: Path) -> Pairs:
     cameras = orbit(tiny_scene(), Camera.of_scene(tiny_scene(), 0), 4, 360)
@@ -69,15 +66,16 @@ def run(
     renderers: list[FlatRenderer],
     out: Path,
     pairs: Pairs,
-    look: Look = Look(),  # noqa: B008
+    tone_map: ToneMap = "plain",
+    exposure_ev: float = 0.0,
 ) -> tuple[Sequence[FinishedShot], Sequence[str]]:
     plan = RenderPlan(
         source="tiny",
         view=0,
-        engine="neural",
         renderers=renderers,
         resolution=16,
-        look=look,
+        tone_map=tone_map,
+        exposure_ev=exposure_ev,
         output=output_paths(out),
         pairs=pairs,
         fps=24,
@@ -138,13 +136,13 @@ def test_another_look_needs_no_other_picture(turn: Pairs, tmp_path: Path) -> Non
     out, again = tmp_path / "turn", FlatRenderer()
     run([FlatRenderer()], out, turn)
     measured = (out / "000000.exr").read_bytes()
-    run([again], out, turn, Look(exposure_ev=-3.0))
+    run([again], out, turn, exposure_ev=-3.0)
     assert (out / "000000.exr").read_bytes() == measured
     darker = np.asarray(Picture.open(out / "000000.png"))
     np.testing.assert_array_equal(darker[::16, ::16], preview_srgb8(decode_exr(measured) / 8))
     assert 0 < darker.min() < 255
     pytest.importorskip("PyOpenColorIO", reason="the film-like curve is OpenColorIO's")
-    run([again], out, turn, Look(tone_map="filmic"))
+    run([again], out, turn, tone_map="filmic")
     assert again.rendered == 0
     assert (np.asarray(Picture.open(out / "000000.png")) != darker).any()
 
@@ -214,6 +212,6 @@ def test_out_says_what_is_made(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) 
     here = output_paths(Path("."))
     assert (here.folder, here.video, here.is_sequence) == (Path("."), None, True)
     monkeypatch.setitem(__import__("sys").modules, "PyOpenColorIO", None)
-    look_module._filmic.cache_clear()
+    load_filmic.cache_clear()
     with pytest.raises(TrilightError, match="OpenColorIO is not installed"):
-        Look(tone_map="filmic")
+        load_filmic()
