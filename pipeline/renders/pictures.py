@@ -38,7 +38,7 @@ from pipeline.renders.view_pictures import (
     require_finite,
     to_filter,
 )
-from storage.denoiser import denoise
+from storage.denoiser import Features, Quality, denoise
 from storage.records.sample import PictureErrors
 
 if TYPE_CHECKING:
@@ -230,8 +230,18 @@ def clean_pictures(
     return denoised
 
 
+def raws_to_filter(
+    pixels: Pixels, sums: Sums, names: Sequence[str], of_both: bool
+) -> list[list[Any]]:
+    """Return what the denoiser is asked for, of each half or of both, as it takes pictures."""
+    return [
+        [pixels.flat(picture) for picture, _ in to_filter(pictures, names)]
+        for pictures in means(sums, pixels, of_both=of_both)
+    ]
+
+
 def finish_pictures(
-    sums: Sums, filtered: Sequence[Any], guides: Any, pixels: Pixels, names: Sequence[str]
+    pixels: Pixels, sums: Sums, filtered: Sequence[Any], guides: Any, names: Sequence[str]
 ) -> list[Any]:
     """Return the pictures of all samples; those that nothing filtered are the raw ones."""
     raws = means(sums, pixels, of_both=True)
@@ -254,7 +264,7 @@ def measure_pixels(
     guides: Any,
     hit: Any,
     logs: Sequence[Any],
-    finished: Any,
+    finished: Sequence[Any],
 ) -> tuple[list[Any], list[Any], list[Any], list[Any]]:
     """Measure the halves, and with `finished`, one denoise of all samples, the error of that.
 
@@ -280,12 +290,12 @@ def measure_pixels(
     for group in groups:
         a, b, denoised_a, denoised_b = (add_up(each[slice(*group)]) for each in (*raws, *corrected))
         halves = join_halves(a, b, denoised_a, denoised_b, pixels)
-        if finished is None:
+        if not finished:
             rows = estimates(halves, hit, pixels, bool(filtered))
             errors += [error for error, _ in rows]
             surprises += [surprise for _, surprise in rows]
         else:
-            measured, more = error_measures(halves, pixels.double(finished), hit, pixels)
+            measured, more = error_measures(halves, pixels.double(finished[0]), hit, pixels)
             totals.append(measured)
             surprises += more
     channels = [pixels.brightest(part) for half in raws for part in half]
@@ -371,9 +381,16 @@ NUMPY = Pixels()
 
 
 def read_sums(samples: DualBuffer) -> Sums:
-    """Return the sums of a view; raises as `ViewPictures.look`."""
+    """Return the sums of a view; raises Rejected("nonfinite_radiance")."""
     sums = [[each.read() for each in half] for half in samples.sums]
     require_finite(int(broken_pixels(sums, NUMPY).sum()))
+    return sums
+
+
+def read_bounded(samples: DualBuffer) -> Sums:
+    """Return the sums of a view; raises as `ViewPictures.look`."""
+    sums = read_sums(samples)
+    require_bounded(float(np.max(means(sums, NUMPY, of_both=False))))
     return sums
 
 
@@ -397,7 +414,12 @@ class ViewPictures:
     There are P of them, of lights and of their parts: all parts of the first light come first.
     """
 
-    _read: Any = staticmethod(read_sums)
+    _pixels: Pixels = NUMPY
+    _inputs: Any = staticmethod(lambda pixels: pixels)
+    """What a recorded function takes in the place of `_pixels`."""
+    _read: Any = staticmethod(read_bounded)
+    _raws: Any = staticmethod(raws_to_filter)
+    _finish: Any = staticmethod(finish_pictures)
     hits: NDArray[np.bool_]
     """[R, R] true where `VectorTracer.hits` is."""
     visible: NDArray[np.bool_]
@@ -425,8 +447,13 @@ class ViewPictures:
         self, tracer: "VectorTracer", camera: PixelCamera
     ) -> tuple[NDArray[np.bool_], NDArray[np.bool_]]:
         """Trace what guides the denoiser; return pixels that hit and that show anything."""
-        self._features = tracer.features(camera, spp=self._settings.aux_spp)
-        return tracer.hits(camera), np.any(self._features.normal != 0, axis=-1)
+        shape = (camera.resolution, camera.resolution, 3)
+        guides = tracer.guides(camera, self._names, spp=self._settings.aux_spp)
+        self._guides: Any = {
+            name: Features(albedo=albedo.reshape(shape), normal=normal.reshape(shape))
+            for name, (albedo, normal) in ((name, map(np.array, guides[name])) for name in guides)
+        }
+        return tracer.hits(camera), np.any(self._guides[""].normal != 0, axis=-1)
 
     @staticmethod
     def mean_radiance(samples: DualBuffer) -> float:
@@ -445,11 +472,11 @@ class ViewPictures:
         self._picture = None
         self._filtered = self._denoise_raws(quality, of_both=False)
         if statement is None or self._settings.picture_within_db is not None:
-            numbers = self._numbers(None)
+            numbers = self._numbers(())
             floors = floors_of(numbers, self._counts)
             if statement is None or is_far(floors[0], self._settings, self._samples.spp):
                 return self._look(numbers, floors, None)
-        numbers = self._numbers(self._make_pictures())
+        numbers = self._numbers(self._make_pictures()[:1])
         resolution = len(self.hits)
         floor, expected = statement.state(self._measures(numbers), resolution, self._samples.spp)
         return self._look(numbers, [floor], expected)
@@ -483,32 +510,27 @@ class ViewPictures:
         """Return the pictures of all samples of the last look, [P, R, R, 3]."""
         return np.stack(self._make_pictures())
 
-    def _make_pictures(self) -> Any:
+    def _make_pictures(self) -> list[Any]:
         """Return the pictures of `finish` where they are worked out, once for a look."""
         if self._picture is None:
             filtered = self._denoise_raws(self._settings.denoiser, of_both=True)
-            self._picture = self._finish(filtered)
+            inputs = self._inputs(self._pixels)
+            self._picture = self._finish(inputs, self._sums, filtered, self._guides, self._names)
         return self._picture
 
-    def _finish(self, filtered: Sequence[Any]) -> Any:
-        return finish_pictures(self._sums, filtered, None, NUMPY, self._names)
-
     def _denoise_raws(self, quality: Filtered, *, of_both: bool) -> Sequence[Any]:
-        raws = means(self._sums, NUMPY, of_both=of_both)
-        require_bounded(float(np.max(raws)))
         if quality == "off":
             return []
-        return [
-            [
-                denoise(picture, self._features.of_part(name), quality)
-                for picture, name in to_filter(pictures, self._names)
-            ]
-            for pictures in raws
-        ]
+        raws = self._raws(self._inputs(self._pixels), self._sums, self._names, of_both)
+        pictures = range(sum(len(tracer) - 3 for tracer in self._sums[0]))
+        guides = [self._guides[name] for _, name in to_filter(pictures, self._names)]
+        return [self._denoise(each, guides, quality) for each in raws]
 
-    def _numbers(self, finished: Any) -> LookNumbers:
-        picture = None if finished is None else finished[0]
-        arrays = self._sums, self._filtered, None, self.hits, self._logs, picture
+    def _denoise(self, raws: Sequence[Any], guides: Sequence[Any], quality: Quality) -> list[Any]:
+        return [denoise(*pair, quality) for pair in zip(raws, guides, strict=True)]
+
+    def _numbers(self, finished: Sequence[Any]) -> LookNumbers:
+        arrays = self._sums, self._filtered, self._guides, self.hits, self._logs, finished
         return add_numbers(*measure_pixels(NUMPY, self._names, self._groups(), *arrays))
 
     def _groups(self) -> Sequence[Group]:
