@@ -14,11 +14,9 @@ import mitsuba as mi
 import numpy as np
 from numpy.typing import NDArray
 
-from pipeline.renders.calibrated_error import METRICS
 from pipeline.renders.device_memory import KernelInputs, read_back, record_launches
 from pipeline.renders.pictures import (
     TILE,
-    LookNumbers,
     Sums,
     ViewPictures,
     broken_pixels,
@@ -141,6 +139,13 @@ class KernelPixels(Pixels):
         across = self._resolution // TILE_PX
         return dr.block_sum(dr.block_sum(dr.concat(list(values)), across), across)
 
+    def one_row(
+        self, totals: Sequence[Any], adds: Sequence[Any], most: Sequence[Any], logs: Sequence[Any]
+    ) -> Any:
+        dr.eval(logs)
+        added = self.reduce_tiles(adds, dr.ReduceOp.Add)
+        return dr.concat([*totals, added, self.reduce_tiles(most, dr.ReduceOp.Max)])
+
     def reduce_tiles(self, values: Sequence[Any], reduction: Any) -> Any:
         """Return values of pixels (Float64) reduced over tiles, those of one after another's."""
         row, column = self._rows_and_columns()
@@ -179,6 +184,7 @@ class DevicePictures(ViewPictures):
     _read = staticmethod(_sums)
     _raws = staticmethod(record_launches(raws_to_filter))
     _finish = staticmethod(record_launches(finish_pictures))
+    _measure = staticmethod(record_launches(measure_pixels))
 
     def _trace_guides(
         self, tracer: VectorTracer, camera: PixelCamera
@@ -209,36 +215,12 @@ class DevicePictures(ViewPictures):
     def _denoise(self, raws: Sequence[Any], guides: Sequence[Any], quality: Quality) -> list[Any]:
         return denoise_arrays(raws, guides, self._resolution, quality)
 
-    def _numbers(self, finished: Sequence[Any]) -> LookNumbers:
-        arrays = self._sums, self._filtered, self._guides, self._hit, self._logs, finished
-        groups = self._groups()
-        numbers, logs = _measure(KernelInputs(self._pixels), self._names, groups, *arrays)
-        totals, tiles = np.split(read_back(numbers), [6 * len(METRICS) if finished else 0])
-        rows = tiles.reshape(-1, len(self._counts[0]))
-        num_surprises = 3 if finished else 3 * len(groups)
-        adds, most = np.split(rows, [len(rows) - num_surprises - 1])
-        totals = totals.reshape(-1, 6)
-        return LookNumbers(totals=totals, adds=adds, sums=adds.sum(axis=1), most=most, logs=logs)
-
 
 @record_launches
 def _brightness(pixels: KernelPixels, sums: Sums) -> Any:
     """Return the sum of all channels of the mean of both halves, and the broken pixels."""
     of_halves = [add_up(half) for half in half_means(sums, pixels)]
     return pixels.totals([channel_sum(add_up(of_halves)) / 2, broken_pixels(sums, pixels)])
-
-
-@record_launches
-def _measure(pixels: KernelPixels, *arguments: Any) -> tuple[Any, list[Any]]:
-    """Return the totals and rows of numbers of all tiles of `measure_pixels` (Float64), and logs.
-
-    What is added up comes first, and then what is greatest.
-    """
-    totals, adds, most, new_logs = measure_pixels(pixels, *arguments)
-    dr.eval(new_logs)
-    added = pixels.reduce_tiles(adds, dr.ReduceOp.Add)
-    greatest = pixels.reduce_tiles(most, dr.ReduceOp.Max)
-    return dr.concat([*totals, added, greatest]), new_logs
 
 
 def denoise_arrays(

@@ -20,7 +20,7 @@ from pipeline.renders.noise_floor import (
     measured_floor,
     secant_slope,
 )
-from pipeline.renders.samples import TILE_PX, DualBuffer, by_tiles, tile_means
+from pipeline.renders.samples import TILE_PX, DualBuffer, tile_means
 from pipeline.renders.settings import Filtered, RenderSettings
 from pipeline.renders.tracer import PixelCamera
 from pipeline.renders.view_pictures import (
@@ -265,14 +265,15 @@ def measure_pixels(
     hit: Any,
     logs: Sequence[Any],
     finished: Sequence[Any],
-) -> tuple[list[Any], list[Any], list[Any], list[Any]]:
+) -> tuple[Any, list[Any]]:
     """Measure the halves, and with `finished`, one denoise of all samples, the error of that.
 
     Returns:
-        Totals of `measures_of_totals`, of one metric after another; none without a picture. What
-        is added up: the changes of both halves, broken pixels, and three estimates of each of
-        `floor_groups`; no estimates with a picture. What the greatest counts of: surprises of the
-        same, and the brightest raw channel. And the log radiance of both halves.
+        `Pixels.one_row`, and the log radiance of both halves. Totals are those of
+        `measures_of_totals`, of one metric after another; none without a picture. Added up are the
+        changes of both halves, broken pixels, and three estimates of each of `floor_groups`; no
+        estimates with a picture. The greatest counts of surprises of the same, and of the brightest
+        raw channel.
     """
     raws = means(sums, pixels, of_both=False)
     denoised = clean_pictures(raws, filtered, guides, pixels, names) if filtered else raws
@@ -301,7 +302,7 @@ def measure_pixels(
     channels = [pixels.brightest(part) for half in raws for part in half]
     brightest = functools.reduce(pixels.maximum, channels)
     adds = [*changes, broken_pixels(sums, pixels), *errors]
-    return totals, adds, [*surprises, brightest], new_logs
+    return pixels.one_row(totals, adds, [*surprises, brightest], new_logs), new_logs
 
 
 def join_halves(a: Any, b: Any, denoised_a: Any, denoised_b: Any, pixels: Pixels) -> Halves:
@@ -347,8 +348,6 @@ class LookNumbers:
     """[3, 6] totals of `measures_of_totals`; empty without a picture."""
     adds: NDArray[np.float64]
     """[N, T] sums over tiles of what `measure_pixels` adds up."""
-    sums: NDArray[np.float64]
-    """[N] the same over all pixels."""
     most: NDArray[np.float64]
     """[M, T] largest in each tile of what the greatest counts of."""
     logs: Sequence[Any]
@@ -368,12 +367,12 @@ def floors_of(numbers: LookNumbers, counts: tuple[NDArray[np.float64], ...]) -> 
     errors = numbers.adds[3:]
     surprises = numbers.most[:-1].max(axis=1)
     counts = counts * (len(errors) // 3)
-    rows = list(zip(numbers.sums[3:], surprises, errors, counts, strict=True))
+    rows = list(zip(surprises, errors, counts, strict=True))
     return [measured_floor(rows[first : first + 3]) for first in range(0, len(rows), 3)]
 
 
 def _require_numbers(numbers: LookNumbers) -> None:
-    require_finite(int(numbers.sums[2]))
+    require_finite(int(numbers.adds[2].sum()))
     require_bounded(float(numbers.most[-1].max()))
 
 
@@ -394,20 +393,6 @@ def read_bounded(samples: DualBuffer) -> Sums:
     return sums
 
 
-def add_numbers(
-    totals: list[Any], adds: list[Any], most: list[Any], logs: list[Any]
-) -> LookNumbers:
-    """Return the numbers of pixels by tile and in all."""
-    greatest = [by_tiles(each).max(axis=(1, 3)).ravel() for each in most]
-    return LookNumbers(
-        totals=np.array(totals).reshape(-1, 6),
-        adds=np.array(NUMPY.tile_sums(adds)),
-        sums=np.array([each.sum() for each in adds]),
-        most=np.array(greatest, np.float64),
-        logs=logs,
-    )
-
-
 class ViewPictures:
     """The pictures of one view, of samples that grow.
 
@@ -420,6 +405,7 @@ class ViewPictures:
     _read: Any = staticmethod(read_bounded)
     _raws: Any = staticmethod(raws_to_filter)
     _finish: Any = staticmethod(finish_pictures)
+    _measure: Any = staticmethod(measure_pixels)
     hits: NDArray[np.bool_]
     """[R, R] true where `VectorTracer.hits` is."""
     visible: NDArray[np.bool_]
@@ -453,7 +439,8 @@ class ViewPictures:
             name: Features(albedo=albedo.reshape(shape), normal=normal.reshape(shape))
             for name, (albedo, normal) in ((name, map(np.array, guides[name])) for name in guides)
         }
-        return tracer.hits(camera), np.any(self._guides[""].normal != 0, axis=-1)
+        self._hit: Any = tracer.hits(camera)
+        return self._hit, np.any(self._guides[""].normal != 0, axis=-1)
 
     @staticmethod
     def mean_radiance(samples: DualBuffer) -> float:
@@ -530,8 +517,13 @@ class ViewPictures:
         return [denoise(*pair, quality) for pair in zip(raws, guides, strict=True)]
 
     def _numbers(self, finished: Sequence[Any]) -> LookNumbers:
-        arrays = self._sums, self._filtered, self._guides, self.hits, self._logs, finished
-        return add_numbers(*measure_pixels(NUMPY, self._names, self._groups(), *arrays))
+        arrays = self._sums, self._filtered, self._guides, self._hit, self._logs, finished
+        groups = self._groups()
+        row, logs = self._measure(self._inputs(self._pixels), self._names, groups, *arrays)
+        totals, tiles = np.split(np.array(row), [6 * len(METRICS) if finished else 0])
+        rows = tiles.reshape(-1, len(self._counts[0]))
+        adds, most = np.split(rows, [3 if finished else 3 + 3 * len(groups)])
+        return LookNumbers(totals=totals.reshape(-1, 6), adds=adds, most=most, logs=logs)
 
     def _groups(self) -> Sequence[Group]:
         count = len(self._samples.sums[0]) * max(1, len(self._names))
