@@ -363,17 +363,11 @@ def metric_counts(hits: NDArray[np.bool_]) -> tuple[NDArray[np.float64], ...]:
 
 def floors_of(numbers: LookNumbers, counts: tuple[NDArray[np.float64], ...]) -> list[PictureErrors]:
     """Return the floors of `floor_groups`, by the halves alone and `metric_counts`."""
-    _require_numbers(numbers)
     errors = numbers.adds[3:]
     surprises = numbers.most[:-1].max(axis=1)
     counts = counts * (len(errors) // 3)
     rows = list(zip(surprises, errors, counts, strict=True))
     return [measured_floor(rows[first : first + 3]) for first in range(0, len(rows), 3)]
-
-
-def _require_numbers(numbers: LookNumbers) -> None:
-    require_finite(int(numbers.adds[2].sum()))
-    require_bounded(float(numbers.most[-1].max()))
 
 
 NUMPY = Pixels()
@@ -484,7 +478,6 @@ class ViewPictures:
 
     def _measures(self, numbers: LookNumbers) -> dict[str, ErrorMeasures]:
         """Return the measures of the picture by metric."""
-        _require_numbers(numbers)
         share = float(self.hits.mean())
         return {
             name: measures_of_totals(added, float(most.max()), int(count.sum()), share)
@@ -523,6 +516,8 @@ class ViewPictures:
         totals, tiles = np.split(np.array(row), [6 * len(METRICS) if finished else 0])
         rows = tiles.reshape(-1, len(self._counts[0]))
         adds, most = np.split(rows, [3 if finished else 3 + 3 * len(groups)])
+        require_finite(int(adds[2].sum()))
+        require_bounded(float(most[-1].max()))
         return LookNumbers(totals=totals.reshape(-1, 6), adds=adds, most=most, logs=logs)
 
     def _groups(self) -> Sequence[Group]:
