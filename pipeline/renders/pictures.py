@@ -361,10 +361,12 @@ def metric_counts(hits: NDArray[np.bool_]) -> tuple[NDArray[np.float64], ...]:
     return everywhere, everywhere, objects
 
 
-def floors_of(numbers: LookNumbers, counts: tuple[NDArray[np.float64], ...]) -> list[PictureErrors]:
-    """Return the floors of `floor_groups`, by the halves alone and `metric_counts`."""
-    errors = numbers.adds[3:]
-    surprises = numbers.most[:-1].max(axis=1)
+def floors_of(
+    adds: NDArray[np.float64], most: NDArray[np.float64], counts: tuple[NDArray[np.float64], ...]
+) -> list[PictureErrors]:
+    """Return the floors of `floor_groups`, by `LookNumbers` of the halves and `metric_counts`."""
+    errors = adds[3:]
+    surprises = most[:-1].max(axis=1)
     counts = counts * (len(errors) // 3)
     rows = list(zip(surprises, errors, counts, strict=True))
     return [measured_floor(rows[first : first + 3]) for first in range(0, len(rows), 3)]
@@ -395,7 +397,7 @@ class ViewPictures:
 
     _pixels: Pixels = NUMPY
     _inputs: Any = staticmethod(lambda pixels: pixels)
-    """What a recorded function takes in the place of `_pixels`."""
+    """Wrapper of `_pixels` for recorded functions."""
     _read: Any = staticmethod(read_bounded)
     _raws: Any = staticmethod(raws_to_filter)
     _finish: Any = staticmethod(finish_pictures)
@@ -454,7 +456,7 @@ class ViewPictures:
         self._filtered = self._denoise_raws(quality, of_both=False)
         if statement is None or self._settings.picture_within_db is not None:
             numbers = self._numbers(())
-            floors = floors_of(numbers, self._counts)
+            floors = floors_of(numbers.adds, numbers.most, self._counts)
             if statement is None or is_far(floors[0], self._settings, self._samples.spp):
                 return self._look(numbers, floors, None)
         numbers = self._numbers(self._make_pictures()[:1])

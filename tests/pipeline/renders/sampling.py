@@ -10,7 +10,6 @@ from scipy import stats
 from pipeline.renders.pictures import (
     NUMPY,
     Halves,
-    LookNumbers,
     estimates,
     floors_of,
     join_halves,
@@ -153,8 +152,7 @@ def floor_of(a: Half, b: Half, hits: NDArray[np.bool_]) -> PictureErrors:
     errors, surprises = zip(*rows, strict=True)
     row = NUMPY.one_row([], [nothing] * 3 + list(errors), [*surprises, nothing], [])
     adds, most = np.split(row.reshape(10, -1), [6])
-    numbers = LookNumbers(totals=row[:0], adds=adds, most=most, logs=[])
-    (floor,) = floors_of(numbers, metric_counts(hits))
+    (floor,) = floors_of(adds, most, metric_counts(hits))
     return floor
 
 
