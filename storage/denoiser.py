@@ -10,7 +10,7 @@ import math
 import sys
 import threading
 from collections.abc import Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from typing import Any, Literal
 
 import numpy as np
@@ -38,19 +38,6 @@ class Features:
     """[R, R, 3] diffuse + specular albedo of the first surface, 0 where there is none."""
     normal: NDArray[np.float32]
     """[R, R, 3] its shading normal in world space, 0 where there is none."""
-    lobes: Mapping[str, NDArray[np.float32]] = field(default_factory=dict)
-    """[R, R, 3] the diffuse and the specular albedo by these names, where lobes are apart."""
-
-    def of_part(self, name: str) -> "Features":
-        """Return what guides the denoiser of a part (storage.records.lights), by its name.
-
-        A lobe is guided by its own albedo, and by no normal where it has none: there it is black.
-        """
-        albedo = self.lobes.get(name.partition("_")[0])
-        if albedo is None:
-            return self
-        normal = np.where(albedo.any(axis=-1, keepdims=True), self.normal, np.float32(0))
-        return Features(albedo=albedo, normal=normal)
 
 
 def set_denoiser_threads(count: int) -> None:

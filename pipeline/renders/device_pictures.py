@@ -5,7 +5,6 @@ Color3f, what is worked out of them is Float64, pixel by pixel.
 """
 
 import ctypes
-import functools
 import operator
 from collections.abc import Sequence
 from typing import Any
@@ -15,31 +14,26 @@ import mitsuba as mi
 import numpy as np
 from numpy.typing import NDArray
 
-from pipeline.renders.calibrated_error import METRICS
 from pipeline.renders.device_memory import KernelInputs, read_back, record_launches
 from pipeline.renders.pictures import (
     TILE,
-    LookNumbers,
     Sums,
     ViewPictures,
     broken_pixels,
     finish_pictures,
     half_means,
-    means,
     measure_pixels,
+    raws_to_filter,
 )
 from pipeline.renders.samples import TILE_PX, DualBuffer
-from pipeline.renders.settings import Filtered
 from pipeline.renders.tracer import PixelCamera
 from pipeline.renders.vector_tracer import VectorTracer
 from pipeline.renders.view_pictures import (
     GLINT,
     MOST_APART,
-    Group,
     Pixels,
     add_up,
     require_finite,
-    to_filter,
 )
 from storage.denoiser import INPUTS, Quality, open_filter
 
@@ -58,6 +52,7 @@ class KernelPixels(Pixels):
     maximum: Any = staticmethod(dr.maximum)
     brightest: Any = staticmethod(dr.max)
     channels: Any = staticmethod(list)
+    flat: Any = staticmethod(dr.ravel)
     mean: Any = staticmethod(operator.truediv)
 
     def __init__(self, resolution: int) -> None:
@@ -144,6 +139,13 @@ class KernelPixels(Pixels):
         across = self._resolution // TILE_PX
         return dr.block_sum(dr.block_sum(dr.concat(list(values)), across), across)
 
+    def one_row(
+        self, totals: Sequence[Any], adds: Sequence[Any], most: Sequence[Any], logs: Sequence[Any]
+    ) -> Any:
+        dr.eval(logs)
+        added = self.reduce_tiles(adds, dr.ReduceOp.Add)
+        return dr.concat([*totals, added, self.reduce_tiles(most, dr.ReduceOp.Max)])
+
     def reduce_tiles(self, values: Sequence[Any], reduction: Any) -> Any:
         """Return values of pixels (Float64) reduced over tiles, those of one after another's."""
         row, column = self._rows_and_columns()
@@ -178,19 +180,24 @@ def _sums(samples: DualBuffer) -> Sums:
 class DevicePictures(ViewPictures):
     """See `ViewPictures` for the meaning of its methods."""
 
+    _inputs = KernelInputs
     _read = staticmethod(_sums)
+    _raws = staticmethod(record_launches(raws_to_filter))
+    _finish = staticmethod(record_launches(finish_pictures))
+    _measure = staticmethod(record_launches(measure_pixels))
 
     def _trace_guides(
         self, tracer: VectorTracer, camera: PixelCamera
     ) -> tuple[NDArray[np.bool_], NDArray[np.bool_]]:
         self._resolution = camera.resolution
         self._pixels = KernelPixels(camera.resolution)
-        arrays = tracer.feature_arrays(camera, spp=self._settings.aux_spp)
-        hits = tracer.hit_array(camera)
-        inputs = KernelInputs(self._pixels)
-        self._guides, self._masks = _guides(inputs, arrays, hits, self._names or ("",))
+        self._guides = tracer.guides(camera, self._names, spp=self._settings.aux_spp)
+        self._hit = tracer.hit_array(camera)
         self._logs = [dr.opaque(mi.Color3d, 0, camera.resolution**2) for _ in range(2)]
-        bits = read_back(self._masks).reshape(camera.resolution, camera.resolution)
+        visible = dr.any(dr.unravel(mi.Color3f, self._guides[""][1]) != 0)
+        byte: Any = mi.UInt8
+        bits = read_back(byte(dr.select(self._hit, 1, 0) + dr.select(visible, 2, 0)))
+        bits = bits.reshape(camera.resolution, camera.resolution)
         return bits & 1 > 0, bits & 2 > 0
 
     @staticmethod
@@ -202,32 +209,11 @@ class DevicePictures(ViewPictures):
         return float(total) / (3 * resolution**2)
 
     def finish(self) -> NDArray[np.float32]:
-        pictures = read_back(self._make_pictures())
-        return pictures.reshape(-1, self._resolution, self._resolution, 3)
+        shape = (-1, self._resolution, self._resolution, 3)
+        return np.reshape([read_back(picture) for picture in self._make_pictures()], shape)
 
-    def _finish(self, filtered: Sequence[Any]) -> Any:
-        """Return the pictures of all samples of this look (Float), one after another."""
-        return _finish(KernelInputs(self._pixels), self._sums, filtered, self._guides, self._names)
-
-    def _denoise_raws(self, quality: Filtered, *, of_both: bool) -> Sequence[Any]:
-        if quality == "off":
-            return []
-        raws = _raws(KernelInputs(self._pixels), self._sums, self._names, of_both)
-        pictures = range(sum(len(tracer) - 3 for tracer in self._sums[0]))
-        guides = [self._guides[name] for _, name in to_filter(pictures, self._names)]
-        return [denoise_arrays(raw, guides, self._resolution, quality) for raw in raws]
-
-    def _numbers(self, finished: Any) -> LookNumbers:
-        picture = [] if finished is None else [finished]
-        arrays = self._sums, self._filtered, self._guides, self._masks, self._logs, picture
-        groups = self._groups()
-        numbers, logs = _measure(KernelInputs(self._pixels), *arrays, self._names, groups)
-        totals, tiles = np.split(read_back(numbers), [6 * len(METRICS) if picture else 0])
-        rows = tiles.reshape(-1, len(self._counts[0]))
-        num_surprises = 3 if picture else 3 * len(groups)
-        adds, most = np.split(rows, [len(rows) - num_surprises - 1])
-        totals = totals.reshape(-1, 6)
-        return LookNumbers(totals=totals, adds=adds, sums=adds.sum(axis=1), most=most, logs=logs)
+    def _denoise(self, raws: Sequence[Any], guides: Sequence[Any], quality: Quality) -> list[Any]:
+        return denoise_arrays(raws, guides, self._resolution, quality)
 
 
 @record_launches
@@ -235,71 +221,6 @@ def _brightness(pixels: KernelPixels, sums: Sums) -> Any:
     """Return the sum of all channels of the mean of both halves, and the broken pixels."""
     of_halves = [add_up(half) for half in half_means(sums, pixels)]
     return pixels.totals([channel_sum(add_up(of_halves)) / 2, broken_pixels(sums, pixels)])
-
-
-@record_launches
-def _guides(
-    _: KernelPixels, arrays: dict[str, Any], hits: Any, names: Sequence[str]
-) -> tuple[Any, Any]:
-    """Return albedo and normal by the name of a part, as `Features.of_part`, and hits and shown."""
-    normal: Any = mi.Color3f(arrays["normal"])
-    guides = dict[str, Any]()
-    for name in names:
-        albedo = mi.Color3f(arrays.get(name.partition("_")[0], arrays["albedo"]))
-        seen = (
-            normal
-            if name.partition("_")[0] not in arrays
-            else dr.select(dr.any(albedo != 0), normal, 0)
-        )
-        guides[name] = dr.ravel(albedo), dr.ravel(seen)
-    visible: Any = functools.reduce(operator.or_, normal != 0)
-    byte: Any = mi.UInt8
-    return guides, byte(dr.select(hits, 1, 0) + dr.select(visible, 2, 0))
-
-
-@record_launches
-def _raws(pixels: KernelPixels, sums: Sums, names: Sequence[str], of_both: bool) -> list[list[Any]]:
-    """Return what the denoiser is asked for, of each half or of both (Float, pixel by pixel)."""
-    return [
-        [dr.ravel(picture) for picture, _ in to_filter(pictures, names)]
-        for pictures in means(sums, pixels, of_both=of_both)
-    ]
-
-
-@record_launches
-def _measure(
-    pixels: KernelPixels,
-    sums: Sums,
-    filtered: list[list[Any]],
-    guides: dict[str, Any],
-    masks: Any,
-    logs: Sequence[Any],
-    finished: list[Any],
-    names: Sequence[str],
-    groups: Sequence[Group],
-) -> tuple[Any, list[Any]]:
-    """Return the totals and rows of numbers of all tiles of `measure_pixels` (Float64), and logs.
-
-    What is added up comes first, and then what is greatest.
-    """
-    picture = dr.unravel(mi.Color3f, finished[0]) if finished else None
-    totals, adds, most, new_logs = measure_pixels(
-        pixels, names, groups, sums, filtered, guides, (masks & 1) > 0, logs, picture
-    )
-    dr.eval(new_logs)
-    added = pixels.reduce_tiles(adds, dr.ReduceOp.Add)
-    greatest = pixels.reduce_tiles(most, dr.ReduceOp.Max)
-    return dr.concat([*totals, added, greatest]), new_logs
-
-
-@record_launches
-def _finish(
-    pixels: KernelPixels, sums: Sums, filtered: Any, guides: dict[str, Any], names: Sequence[str]
-) -> Any:
-    """Return the pictures of all samples (Float), one after another."""
-    pictures = finish_pictures(sums, filtered, guides, pixels, names)
-    flat: list[Any] = [dr.ravel(picture) for picture in pictures]
-    return dr.concat(flat)
 
 
 def denoise_arrays(

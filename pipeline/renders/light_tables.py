@@ -21,7 +21,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pipeline.renders.device_memory import opaque_vector, own_floats
-from pipeline.renders.surface_table import SurfacePoint
+from pipeline.renders.surface_table import SurfacePoint, neighbours
 from storage.errors import Rejected
 from storage.records.material import EMISSION
 from storage.records.scene import Scene
@@ -266,15 +266,13 @@ class SkyTable:
         x, y, z = (dr.dot(axis, direction) for axis in self._to_world)
         u = 0.5 - dr.atan2(y, x) / (2 * dr.pi)
         v = dr.atan2(dr.sqrt(x * x + y * y), z) / dr.pi
-        first_column, along = _between(u * mi.Float(self._width))
-        above, down = _between(v * mi.Float(self._height))
-        most = mi.Int32(self._height) - 1
-        rows = [mi.UInt32(dr.clip(above + step, 0, most)) for step in (0, 1)]
-        width = mi.Int32(self._width)
-        columns = [first_column + step for step in (0, 1)]
-        columns = [mi.UInt32(dr.select(c < 0, c + width, c)) for c in columns]
-        columns = [dr.select(c >= self._width, c - self._width, c) for c in columns]
+        *columns, along = neighbours(u, self._width)
         columns = [dr.minimum(c, self._width - 1) for c in columns]  # of what is no direction
+        place = v * mi.Float(self._height) - 0.5
+        above = dr.floor(place)
+        down = place - above
+        most = mi.Int32(self._height) - 1
+        rows = [mi.UInt32(dr.clip(mi.Int32(above) + step, 0, most)) for step in (0, 1)]
         upper, lower = (
             [
                 dr.gather(mi.Vector4f, self._texels, row * self._width + column, active)
@@ -326,13 +324,6 @@ def alias_rows(weights: NDArray[np.float64]) -> tuple[NDArray[np.float64], NDArr
         residual = np.where(used_up, residual + scaled[all_rows, following] - 1, residual)
         rich += used_up
     return np.clip(keep, 0, 1), alias
-
-
-def _between(place: Any) -> tuple[Any, Any]:
-    """Return the texel centre (Int32) at or before a place in texels, and how far it is beyond."""
-    shifted = place - 0.5
-    before = dr.floor(shifted)
-    return mi.Int32(before), shifted - before
 
 
 def sky_share(scene: Scene, sky: Environment) -> float:

@@ -104,21 +104,21 @@ class ErrorMeasures:
 
 
 def measured_floor(
-    rows: Iterable[tuple[float, float, NDArray[np.float64], NDArray[np.float64]]],
+    rows: Iterable[tuple[float, NDArray[np.float64], NDArray[np.float64]]],
 ) -> PictureErrors:
     """Return the floor of a picture.
 
     Args:
-        rows: of log and linear light and of objects: sum of the estimates of all pixels, greatest
-            surprise, and [T] the sums of estimates and the pixels of each block. Where there are
-            no pixels at all, the floor is the highest.
+        rows: of log and linear light and of objects: greatest surprise of a pixel, and [T] the sums
+            of estimates and the pixels of each block. Where there are no pixels at all, the floor
+            is the highest.
     """
     floors_db = []
-    for (error, surprise, sums, counts), deviations in zip(rows, _STANDARD_ERRORS, strict=True):
+    for (surprise, sums, counts), deviations in zip(rows, _STANDARD_ERRORS, strict=True):
         count = counts.sum()
         bound = 0.0
         if count:
-            bound = max(error / count, 0.0) + surprise / count
+            bound = max(sums.sum() / count, 0.0) + surprise / count
             bound += deviations * _standard_error(sums, counts)
         smallest = 10 ** (-MAX_DB / 10)
         floors_db.append(MAX_DB if bound <= smallest else float(-10 * np.log10(bound)))

@@ -20,7 +20,7 @@ from pipeline.renders.noise_floor import (
     measured_floor,
     secant_slope,
 )
-from pipeline.renders.samples import TILE_PX, DualBuffer, by_tiles, tile_means
+from pipeline.renders.samples import TILE_PX, DualBuffer, tile_means
 from pipeline.renders.settings import Filtered, RenderSettings
 from pipeline.renders.tracer import PixelCamera
 from pipeline.renders.view_pictures import (
@@ -38,7 +38,7 @@ from pipeline.renders.view_pictures import (
     require_finite,
     to_filter,
 )
-from storage.denoiser import denoise
+from storage.denoiser import Features, Quality, denoise
 from storage.records.sample import PictureErrors
 
 if TYPE_CHECKING:
@@ -230,8 +230,18 @@ def clean_pictures(
     return denoised
 
 
+def raws_to_filter(
+    pixels: Pixels, sums: Sums, names: Sequence[str], of_both: bool
+) -> list[list[Any]]:
+    """Return what the denoiser is asked for, of each half or of both, as it takes pictures."""
+    return [
+        [pixels.flat(picture) for picture, _ in to_filter(pictures, names)]
+        for pictures in means(sums, pixels, of_both=of_both)
+    ]
+
+
 def finish_pictures(
-    sums: Sums, filtered: Sequence[Any], guides: Any, pixels: Pixels, names: Sequence[str]
+    pixels: Pixels, sums: Sums, filtered: Sequence[Any], guides: Any, names: Sequence[str]
 ) -> list[Any]:
     """Return the pictures of all samples; those that nothing filtered are the raw ones."""
     raws = means(sums, pixels, of_both=True)
@@ -254,15 +264,16 @@ def measure_pixels(
     guides: Any,
     hit: Any,
     logs: Sequence[Any],
-    finished: Any,
-) -> tuple[list[Any], list[Any], list[Any], list[Any]]:
+    finished: Sequence[Any],
+) -> tuple[Any, list[Any]]:
     """Measure the halves, and with `finished`, one denoise of all samples, the error of that.
 
     Returns:
-        Totals of `measures_of_totals`, of one metric after another; none without a picture. What
-        is added up: the changes of both halves, broken pixels, and three estimates of each of
-        `floor_groups`; no estimates with a picture. What the greatest counts of: surprises of the
-        same, and the brightest raw channel. And the log radiance of both halves.
+        `Pixels.one_row`, and the log radiance of both halves. Totals are those of
+        `measures_of_totals`, of one metric after another; none without a picture. Added up are the
+        changes of both halves, broken pixels, and three estimates of each of `floor_groups`; no
+        estimates with a picture. The greatest counts of surprises of the same, and of the brightest
+        raw channel.
     """
     raws = means(sums, pixels, of_both=False)
     denoised = clean_pictures(raws, filtered, guides, pixels, names) if filtered else raws
@@ -280,18 +291,18 @@ def measure_pixels(
     for group in groups:
         a, b, denoised_a, denoised_b = (add_up(each[slice(*group)]) for each in (*raws, *corrected))
         halves = join_halves(a, b, denoised_a, denoised_b, pixels)
-        if finished is None:
+        if not finished:
             rows = estimates(halves, hit, pixels, bool(filtered))
             errors += [error for error, _ in rows]
             surprises += [surprise for _, surprise in rows]
         else:
-            measured, more = error_measures(halves, pixels.double(finished), hit, pixels)
+            measured, more = error_measures(halves, pixels.double(finished[0]), hit, pixels)
             totals.append(measured)
             surprises += more
     channels = [pixels.brightest(part) for half in raws for part in half]
     brightest = functools.reduce(pixels.maximum, channels)
     adds = [*changes, broken_pixels(sums, pixels), *errors]
-    return totals, adds, [*surprises, brightest], new_logs
+    return pixels.one_row(totals, adds, [*surprises, brightest], new_logs), new_logs
 
 
 def join_halves(a: Any, b: Any, denoised_a: Any, denoised_b: Any, pixels: Pixels) -> Halves:
@@ -337,8 +348,6 @@ class LookNumbers:
     """[3, 6] totals of `measures_of_totals`; empty without a picture."""
     adds: NDArray[np.float64]
     """[N, T] sums over tiles of what `measure_pixels` adds up."""
-    sums: NDArray[np.float64]
-    """[N] the same over all pixels."""
     most: NDArray[np.float64]
     """[M, T] largest in each tile of what the greatest counts of."""
     logs: Sequence[Any]
@@ -352,43 +361,32 @@ def metric_counts(hits: NDArray[np.bool_]) -> tuple[NDArray[np.float64], ...]:
     return everywhere, everywhere, objects
 
 
-def floors_of(numbers: LookNumbers, counts: tuple[NDArray[np.float64], ...]) -> list[PictureErrors]:
-    """Return the floors of `floor_groups`, by the halves alone and `metric_counts`."""
-    _require_numbers(numbers)
-    errors = numbers.adds[3:]
-    surprises = numbers.most[:-1].max(axis=1)
+def floors_of(
+    adds: NDArray[np.float64], most: NDArray[np.float64], counts: tuple[NDArray[np.float64], ...]
+) -> list[PictureErrors]:
+    """Return the floors of `floor_groups`, by `LookNumbers` of the halves and `metric_counts`."""
+    errors = adds[3:]
+    surprises = most[:-1].max(axis=1)
     counts = counts * (len(errors) // 3)
-    rows = list(zip(numbers.sums[3:], surprises, errors, counts, strict=True))
+    rows = list(zip(surprises, errors, counts, strict=True))
     return [measured_floor(rows[first : first + 3]) for first in range(0, len(rows), 3)]
-
-
-def _require_numbers(numbers: LookNumbers) -> None:
-    require_finite(int(numbers.sums[2]))
-    require_bounded(float(numbers.most[-1].max()))
 
 
 NUMPY = Pixels()
 
 
 def read_sums(samples: DualBuffer) -> Sums:
-    """Return the sums of a view; raises as `ViewPictures.look`."""
+    """Return the sums of a view; raises Rejected("nonfinite_radiance")."""
     sums = [[each.read() for each in half] for half in samples.sums]
     require_finite(int(broken_pixels(sums, NUMPY).sum()))
     return sums
 
 
-def add_numbers(
-    totals: list[Any], adds: list[Any], most: list[Any], logs: list[Any]
-) -> LookNumbers:
-    """Return the numbers of pixels by tile and in all."""
-    greatest = [by_tiles(each).max(axis=(1, 3)).ravel() for each in most]
-    return LookNumbers(
-        totals=np.array(totals).reshape(-1, 6),
-        adds=np.array(NUMPY.tile_sums(adds)),
-        sums=np.array([each.sum() for each in adds]),
-        most=np.array(greatest, np.float64),
-        logs=logs,
-    )
+def read_bounded(samples: DualBuffer) -> Sums:
+    """Return the sums of a view; raises as `ViewPictures.look`."""
+    sums = read_sums(samples)
+    require_bounded(float(np.max(means(sums, NUMPY, of_both=False))))
+    return sums
 
 
 class ViewPictures:
@@ -397,7 +395,13 @@ class ViewPictures:
     There are P of them, of lights and of their parts: all parts of the first light come first.
     """
 
-    _read: Any = staticmethod(read_sums)
+    _pixels: Pixels = NUMPY
+    _inputs: Any = staticmethod(lambda pixels: pixels)
+    """Wrapper of `_pixels` for recorded functions."""
+    _read: Any = staticmethod(read_bounded)
+    _raws: Any = staticmethod(raws_to_filter)
+    _finish: Any = staticmethod(finish_pictures)
+    _measure: Any = staticmethod(measure_pixels)
     hits: NDArray[np.bool_]
     """[R, R] true where `VectorTracer.hits` is."""
     visible: NDArray[np.bool_]
@@ -425,8 +429,14 @@ class ViewPictures:
         self, tracer: "VectorTracer", camera: PixelCamera
     ) -> tuple[NDArray[np.bool_], NDArray[np.bool_]]:
         """Trace what guides the denoiser; return pixels that hit and that show anything."""
-        self._features = tracer.features(camera, spp=self._settings.aux_spp)
-        return tracer.hits(camera), np.any(self._features.normal != 0, axis=-1)
+        shape = (camera.resolution, camera.resolution, 3)
+        guides = tracer.guides(camera, self._names, spp=self._settings.aux_spp)
+        self._guides: Any = {
+            name: Features(albedo=albedo.reshape(shape), normal=normal.reshape(shape))
+            for name, (albedo, normal) in ((name, map(np.array, guides[name])) for name in guides)
+        }
+        self._hit: Any = tracer.hits(camera)
+        return self._hit, np.any(self._guides[""].normal != 0, axis=-1)
 
     @staticmethod
     def mean_radiance(samples: DualBuffer) -> float:
@@ -445,11 +455,11 @@ class ViewPictures:
         self._picture = None
         self._filtered = self._denoise_raws(quality, of_both=False)
         if statement is None or self._settings.picture_within_db is not None:
-            numbers = self._numbers(None)
-            floors = floors_of(numbers, self._counts)
+            numbers = self._numbers(())
+            floors = floors_of(numbers.adds, numbers.most, self._counts)
             if statement is None or is_far(floors[0], self._settings, self._samples.spp):
                 return self._look(numbers, floors, None)
-        numbers = self._numbers(self._make_pictures())
+        numbers = self._numbers(self._make_pictures()[:1])
         resolution = len(self.hits)
         floor, expected = statement.state(self._measures(numbers), resolution, self._samples.spp)
         return self._look(numbers, [floor], expected)
@@ -470,7 +480,6 @@ class ViewPictures:
 
     def _measures(self, numbers: LookNumbers) -> dict[str, ErrorMeasures]:
         """Return the measures of the picture by metric."""
-        _require_numbers(numbers)
         share = float(self.hits.mean())
         return {
             name: measures_of_totals(added, float(most.max()), int(count.sum()), share)
@@ -483,33 +492,35 @@ class ViewPictures:
         """Return the pictures of all samples of the last look, [P, R, R, 3]."""
         return np.stack(self._make_pictures())
 
-    def _make_pictures(self) -> Any:
+    def _make_pictures(self) -> list[Any]:
         """Return the pictures of `finish` where they are worked out, once for a look."""
         if self._picture is None:
             filtered = self._denoise_raws(self._settings.denoiser, of_both=True)
-            self._picture = self._finish(filtered)
+            inputs = self._inputs(self._pixels)
+            self._picture = self._finish(inputs, self._sums, filtered, self._guides, self._names)
         return self._picture
 
-    def _finish(self, filtered: Sequence[Any]) -> Any:
-        return finish_pictures(self._sums, filtered, None, NUMPY, self._names)
-
     def _denoise_raws(self, quality: Filtered, *, of_both: bool) -> Sequence[Any]:
-        raws = means(self._sums, NUMPY, of_both=of_both)
-        require_bounded(float(np.max(raws)))
         if quality == "off":
             return []
-        return [
-            [
-                denoise(picture, self._features.of_part(name), quality)
-                for picture, name in to_filter(pictures, self._names)
-            ]
-            for pictures in raws
-        ]
+        raws = self._raws(self._inputs(self._pixels), self._sums, self._names, of_both)
+        pictures = range(sum(len(tracer) - 3 for tracer in self._sums[0]))
+        guides = [self._guides[name] for _, name in to_filter(pictures, self._names)]
+        return [self._denoise(each, guides, quality) for each in raws]
 
-    def _numbers(self, finished: Any) -> LookNumbers:
-        picture = None if finished is None else finished[0]
-        arrays = self._sums, self._filtered, None, self.hits, self._logs, picture
-        return add_numbers(*measure_pixels(NUMPY, self._names, self._groups(), *arrays))
+    def _denoise(self, raws: Sequence[Any], guides: Sequence[Any], quality: Quality) -> list[Any]:
+        return [denoise(*pair, quality) for pair in zip(raws, guides, strict=True)]
+
+    def _numbers(self, finished: Sequence[Any]) -> LookNumbers:
+        arrays = self._sums, self._filtered, self._guides, self._hit, self._logs, finished
+        groups = self._groups()
+        row, logs = self._measure(self._inputs(self._pixels), self._names, groups, *arrays)
+        totals, tiles = np.split(np.array(row), [6 * len(METRICS) if finished else 0])
+        rows = tiles.reshape(-1, len(self._counts[0]))
+        adds, most = np.split(rows, [3 if finished else 3 + 3 * len(groups)])
+        require_finite(int(adds[2].sum()))
+        require_bounded(float(most[-1].max()))
+        return LookNumbers(totals=totals.reshape(-1, 6), adds=adds, most=most, logs=logs)
 
     def _groups(self) -> Sequence[Group]:
         count = len(self._samples.sums[0]) * max(1, len(self._names))

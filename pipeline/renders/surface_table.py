@@ -240,8 +240,8 @@ class KernelTextures:
 
     def _bilinear(self, kind: Any, texture: Any, u: Any, v: Any, active: Any) -> Any:
         """Return the value at u and v in [0, 1] of a texture (Vector4u: first, width, height)."""
-        near, far, along = _neighbours(u, texture.y)
-        low, high, across = _neighbours(v, texture.z)
+        near, far, along = neighbours(u, texture.y)
+        low, high, across = neighbours(v, texture.z)
 
         def row(line: Any) -> Any:
             first = texture.x + line * texture.y
@@ -260,7 +260,7 @@ class KernelTextures:
         return mi.Color3f(texel.xyz)
 
 
-def _neighbours(place: Any, count: Any) -> tuple[Any, Any, Any]:
+def neighbours(place: Any, count: Any) -> tuple[Any, Any, Any]:
     """Return the texels (UInt32) around a place in [0, 1], and the share (Float) of the second."""
     scaled = place * mi.Float(count) - 0.5
     below = dr.floor(scaled)

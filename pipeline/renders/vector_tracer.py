@@ -201,18 +201,20 @@ class VectorTracer:
 
     def features(self, camera: PixelCamera, *, spp: int) -> Features:
         """Return the albedo and normal pictures, of `spp` evenly spread rays in each pixel."""
-        named = self.feature_arrays(camera, spp=spp)
-        return Features(
-            albedo=_picture(camera, named.pop("albedo")),
-            normal=_picture(camera, named.pop("normal")),
-            lobes={name: _picture(camera, values) for name, values in named.items()},
-        )
+        albedo, normal = self.guides(camera, (), spp=spp)[""]
+        return Features(albedo=_picture(camera, albedo), normal=_picture(camera, normal))
 
-    def feature_arrays(self, camera: PixelCamera, *, spp: int) -> dict[str, Any]:
-        """Return the pictures of `features` by name, in the memory of the device (Color3f)."""
+    def guides(
+        self, camera: PixelCamera, names: Sequence[str], *, spp: int
+    ) -> dict[str, tuple[Any, Any]]:
+        """Return `features` by the name of a part in the device's memory (Float, flat); "" is all.
+
+        A lobe is guided by its own albedo, and by no normal where it has none: there it is black.
+        """
         inputs = KernelInputs(self._scene, self._film(camera), self._parts)
-        arrays: dict[str, Any] = _features(inputs, camera.resolution, spp)
-        return arrays
+        of_lobes: dict[str, tuple[Any, Any]] = _features(inputs, camera.resolution, spp)
+        every = of_lobes[""]
+        return {name: of_lobes.get(name.partition("_")[0], every) for name in ("", *names)}
 
     def hits(self, camera: PixelCamera) -> NDArray[np.bool_]:
         """Return whether the ray through each pixel's centre hits a surface, [R, R]."""
@@ -312,15 +314,23 @@ def _settle(scene: KernelScene) -> Any:
 
 
 @record_launches
-def _features(scene: Any, film: Film, parts: Any, resolution: int, spp: int) -> dict[str, Any]:
+def _features(
+    scene: Any, film: Film, parts: Any, resolution: int, spp: int
+) -> dict[str, tuple[Any, Any]]:
+    """Return albedo and normal (Float, flat) of all light, "", and of each lobe that is apart."""
     hit, active = _first_hit(scene, film, resolution, spp)
     normal, lobes = scene.table.shading(hit, active)
     mapped = scene.table.mapped_normal(normal, hit, active)
     normal = normal if mapped is None else mapped
-    named = {"albedo": lobes.diffuse + lobes.specular, "normal": normal}
+    named = {"": lobes.diffuse + lobes.specular}
     if parts.num_lobes == 2:
         named |= {"diffuse": lobes.diffuse, "specular": lobes.specular}
-    return {name: _pixel_means(spp, dr.select(active, values, 0)) for name, values in named.items()}
+    normal, *albedos = (
+        _pixel_means(spp, dr.select(active, values, 0)) for values in (normal, *named.values())
+    )
+    seen = [normal, *(dr.select(dr.any(each != 0), normal, 0) for each in albedos[1:])]
+    pairs = zip(map(dr.ravel, albedos), map(dr.ravel, seen), strict=True)
+    return dict(zip(named, pairs, strict=True))
 
 
 @record_launches

@@ -93,6 +93,10 @@ class Pixels:
     brightest: Any = staticmethod(functools.partial(np.max, axis=-1))
     """Largest channel of each pixel."""
 
+    def flat(self, color: Any) -> Any:
+        """Return a picture as the denoiser takes it."""
+        return color
+
     def select(self, mask: Any, first: Any, second: Any) -> Any:
         return np.where(mask[..., None] if np.ndim(first) > mask.ndim else mask, first, second)
 
@@ -145,6 +149,19 @@ class Pixels:
     def totals_of_tiles(self, values: Sequence[Any]) -> Any:
         """Return the sum over all tiles of each of some values of tiles."""
         return np.array([each.sum() for each in values])
+
+    def one_row(
+        self, totals: Sequence[Any], adds: Sequence[Any], most: Sequence[Any], logs: Sequence[Any]
+    ) -> Any:
+        """Return totals, the sums of `adds` over tiles and the greatest of `most` in them, flat.
+
+        Args:
+            totals: rows of numbers.
+            adds, most: values of pixels.
+            logs: pictures that are worked out with them, where that is not done yet.
+        """
+        greatest = [by_tiles(each).max(axis=(1, 3)).ravel() for each in most]
+        return np.concatenate([*totals, *self.tile_sums(adds), *greatest])
 
 
 def with_mean_of(

@@ -293,10 +293,7 @@ def subdivide(piece: ScenePiece, num_faces: int) -> ScenePiece:
     neighbors' normals, and new triangles keep their material. A piece that has as many faces
     already is returned as it is.
     """
-    work = _Work(piece.mesh)
-    work.halve_longest(num_faces)
-    mesh = work.mesh()
-    origin = np.array(work.origin)
+    mesh, origin = _halve_longest(piece.mesh, num_faces)
     skin = piece.skin
     if skin is not None:
         corner_uv = skin.uv.reshape(-1, 3, 2)
@@ -321,76 +318,59 @@ def _interpolate_uv(
     return np.einsum("tpc,tcu->tpu", np.clip(weights, 0, 1), uv[origin].astype(np.float64))
 
 
-class _Work:
-    """A mesh while it is subdivided. Positions identify edges: flat faces share no vertices."""
+def _halve_longest(mesh: ShadedMesh, num_faces: int) -> tuple[ShadedMesh, NDArray[np.int64]]:
+    """Return a mesh of at most `num_faces` faces, and the face that each is a part of.
 
-    def __init__(self, mesh: ShadedMesh) -> None:
-        self._points = list(mesh.positions.astype(np.float64))
-        self._normals = list(mesh.normals.astype(np.float64))
-        _, ids = np.unique(mesh.positions, axis=0, return_inverse=True)
-        self._position_ids: list[int] = ids.ravel().tolist()
-        self._new_positions = itertools.count(1 + max(self._position_ids))
-        self._groups = mesh.groups
-        self._faces: list[list[int]] = mesh.faces.tolist()
-        self.origin = list(range(len(self._faces)))
-        self._rows: dict[Edge, set[int]] = {}
-        self._longest: list[tuple[float, Edge]] = []
-        for row in range(len(self._faces)):
-            self._enter(row)
+    Positions identify edges: flat faces share no vertices.
+    """
+    vertices = list(np.column_stack([mesh.positions, mesh.normals]).astype(np.float64))
+    _, ids = np.unique(mesh.positions, axis=0, return_inverse=True)
+    places: list[int] = ids.ravel().tolist()
+    new_places = itertools.count(1 + max(places))
+    faces: list[list[int]] = mesh.faces.tolist()
+    origin = list(range(len(faces)))
+    rows: dict[Edge, set[int]] = {}
+    longest: list[tuple[float, Edge]] = []
 
-    def mesh(self) -> ShadedMesh:
-        normals = np.array(self._normals)
-        normals /= np.sqrt(np.sum(np.square(normals), axis=1, keepdims=True))
-        return ShadedMesh(
-            positions=np.array(self._points, np.float32),
-            normals=normals.astype(np.float32),
-            faces=np.array(self._faces, np.uint32),
-            groups=self._groups[np.array(self.origin)],
-        )
+    def edges(row: int) -> Iterator[tuple[int, int, Edge]]:
+        for a, b in itertools.pairwise([*faces[row], faces[row][0]]):
+            yield a, b, (min(places[a], places[b]), max(places[a], places[b]))
 
-    def halve_longest(self, num_faces: int) -> None:
-        """Halve the longest edge, as long as its faces leave the mesh within `num_faces`.
+    def enter(row: int) -> None:
+        for a, b, edge in edges(row):
+            if edge not in rows:
+                rows[edge] = set()
+                offset = vertices[a][:3] - vertices[b][:3]
+                heapq.heappush(longest, (-float(np.sum(offset * offset)), edge))
+            rows[edge].add(row)
 
-        An edge that no face has any more is only taken off.
-        """
-        while True:
-            edge = self._longest[0][1]
-            if len(self._faces) + len(self._rows[edge]) > num_faces:
-                return
-            heapq.heappop(self._longest)
-            middle = next(self._new_positions)
-            made: dict[Edge, int] = {}
-            for row in sorted(self._rows.pop(edge)):
-                self._halve(row, edge, middle, made)
-
-    def _halve(self, row: int, edge: Edge, position_id: int, made: dict[Edge, int]) -> None:
-        face = self._faces[row]
-        first, second = sorted(v for v in face if self._position_ids[v] in edge)
-        if (first, second) not in made:
-            made[first, second] = len(self._points)
-            self._points.append((self._points[first] + self._points[second]) / 2)
-            self._normals.append((self._normals[first] + self._normals[second]) / 2)
-            self._position_ids.append(position_id)
-        middle = made[first, second]
-        for _, other in self._edges(row):
-            if other != edge:
-                self._rows[other].discard(row)
-        self._faces[row] = [middle if v == first else v for v in face]
-        self._faces.append([middle if v == second else v for v in face])
-        self.origin.append(self.origin[row])
-        self._enter(row)
-        self._enter(len(self._faces) - 1)
-
-    def _enter(self, row: int) -> None:
-        for length_sq, edge in self._edges(row):
-            if edge not in self._rows:
-                self._rows[edge] = set()
-                heapq.heappush(self._longest, (-length_sq, edge))
-            self._rows[edge].add(row)
-
-    def _edges(self, row: int) -> Iterator[tuple[float, Edge]]:
-        face = self._faces[row]
-        for a, b in zip(face, (*face[1:], face[0]), strict=True):
-            offset = self._points[a] - self._points[b]
-            pair = self._position_ids[a], self._position_ids[b]
-            yield float(np.sum(offset * offset)), (min(pair), max(pair))
+    for row in range(len(faces)):
+        enter(row)
+    while len(faces) + len(rows[longest[0][1]]) <= num_faces:
+        _, halved = heapq.heappop(longest)
+        place = next(new_places)
+        middles: dict[Edge, int] = {}
+        for row in sorted(rows.pop(halved)):
+            for _, _, edge in edges(row):
+                rows.get(edge, set()).discard(row)
+            face = faces[row]
+            first, second = sorted(v for v in face if places[v] in halved)
+            if (first, second) not in middles:
+                middles[first, second] = len(vertices)
+                vertices.append((vertices[first] + vertices[second]) / 2)
+                places.append(place)
+            middle = middles[first, second]
+            faces[row] = [middle if v == first else v for v in face]
+            faces.append([middle if v == second else v for v in face])
+            origin.append(origin[row])
+            enter(row)
+            enter(len(faces) - 1)
+    positions, normals = np.split(np.array(vertices), 2, axis=1)
+    normals = normals / np.sqrt(np.sum(np.square(normals), axis=1, keepdims=True))
+    finer = ShadedMesh(
+        positions=positions.astype(np.float32),
+        normals=normals.astype(np.float32),
+        faces=np.array(faces, np.uint32),
+        groups=mesh.groups[origin],
+    )
+    return finer, np.array(origin)

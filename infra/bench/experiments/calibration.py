@@ -67,8 +67,8 @@ def record_looks(
 
         def look(self, quality: Filtered) -> MeasuredLook:
             look = super().look(quality)
-            (picture,) = pictures = self.finish()
-            measured = self._measures(self._numbers(pictures))
+            (picture,) = self.finish()
+            measured = self._measures(self._numbers([picture]))
             row = {
                 "spp": float(self._samples.spp),
                 "hits": float(self.hits.mean()),

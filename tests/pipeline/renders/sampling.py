@@ -10,7 +10,6 @@ from scipy import stats
 from pipeline.renders.pictures import (
     NUMPY,
     Halves,
-    add_numbers,
     estimates,
     floors_of,
     join_halves,
@@ -151,8 +150,9 @@ def floor_of(a: Half, b: Half, hits: NDArray[np.bool_]) -> PictureErrors:
     is_filtered = not np.array_equal(*a)
     rows, nothing = estimates(halves_of(a, b), hits, NUMPY, is_filtered), np.zeros(hits.shape)
     errors, surprises = zip(*rows, strict=True)
-    numbers = add_numbers([], [nothing] * 3 + list(errors), [*surprises, nothing], [])
-    (floor,) = floors_of(numbers, metric_counts(hits))
+    row = NUMPY.one_row([], [nothing] * 3 + list(errors), [*surprises, nothing], [])
+    adds, most = np.split(row.reshape(10, -1), [6])
+    (floor,) = floors_of(adds, most, metric_counts(hits))
     return floor
 
 
