@@ -319,15 +319,15 @@ def _from_workers(workers: int) -> dict[str, dict[int, str]]:
         mp_context=multiprocessing.get_context("spawn"),
         initializer=hold if workers == 1 else None,
     ) as executor:
-        jobs = [
-            (build, index, executor.submit(composed_digest, build, 0, index))
+        submit = functools.partial(executor.submit, composed_digest)
+        jobs = {
+            build: {index: submit(build, 0, index) for index in reversed(indices)}
             for build, indices in SCENES.items()
-            for index in reversed(indices)
-        ]
-        found: dict[str, dict[int, str]] = {build: {} for build in SCENES}
-        for build, index, job in jobs:
-            found[build][index] = job.result()
-        return found
+        }
+        return {
+            build: {index: job.result() for index, job in of_build.items()}
+            for build, of_build in jobs.items()
+        }
 
 
 @pytest.mark.slow("kills")
