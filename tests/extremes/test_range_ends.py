@@ -25,7 +25,7 @@ from model.open import BUILTIN_TOKENS, open_network
 from model.positions import TriangleRotary
 from model.renderformer import RenderFormer
 from model.scene_tensors import MAX_NETWORK_M, SceneBatch, batch_scenes, scene_tensors
-from pipeline.renders.renderer import RenderedView, SceneRenderer
+from pipeline.renders.renderer import RenderedView
 from pipeline.renders.settings import MAX_SPP
 from pipeline.scenes.triangle_budget import PooledAsset
 from scene_templates.families import Family
@@ -52,7 +52,7 @@ from tests.model.kit import (
     tensors_of,
     tiny_config,
 )
-from tests.pipeline.renders.sampling import view_settings
+from tests.pipeline.renders.sampling import render_view, view_settings
 from tests.pipeline.renders.scene_kit import join, light, material, quad
 from tests.pipeline.scenes.small_pool import BLIND, composed
 from tests.train.kit import stepper, tiny_run
@@ -168,8 +168,7 @@ WALL = quad([[-1, 1, 0], [1, 1, 0], [1, 1, 2], [-1, 1, 2]], material(diffuse=0.8
 def _render(**changes: Any) -> RenderedView:
     lamp = light(LAMP * [5, 5, 1], 10.0)
     scene = join([quad(FLOOR, material(diffuse=0.8)), WALL, lamp], fov_deg=60)
-    renderer = SceneRenderer(scene, dataclasses.replace(RENDER, **changes))
-    view = renderer.render_view(scene.c2w[0], 60.0, seed=0)
+    view = render_view(scene, dataclasses.replace(RENDER, **changes))
     assert np.isfinite(view.radiance_rgb).all() and (view.radiance_rgb >= 0).all()
     return view
 

@@ -5,6 +5,7 @@ import itertools
 import json
 from collections.abc import Callable
 from typing import Any
+from unittest.mock import Mock
 
 import numpy as np
 import pytest
@@ -13,6 +14,8 @@ from numpy.typing import NDArray
 from pipeline.generation.scene_origins import RenderInput
 from pipeline.generation.scene_worker import ViewProgress, render_sample
 from pipeline.presets.registry import preset_settings
+from pipeline.presets.settings import DatasetSettings
+from pipeline.renders import kernel_scene
 from pipeline.renders.renderer import SceneRenderer
 from pipeline.renders.tracer import load_tracer
 from pipeline.renders.vector_tracer import VectorTracer
@@ -31,7 +34,7 @@ from storage.records.lights import (
     sum_of_parts,
 )
 from storage.records.retextured import NO_TEXTURES
-from storage.records.sample import decode_sample, encode_sample
+from storage.records.sample import Sample, decode_sample, encode_sample
 from storage.records.scene import Scene
 from storage.records.texture import Texture
 from storage.settings.described import settings_record
@@ -65,6 +68,7 @@ from tests.pipeline.renders.scene_kit import (
     noise_map,
     open_scene,
     quad,
+    sampled_like_scene,
     sphere,
     textured,
     textured_floor,
@@ -332,17 +336,27 @@ def test_too_many_pictures_are_rejected() -> None:
         SceneRenderer(scene, dataclasses.replace(SETTINGS, per_light=True, split=True))
 
 
+def _build(scene: Scene, **renders: Any) -> tuple[Sample, DatasetSettings]:
+    """Return a sample of two views, as a build with these settings of renders makes it."""
+    asked = {"min_spp": 8, "max_spp": 8, **renders}
+    changes = {f"renders.{name}": value for name, value in asked.items()} | {"scenes.num_views": 2}
+    settings = preset_settings("smoke", resolution=16, changes=changes)
+    scene_input = RenderInput(scene=scene.with_provenance({"camera_attempts": [0, 0]}))
+    return render_sample("000000007", scene_input, settings, [], ViewProgress(None, 7)), settings
+
+
+def test_all_views_and_lights_share_one_load(monkeypatch: pytest.MonkeyPatch) -> None:
+    load = Mock(wraps=kernel_scene.build_mitsuba_scene)
+    monkeypatch.setattr(kernel_scene, "build_mitsuba_scene", load)
+    scene = sampled_like_scene(np.random.default_rng(3), num_views=2)
+    assert len(_build(scene, per_light=True)[0].views) == 2
+    assert load.call_count == 2  # what camera rays meet, and what all other rays meet
+
+
 def test_a_build_with_the_setting_stores_what_verify_accepts() -> None:
     """`--set renders.per_light=true` or split, from the settings to the members of a sample."""
     for kind, per_light in (({}, True), (KINDS[0], False), (KINDS[2], True)):
-        asked = {**kind, "per_light": per_light, "min_spp": 8, "max_spp": 8}
-        changes = {f"renders.{name}": value for name, value in asked.items()}
-        settings = preset_settings(
-            "smoke", resolution=16, changes={**changes, "scenes.num_views": 2}
-        )
-        scene = tiny_scene(provenance={"camera_attempts": [0, 0]})
-        scene_input = RenderInput(scene=scene)
-        sample = render_sample("000000007", scene_input, settings, [], ViewProgress(None, 7))
+        sample, settings = _build(tiny_scene(), per_light=per_light, **kind)
         manifest = Manifest(
             build="smoke",
             settings=settings_record(settings),
