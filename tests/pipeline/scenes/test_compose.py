@@ -319,9 +319,10 @@ def _from_workers(workers: int) -> dict[str, dict[int, str]]:
         mp_context=multiprocessing.get_context("spawn"),
         initializer=hold if workers == 1 else None,
     ) as executor:
-        submit = functools.partial(executor.submit, composed_digest)
         jobs = {
-            build: {index: submit(build, 0, index) for index in reversed(indices)}
+            build: {
+                each: executor.submit(composed_digest, build, 0, each) for each in reversed(indices)
+            }
             for build, indices in SCENES.items()
         }
         return {
