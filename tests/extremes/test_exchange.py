@@ -23,7 +23,7 @@ from pipeline.presets.registry import preset_settings
 from storage.conventions import HALF_FLOAT_MAX
 from storage.errors import TrilightError
 from storage.records.exr import decode_exr, encode_channels, encode_exr
-from storage.records.material import EMISSION
+from storage.records.material import DIFFUSE, EMISSION, ROUGHNESS, SPECULAR
 from storage.records.profiles import PROFILES, keeps_law, pack_picture
 from storage.records.sample import decode_sample, encode_sample
 from storage.records.scene import MAX_POSITION_M, Scene, SceneObject
@@ -42,18 +42,17 @@ from tests.scenes_by_hand import FLOOR, LIGHT, tiny_sample, tiny_scene
 ENDS = np.finfo(np.float32)
 
 
+COLUMNS: dict[str, tuple[int, int | slice]] = {
+    "diffuse": (FLOOR, DIFFUSE), "specular": (FLOOR, SPECULAR), "roughness": (FLOOR, ROUGHNESS),
+    "emission": (LIGHT, EMISSION),
+}  # fmt: skip
+
+
 def surface(**columns: ArrayLike) -> Scene:
-    """Return the tiny scene with another floor: diffuse, specular, roughness."""
+    """Return the tiny scene with another floor, or a light of another emission."""
     scene = tiny_scene()
-    for name, part in (("diffuse", slice(0, 3)), ("specular", slice(3, 6)), ("roughness", 6)):
-        if name in columns:
-            scene.materials[FLOOR, part] = np.asarray(columns[name], np.float32)
-    return scene
-
-
-def glowing(radiance: ArrayLike) -> Scene:
-    scene = tiny_scene()
-    scene.materials[LIGHT, EMISSION] = np.asarray(radiance, np.float32)
+    for name, value in columns.items():
+        scene.materials[COLUMNS[name]] = np.asarray(value, np.float32)
     return scene
 
 
@@ -84,8 +83,8 @@ SCENES: dict[str, Callable[[], Scene]] = {
     "white": lambda: surface(diffuse=1, specular=0),
     "mirror": lambda: surface(diffuse=0, specular=1, roughness=0),
     "sum of exactly 1": lambda: surface(diffuse=[0.25, 0.1, 0.7], specular=[0.75, 0.9, 0.3]),
-    "emission 1e6": lambda: glowing(1e6),
-    "emission in one channel": lambda: glowing([0, float(ENDS.tiny), 0]),
+    "emission 1e6": lambda: surface(emission=1e6),
+    "emission in one channel": lambda: surface(emission=[0, float(ENDS.tiny), 0]),
     "fov 0.001 and 179": lambda: seen_at(0.001, 179),
     "64 lights": many_lights,
     "sliver 1e-7": lambda: shrunk([0, 0, 0], [1, 0, 0], [0.5, 1e-7, 0]),
@@ -150,10 +149,9 @@ def with_a_wall(scene: Scene) -> Scene:
 
 
 def at_the_ends_of_floats() -> Scene:
-    scene = tiny_scene()
+    scene = surface(emission=[1e38, float(ENDS.smallest_subnormal), 0])
     scene.vertex_positions[0] = np.array([MAX_POSITION_M, -ENDS.tiny, -0.0], np.float32)
     scene.vertex_positions[1] = np.array([ENDS.smallest_subnormal, 0, -MAX_POSITION_M], np.float32)
-    scene.materials[LIGHT, EMISSION] = np.array([1e38, ENDS.smallest_subnormal, 0], np.float32)
     return scene
 
 
@@ -167,7 +165,7 @@ def test_the_ends_of_floats_come_back_in_usd_and_hdf5(tmp_path: Path) -> None:
 def test_what_readers_would_refuse_or_no_scene_may_be_is_not_written(tmp_path: Path) -> None:
     """Brighter or wider than the form says, and a light of no area."""
     for refused, message in (
-        (glowing(2e9), "emissive.*expected"),
+        (surface(emission=2e9), "emissive.*expected"),
         (seen_at(40, 179.5), "fov.*expected"),
         (shrunk(*np.ones((3, 3)), first=4), "no emitter has an area"),
     ):
@@ -247,8 +245,7 @@ def test_rounding_to_half_floats_is_the_only_loss() -> None:
 @pytest.mark.parametrize("emission", [65504.0, SMALLEST, 1e5, 1e-8])
 def test_the_ends_of_half_floats_go_through_hdf5(tmp_path: Path, emission: float) -> None:
     """Lights beyond them too: only pictures are half floats."""
-    scene = tiny_scene()
-    scene.materials[LIGHT, EMISSION] = emission
+    scene = surface(emission=emission)
     pictures = np.stack([_spike(8), _halfs(8)])
     write_renderformer_h5(tmp_path / "a.h5", scene, pictures)
     read = read_renderformer_h5(tmp_path / "a.h5")
