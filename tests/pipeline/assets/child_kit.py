@@ -97,7 +97,6 @@ class Bench:
     """A folder of sources with a plan, a store beside it, and a child to work on them."""
 
     root: Path
-    limits: ChildLimits = LIMITS
 
     def __post_init__(self) -> None:
         self.root.mkdir(parents=True, exist_ok=True)
@@ -105,7 +104,12 @@ class Bench:
             self.set()
         heavy = ("pipeline.assets.prepare", "pipeline.assets.decimation.pymeshlab_filters")
         preload([*heavy, "tests.pipeline.assets.child_kit"])
-        self.child = IsolatedChild(limits=self.limits)
+        self.child = IsolatedChild(limits=LIMITS)
+
+    def hurry(self, **limits: Any) -> None:
+        """Work with a child of other limits from now on."""
+        self.child.close()
+        self.child = IsolatedChild(limits=dataclasses.replace(LIMITS, **limits))
 
     def set(self, **plan: str) -> None:
         """Say what children do: an action by method, such as `die` or `die once`."""
