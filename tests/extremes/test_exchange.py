@@ -28,6 +28,7 @@ from storage.records.profiles import PROFILES, keeps_law, pack_picture
 from storage.records.sample import decode_sample, encode_sample
 from storage.records.scene import MAX_POSITION_M, Scene, SceneObject
 from storage.settings.described import settings_record
+from tests.extremes.test_scenes import SHAPES
 from tests.for_each import case
 from tests.pipeline.exchange.exchange_kit import (
     assert_h5_keeps_light,
@@ -36,7 +37,7 @@ from tests.pipeline.exchange.exchange_kit import (
     h5_and_back,
     json_and_back,
 )
-from tests.pipeline.renders.scene_kit import join, light, quad
+from tests.pipeline.renders.scene_kit import join
 from tests.scenes_by_hand import FLOOR, LIGHT, tiny_sample, tiny_scene
 
 ENDS = np.finfo(np.float32)
@@ -60,17 +61,6 @@ def seen_at(*fov_deg: float) -> Scene:
     return tiny_scene(fov_deg=np.array(fov_deg, np.float32))
 
 
-def many_lights() -> Scene:
-    """Sixty-four triangles that emit differently."""
-    lamps = [
-        light([[x, y, 2], [x + 0.05, y, 2], [x, y + 0.05, 2]], 1.0 + 8 * x + y)
-        for x in np.linspace(0, 1, 8)
-        for y in np.linspace(0, 1, 8)
-    ]
-    floor = quad([[-1, -1, 0], [1, -1, 0], [1, 1, 0], [-1, 1, 0]], tiny_scene().materials[FLOOR])
-    return join([floor, *lamps])
-
-
 def shrunk(*corners: ArrayLike, first: int = 0) -> Scene:
     """Return the tiny scene with another triangle, of three vertices: in its floor, or the lamp."""
     scene = tiny_scene()
@@ -86,7 +76,7 @@ SCENES: dict[str, Callable[[], Scene]] = {
     "emission 1e6": lambda: surface(emission=1e6),
     "emission in one channel": lambda: surface(emission=[0, float(ENDS.tiny), 0]),
     "fov 0.001 and 179": lambda: seen_at(0.001, 179),
-    "64 lights": many_lights,
+    "64 lights": lambda: join(SHAPES["64 lights"]),
     "sliver 1e-7": lambda: shrunk([0, 0, 0], [1, 0, 0], [0.5, 1e-7, 0]),
     "to the farthest position": lambda: tiny_scene(
         vertex_positions=tiny_scene().vertex_positions * np.float32(500)

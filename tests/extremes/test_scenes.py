@@ -20,6 +20,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+import trimesh
 from numpy.typing import ArrayLike, NDArray
 
 from pipeline.assets.settings import AssetSettings
@@ -49,7 +50,7 @@ from tests.pipeline.renders.scene_kit import (
     quad,
     sphere,
 )
-from tests.pipeline.scenes.small_pool import counts_of, digest, first_scene, rows_of
+from tests.pipeline.scenes.small_pool import counts_of, digest, first_scene, pooled, rows_of
 from tests.scene_templates.balls import DEFAULTS
 
 
@@ -86,15 +87,9 @@ def test_far_seeds_and_indices_are_seeds_and_indices_of_their_own(pool: list[Poo
     assert len(set(first)) == len(FAR)
 
 
-def _one_triangle(pool: list[PooledAsset]) -> PooledAsset:
-    """An object that is one triangle at its only level: open, flat, seen from two sides."""
-    entry = pool[1]
-    level = dataclasses.replace(
-        entry.asset.levels[0],
-        positions=np.array([[-0.5, -0.4, 0], [0.5, -0.4, 0], [0, 0.4, 0]], np.float32),
-        faces=np.array([[0, 1, 2]], np.uint32),
-    )
-    return PooledAsset(locked=entry.locked, asset=dataclasses.replace(entry.asset, levels=(level,)))
+CORNERS = [[-0.5, -0.4, 0], [0.5, -0.4, 0], [0, 0.4, 0]]
+ONE_TRIANGLE = pooled("made/flat", [trimesh.Trimesh(CORNERS, [[0, 1, 2]])])
+"""An object that is one triangle at its only level: open, flat, seen from two sides."""
 
 
 @for_each(
@@ -106,12 +101,10 @@ def _one_triangle(pool: list[PooledAsset]) -> PooledAsset:
         {"fill_to": 1536},
     ],
 )
-def test_objects_of_one_triangle_compose(
-    pool: list[PooledAsset], changes: Mapping[str, Any]
-) -> None:
+def test_objects_of_one_triangle_compose(changes: Mapping[str, Any]) -> None:
     settings = apply_overrides(DEFAULTS, {"views.min_coverage": 0.0, **changes})
     for index in range(3):
-        scene = first_scene(settings, [_one_triangle(pool)], seed=0, scene_index=index)
+        scene = first_scene(settings, [ONE_TRIANGLE], seed=0, scene_index=index)
         require_laws(scene, settings)
         objects = len(rows_of(scene, "object"))
         if settings.fill_to is None:
@@ -423,17 +416,15 @@ def _without_area() -> Part:
     return Part(triangles=corners, normals=up, material=GREY, kind="object")
 
 
-def _tilted(slope: float) -> Part:
-    return quad(FLOOR + np.array([[0, 0, -slope], [0, 0, slope]])[[0, 1, 1, 0]], GREY)
-
-
 SAME: dict[str, list[Part]] = {
     "a floor twice": [_floor(), _floor()],
-    "two floors through each other at 1e-6": [_floor(), _tilted(1e-6)],
+    "two floors through each other at 1e-6": [
+        _floor(), quad(FLOOR + np.outer([-1e-6, 1e-6, 1e-6, -1e-6], [0, 0, 1]), GREY),
+    ],
     "16200 triangles": [flat(2 * meshes.grid(90).corners, GREY)],
     "a point and a line as triangles": [_floor(), _without_area()],
     "a sliver of 1e-7": [_floor(), flat([[[-0.5, 0, 0.5], [0.5, 0, 0.5], [0, 1e-7, 0.5]]], GREY)],
-}
+}  # fmt: skip
 
 
 def test_what_adds_nothing_changes_nothing(plain: NDArray[np.float32]) -> None:

@@ -12,8 +12,8 @@ import os
 import signal
 import sys
 import time
-from collections.abc import Callable, Iterator, Mapping
-from contextlib import contextmanager
+from collections.abc import Callable, Mapping
+from contextlib import nullcontext
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -138,14 +138,15 @@ class Bench:
         """Prepare objects with a store beside the sources."""
         from tests.pipeline.assets.meshes_by_hand import record_of
 
-        @contextmanager
-        def borrow() -> Iterator[IsolatedChild]:
-            yield self.child
-
         records = [record_of(self.root / name, name) for name in names]
         place = AssetStore(self.root.parent / store)
         return stage.prepare_assets(
-            records, settings, place, borrow_child=borrow, workers=1, done=done
+            records,
+            settings,
+            place,
+            borrow_child=lambda: nullcontext(self.child),
+            workers=1,
+            done=done,
         )
 
     def made(self, name: str = "knot.obj", settings: AssetSettings = SETTINGS) -> Asset:
