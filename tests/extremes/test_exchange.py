@@ -37,7 +37,7 @@ from tests.pipeline.exchange.exchange_kit import (
     h5_and_back,
     json_and_back,
 )
-from tests.pipeline.renders.scene_kit import join
+from tests.pipeline.renders.scene_kit import flat, join, light, material, textured_floor
 from tests.scenes_by_hand import FLOOR, LIGHT, tiny_sample, tiny_scene
 
 ENDS = np.finfo(np.float32)
@@ -106,36 +106,24 @@ def test_sixteen_thousand_triangles(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize(
-    ("scene", "flat"),
-    [
-        (shrunk([0, 0, 0], [1, 0, 0], [0.5, 0, 0]), 1),
-        (shrunk([0, 0, 0], [0, 0, 0], [0, 0, 0]), 2),  # then the other half has no width
-    ],
+    ("width", "num_flat"),
+    [(1, 1), (0, 2)],  # where the first half has no size, the other half has no width
     ids=["no width", "no size"],
 )
 def test_triangles_without_area_stay_or_are_said_to_be_lost(
-    tmp_path: Path, scene: Scene, flat: int
+    tmp_path: Path, width: float, num_flat: int
 ) -> None:
     """A floor of which nothing is left is left out of the JSON, whose readers would refuse it."""
+    floor = textured_floor(material(diffuse=0.5))
+    ring = np.array([[0, 0, 0], [width, 0, 0], [width / 2, 0, 0], [-1, 1, 0]])
+    shrunk_floor = dataclasses.replace(floor, triangles=ring[[[0, 1, 2], [0, 2, 3]]])
+    wall = flat([[[-1, 1, 0], [1, 1, 0], [0, 1, 1]]], material(diffuse=0.5), "shell")
+    scene = join([shrunk_floor, wall, light([[0, 0, 2], [0, 1, 2], [1, 0, 2]], 100.0)])
     assert_usd_keeps_all(scene, tmp_path, ".usdc")
     assert_h5_keeps_light(h5_and_back(scene, tmp_path), scene)
-    back, lost = json_and_back(with_a_wall(scene), tmp_path)
-    assert back.num_triangles == with_a_wall(scene).num_triangles - flat
-    assert any(f"{flat} triangles without an area" in loss for loss in lost)
-
-
-def with_a_wall(scene: Scene) -> Scene:
-    """Return a scene with one more shell part, of the floor's material and one triangle."""
-    corners = np.array([[-1, 1, 0], [1, 1, 0], [0, 1, 1]], np.float32)
-    return dataclasses.replace(
-        scene,
-        vertex_positions=np.concatenate([scene.vertex_positions, corners]),
-        vertex_normals=np.concatenate([scene.vertex_normals, [[0, -1, 0]] * 3]).astype(np.float32),
-        faces=np.concatenate([scene.faces, [[7, 8, 9]]]).astype(np.uint32),
-        material_index=np.append(scene.material_index, np.uint16(FLOOR)),
-        object_index=np.append(scene.object_index, np.uint16(2)),
-        objects=(*scene.objects, SceneObject(name="wall0", kind="shell")),
-    )
+    back, lost = json_and_back(scene, tmp_path)
+    assert back.num_triangles == scene.num_triangles - num_flat
+    assert any(f"{num_flat} triangles without an area" in loss for loss in lost)
 
 
 def at_the_ends_of_floats() -> Scene:

@@ -143,14 +143,9 @@ def test_the_size_of_the_world_changes_nothing_up_to_its_limits(tmp_path: Path) 
 @pytest.mark.parametrize("method", ["pymeshlab_collapse", "meshoptimizer"])
 def test_slivers_of_a_million_to_one(tmp_path: Path, method: str) -> None:
     """A cylinder of 3000 strips as long as the box, each 1e-6 of it apart at the ends."""
-    turn = np.linspace(0, 2 * np.pi, 1501)[:-1]
-    rim = np.column_stack([np.cos(turn), np.sin(turn)]) * 2.4e-4
-    ends = [np.column_stack([rim, np.full(1500, z)]) for z in (-0.5, 0.5)]
-    here, there = np.arange(1500), (np.arange(1500) + 1) % 1500
-    lower = np.column_stack([here, there, here + 1500])
-    upper = np.column_stack([there, there + 1500, here + 1500])
-    faces = np.concatenate([lower, upper])
-    pole = TriangleMesh(positions=np.concatenate(ends), faces=faces)
+    tube = trimesh.creation.revolve([[2.4e-4, -0.5], [2.4e-4, 0.5]], sections=1500)
+    assert len(tube.faces) == len(tube.vertices) == 3000
+    pole = TriangleMesh(positions=tube.vertices, faces=tube.faces)
     settings = AssetSettings(budgets=(1400,))
     asset = meshes.prepare(meshes.write_obj(tmp_path / "a.obj", pole), settings, method)
     meshes.check_levels(asset)
