@@ -23,11 +23,12 @@ from pipeline.presets.registry import preset_settings
 from storage.conventions import HALF_FLOAT_MAX
 from storage.errors import TrilightError
 from storage.records.exr import decode_exr, encode_channels, encode_exr
-from storage.records.material import EMISSION
+from storage.records.material import DIFFUSE, EMISSION, ROUGHNESS, SPECULAR
 from storage.records.profiles import PROFILES, keeps_law, pack_picture
 from storage.records.sample import decode_sample, encode_sample
 from storage.records.scene import MAX_POSITION_M, Scene, SceneObject
 from storage.settings.described import settings_record
+from tests.extremes.test_scenes import SHAPES
 from tests.for_each import case
 from tests.pipeline.exchange.exchange_kit import (
     assert_h5_keeps_light,
@@ -36,40 +37,28 @@ from tests.pipeline.exchange.exchange_kit import (
     h5_and_back,
     json_and_back,
 )
-from tests.pipeline.renders.scene_kit import join, light, quad
+from tests.pipeline.renders.scene_kit import flat, join, light, material, textured_floor
 from tests.scenes_by_hand import FLOOR, LIGHT, tiny_sample, tiny_scene
 
 ENDS = np.finfo(np.float32)
 
 
+COLUMNS: dict[str, tuple[int, int | slice]] = {
+    "diffuse": (FLOOR, DIFFUSE), "specular": (FLOOR, SPECULAR), "roughness": (FLOOR, ROUGHNESS),
+    "emission": (LIGHT, EMISSION),
+}  # fmt: skip
+
+
 def surface(**columns: ArrayLike) -> Scene:
-    """Return the tiny scene with another floor: diffuse, specular, roughness."""
+    """Return the tiny scene with another floor, or a light of another emission."""
     scene = tiny_scene()
-    for name, part in (("diffuse", slice(0, 3)), ("specular", slice(3, 6)), ("roughness", 6)):
-        if name in columns:
-            scene.materials[FLOOR, part] = np.asarray(columns[name], np.float32)
-    return scene
-
-
-def glowing(radiance: ArrayLike) -> Scene:
-    scene = tiny_scene()
-    scene.materials[LIGHT, EMISSION] = np.asarray(radiance, np.float32)
+    for name, value in columns.items():
+        scene.materials[COLUMNS[name]] = np.asarray(value, np.float32)
     return scene
 
 
 def seen_at(*fov_deg: float) -> Scene:
     return tiny_scene(fov_deg=np.array(fov_deg, np.float32))
-
-
-def many_lights() -> Scene:
-    """Sixty-four triangles that emit differently."""
-    lamps = [
-        light([[x, y, 2], [x + 0.05, y, 2], [x, y + 0.05, 2]], 1.0 + 8 * x + y)
-        for x in np.linspace(0, 1, 8)
-        for y in np.linspace(0, 1, 8)
-    ]
-    floor = quad([[-1, -1, 0], [1, -1, 0], [1, 1, 0], [-1, 1, 0]], tiny_scene().materials[FLOOR])
-    return join([floor, *lamps])
 
 
 def shrunk(*corners: ArrayLike, first: int = 0) -> Scene:
@@ -84,10 +73,10 @@ SCENES: dict[str, Callable[[], Scene]] = {
     "white": lambda: surface(diffuse=1, specular=0),
     "mirror": lambda: surface(diffuse=0, specular=1, roughness=0),
     "sum of exactly 1": lambda: surface(diffuse=[0.25, 0.1, 0.7], specular=[0.75, 0.9, 0.3]),
-    "emission 1e6": lambda: glowing(1e6),
-    "emission in one channel": lambda: glowing([0, float(ENDS.tiny), 0]),
+    "emission 1e6": lambda: surface(emission=1e6),
+    "emission in one channel": lambda: surface(emission=[0, float(ENDS.tiny), 0]),
     "fov 0.001 and 179": lambda: seen_at(0.001, 179),
-    "64 lights": many_lights,
+    "64 lights": lambda: join(SHAPES["64 lights"]),
     "sliver 1e-7": lambda: shrunk([0, 0, 0], [1, 0, 0], [0.5, 1e-7, 0]),
     "to the farthest position": lambda: tiny_scene(
         vertex_positions=tiny_scene().vertex_positions * np.float32(500)
@@ -117,43 +106,30 @@ def test_sixteen_thousand_triangles(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize(
-    ("scene", "flat"),
-    [
-        (shrunk([0, 0, 0], [1, 0, 0], [0.5, 0, 0]), 1),
-        (shrunk([0, 0, 0], [0, 0, 0], [0, 0, 0]), 2),  # then the other half has no width
-    ],
+    ("width", "num_flat"),
+    [(1, 1), (0, 2)],  # where the first half has no size, the other half has no width
     ids=["no width", "no size"],
 )
 def test_triangles_without_area_stay_or_are_said_to_be_lost(
-    tmp_path: Path, scene: Scene, flat: int
+    tmp_path: Path, width: float, num_flat: int
 ) -> None:
     """A floor of which nothing is left is left out of the JSON, whose readers would refuse it."""
+    floor = textured_floor(material(diffuse=0.5))
+    ring = np.array([[0, 0, 0], [width, 0, 0], [width / 2, 0, 0], [-1, 1, 0]])
+    shrunk_floor = dataclasses.replace(floor, triangles=ring[[[0, 1, 2], [0, 2, 3]]])
+    wall = flat([[[-1, 1, 0], [1, 1, 0], [0, 1, 1]]], material(diffuse=0.5), "shell")
+    scene = join([shrunk_floor, wall, light([[0, 0, 2], [0, 1, 2], [1, 0, 2]], 100.0)])
     assert_usd_keeps_all(scene, tmp_path, ".usdc")
     assert_h5_keeps_light(h5_and_back(scene, tmp_path), scene)
-    back, lost = json_and_back(with_a_wall(scene), tmp_path)
-    assert back.num_triangles == with_a_wall(scene).num_triangles - flat
-    assert any(f"{flat} triangles without an area" in loss for loss in lost)
-
-
-def with_a_wall(scene: Scene) -> Scene:
-    """Return a scene with one more shell part, of the floor's material and one triangle."""
-    corners = np.array([[-1, 1, 0], [1, 1, 0], [0, 1, 1]], np.float32)
-    return dataclasses.replace(
-        scene,
-        vertex_positions=np.concatenate([scene.vertex_positions, corners]),
-        vertex_normals=np.concatenate([scene.vertex_normals, [[0, -1, 0]] * 3]).astype(np.float32),
-        faces=np.concatenate([scene.faces, [[7, 8, 9]]]).astype(np.uint32),
-        material_index=np.append(scene.material_index, np.uint16(FLOOR)),
-        object_index=np.append(scene.object_index, np.uint16(2)),
-        objects=(*scene.objects, SceneObject(name="wall0", kind="shell")),
-    )
+    back, lost = json_and_back(scene, tmp_path)
+    assert back.num_triangles == scene.num_triangles - num_flat
+    assert any(f"{num_flat} triangles without an area" in loss for loss in lost)
 
 
 def at_the_ends_of_floats() -> Scene:
-    scene = tiny_scene()
+    scene = surface(emission=[1e38, float(ENDS.smallest_subnormal), 0])
     scene.vertex_positions[0] = np.array([MAX_POSITION_M, -ENDS.tiny, -0.0], np.float32)
     scene.vertex_positions[1] = np.array([ENDS.smallest_subnormal, 0, -MAX_POSITION_M], np.float32)
-    scene.materials[LIGHT, EMISSION] = np.array([1e38, ENDS.smallest_subnormal, 0], np.float32)
     return scene
 
 
@@ -167,7 +143,7 @@ def test_the_ends_of_floats_come_back_in_usd_and_hdf5(tmp_path: Path) -> None:
 def test_what_readers_would_refuse_or_no_scene_may_be_is_not_written(tmp_path: Path) -> None:
     """Brighter or wider than the form says, and a light of no area."""
     for refused, message in (
-        (glowing(2e9), "emissive.*expected"),
+        (surface(emission=2e9), "emissive.*expected"),
         (seen_at(40, 179.5), "fov.*expected"),
         (shrunk(*np.ones((3, 3)), first=4), "no emitter has an area"),
     ):
@@ -247,8 +223,7 @@ def test_rounding_to_half_floats_is_the_only_loss() -> None:
 @pytest.mark.parametrize("emission", [65504.0, SMALLEST, 1e5, 1e-8])
 def test_the_ends_of_half_floats_go_through_hdf5(tmp_path: Path, emission: float) -> None:
     """Lights beyond them too: only pictures are half floats."""
-    scene = tiny_scene()
-    scene.materials[LIGHT, EMISSION] = emission
+    scene = surface(emission=emission)
     pictures = np.stack([_spike(8), _halfs(8)])
     write_renderformer_h5(tmp_path / "a.h5", scene, pictures)
     read = read_renderformer_h5(tmp_path / "a.h5")

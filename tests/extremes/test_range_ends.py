@@ -8,6 +8,7 @@ import dataclasses
 import functools
 import math
 import warnings
+from collections.abc import Collection
 from typing import Any
 
 import numpy as np
@@ -24,7 +25,7 @@ from model.open import BUILTIN_TOKENS, open_network
 from model.positions import TriangleRotary
 from model.renderformer import RenderFormer
 from model.scene_tensors import MAX_NETWORK_M, SceneBatch, batch_scenes, scene_tensors
-from pipeline.renders.renderer import RenderedView, SceneRenderer
+from pipeline.renders.renderer import RenderedView
 from pipeline.renders.settings import MAX_SPP
 from pipeline.scenes.triangle_budget import PooledAsset
 from scene_templates.families import Family
@@ -39,7 +40,6 @@ from storage.dataset.settings import MOST_SCENES, SplitSettings
 from storage.dataset.splits import MOST_SHARDS, scenes_of_shard, shard_name, shards_for
 from storage.errors import Rejected, TrilightError
 from storage.seeds import SceneKey
-from storage.settings.fields import FieldDescription
 from storage.settings.overrides import apply_overrides
 from tests.extremes.test_ranges import FIELDS, SMOKE, End
 from tests.extremes.test_scenes import FLOOR, LAMP, require_laws
@@ -52,7 +52,7 @@ from tests.model.kit import (
     tensors_of,
     tiny_config,
 )
-from tests.pipeline.renders.sampling import view_settings
+from tests.pipeline.renders.sampling import render_view, view_settings
 from tests.pipeline.renders.scene_kit import join, light, material, quad
 from tests.pipeline.scenes.small_pool import BLIND, composed
 from tests.train.kit import stepper, tiny_run
@@ -104,49 +104,44 @@ NO_SCENE: dict[tuple[str, End], str] = {
 }
 """Ends at which some scenes cannot be, with everything else as it is: why they are rejected."""
 
-SCENE_FIELDS = [(GROUPS[group] + field.name, field) for group, field in FIELDS if group in GROUPS]
+SCENE_FIELDS = {GROUPS[group] + field.name: field for group, field in FIELDS if group in GROUPS}
 ONE_FAMILY = dataclasses.replace(SMOKE.scenes, families=SMOKE.scenes.families[:1])
 
 
-def _value(field: FieldDescription, end: End) -> Any:
+def _value(name: str, end: End) -> Any:
+    field = SCENE_FIELDS[name]
     number = getattr(field.within, end)
     return [number, number] if field.shape == "pair" else number
 
 
-@pytest.mark.parametrize("end", ["low", "high"])
-def test_scenes_at_an_end_keep_their_laws(pool: list[PooledAsset], end: End) -> None:
-    for name, field in SCENE_FIELDS:
-        if (name, end) != ("fill_to", "high"):
-            _require_scene_or_reason(pool, name, field, end)
-
-
-@pytest.mark.slow("memory")
-def test_a_scene_is_filled_to_the_most_triangles(pool: list[PooledAsset]) -> None:
-    """As above; it takes seconds."""
-    _require_scene_or_reason(pool, "fill_to", dict(SCENE_FIELDS)["fill_to"], "high")
-
-
-def _require_scene_or_reason(
-    pool: list[PooledAsset], name: str, field: FieldDescription, end: End
+@pytest.mark.parametrize(
+    ("names", "end"),
+    [
+        (SCENE_FIELDS.keys(), "low"),
+        (SCENE_FIELDS.keys() - {"fill_to"}, "high"),
+        pytest.param({"fill_to"}, "high", marks=pytest.mark.slow("memory")),
+    ],
+    ids=["low", "high", "filled to the most triangles"],
+)
+def test_scenes_at_an_end_keep_their_laws(
+    pool: list[PooledAsset], names: Collection[str], end: End
 ) -> None:
-    blind = {} if name.startswith("views.") else BLIND
-    beside = BESIDE.get((name, end), {})
-    wanted = apply_overrides(ONE_FAMILY, {**blind, **beside, name: _value(field, end)})
-    with case((name, end)):
-        try:
-            scene = composed(wanted, pool, SceneKey(0, 0))
-        except Rejected as rejection:
-            assert rejection.reason == NO_SCENE.get((name, end)), rejection
-        else:
-            assert (name, end) not in NO_SCENE
-            require_laws(scene, wanted)
+    for name in sorted(names):
+        blind = {} if name.startswith("views.") else BLIND
+        beside = BESIDE.get((name, end), {})
+        wanted = apply_overrides(ONE_FAMILY, {**blind, **beside, name: _value(name, end)})
+        with case((name, end)):
+            try:
+                scene = composed(wanted, pool, SceneKey(0, 0))
+            except Rejected as rejection:
+                assert rejection.reason == NO_SCENE.get((name, end)), rejection
+            else:
+                assert (name, end) not in NO_SCENE
+                require_laws(scene, wanted)
 
 
-CHEAP = [
-    name for name, _ in SCENE_FIELDS
-    if name not in ("num_views", "fill_to", "views.coverage_grid", "lights.count")
-    and name != "families.num_objects"
-]  # fmt: skip
+SLOW = {"num_views", "fill_to", "views.coverage_grid", "lights.count", "families.num_objects"}
+CHEAP = [name for name in SCENE_FIELDS if name not in SLOW]
 
 
 @settings(max_examples=15, derandomize=True)
@@ -154,8 +149,7 @@ CHEAP = [
 def test_scenes_at_several_ends_keep_their_laws_or_have_a_reason(
     pool: list[PooledAsset], ends: dict[str, End]
 ) -> None:
-    fields = dict(SCENE_FIELDS)
-    changes = {name: _value(fields[name], end) for name, end in ends.items()}
+    changes = {name: _value(name, end) for name, end in ends.items()}
     try:
         wanted = apply_overrides(ONE_FAMILY, {"num_views": 1, **changes})
     except TrilightError:
@@ -174,8 +168,7 @@ WALL = quad([[-1, 1, 0], [1, 1, 0], [1, 1, 2], [-1, 1, 2]], material(diffuse=0.8
 def _render(**changes: Any) -> RenderedView:
     lamp = light(LAMP * [5, 5, 1], 10.0)
     scene = join([quad(FLOOR, material(diffuse=0.8)), WALL, lamp], fov_deg=60)
-    renderer = SceneRenderer(scene, dataclasses.replace(RENDER, **changes))
-    view = renderer.render_view(scene.c2w[0], 60.0, seed=0)
+    view = render_view(scene, dataclasses.replace(RENDER, **changes))
     assert np.isfinite(view.radiance_rgb).all() and (view.radiance_rgb >= 0).all()
     return view
 

@@ -20,6 +20,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+import trimesh
 from numpy.typing import ArrayLike, NDArray
 
 from pipeline.assets.settings import AssetSettings
@@ -32,14 +33,13 @@ from pipeline.scenes.triangle_budget import PooledAsset
 from scene_templates.settings import SceneSettings
 from storage.conventions import camera_rays
 from storage.errors import Rejected
-from storage.records.asset import Asset
 from storage.records.exr import decode_exr, encode_exr
 from storage.records.lights import sum_of_parts
 from storage.records.scene import Scene
 from storage.settings.overrides import apply_overrides
 from tests.for_each import case, for_each
 from tests.pipeline.assets import meshes_by_hand as meshes
-from tests.pipeline.renders.sampling import camera_of, render_view, view_settings
+from tests.pipeline.renders.sampling import block_means, camera_of, render_view, view_settings
 from tests.pipeline.renders.scene_kit import (
     Part,
     flat,
@@ -50,7 +50,7 @@ from tests.pipeline.renders.scene_kit import (
     quad,
     sphere,
 )
-from tests.pipeline.scenes.small_pool import counts_of, digest, first_scene, rows_of
+from tests.pipeline.scenes.small_pool import counts_of, digest, first_scene, pooled, rows_of
 from tests.scene_templates.balls import DEFAULTS
 
 
@@ -87,15 +87,9 @@ def test_far_seeds_and_indices_are_seeds_and_indices_of_their_own(pool: list[Poo
     assert len(set(first)) == len(FAR)
 
 
-def _one_triangle(pool: list[PooledAsset]) -> PooledAsset:
-    """An object that is one triangle at its only level: open, flat, seen from two sides."""
-    entry = pool[1]
-    level = dataclasses.replace(
-        entry.asset.levels[0],
-        positions=np.array([[-0.5, -0.4, 0], [0.5, -0.4, 0], [0, 0.4, 0]], np.float32),
-        faces=np.array([[0, 1, 2]], np.uint32),
-    )
-    return PooledAsset(locked=entry.locked, asset=dataclasses.replace(entry.asset, levels=(level,)))
+CORNERS = [[-0.5, -0.4, 0], [0.5, -0.4, 0], [0, 0.4, 0]]
+ONE_TRIANGLE = pooled("made/flat", [trimesh.Trimesh(CORNERS, [[0, 1, 2]])])
+"""An object that is one triangle at its only level: open, flat, seen from two sides."""
 
 
 @for_each(
@@ -107,12 +101,10 @@ def _one_triangle(pool: list[PooledAsset]) -> PooledAsset:
         {"fill_to": 1536},
     ],
 )
-def test_objects_of_one_triangle_compose(
-    pool: list[PooledAsset], changes: Mapping[str, Any]
-) -> None:
+def test_objects_of_one_triangle_compose(changes: Mapping[str, Any]) -> None:
     settings = apply_overrides(DEFAULTS, {"views.min_coverage": 0.0, **changes})
     for index in range(3):
-        scene = first_scene(settings, [_one_triangle(pool)], seed=0, scene_index=index)
+        scene = first_scene(settings, [ONE_TRIANGLE], seed=0, scene_index=index)
         require_laws(scene, settings)
         objects = len(rows_of(scene, "object"))
         if settings.fill_to is None:
@@ -134,13 +126,6 @@ def test_a_pool_of_one_object_fills_every_scene(pool: list[PooledAsset], build: 
             assert len(set(names)) == len(names)
 
 
-def check(asset: Asset, settings: AssetSettings) -> None:
-    for level in asset.levels:
-        assert 1 <= len(level.faces) <= level.record.budget
-        assert np.isfinite(level.positions).all()
-        assert level.record.quality.error_p99 <= settings.gate.max_error_p99
-
-
 def test_the_size_of_the_world_changes_nothing_up_to_its_limits(tmp_path: Path) -> None:
     unit = meshes.moved(meshes.knot(), 1 / np.ptp(meshes.knot().positions, axis=0).max())
     settings = AssetSettings(budgets=(500,))
@@ -158,17 +143,12 @@ def test_the_size_of_the_world_changes_nothing_up_to_its_limits(tmp_path: Path) 
 @pytest.mark.parametrize("method", ["pymeshlab_collapse", "meshoptimizer"])
 def test_slivers_of_a_million_to_one(tmp_path: Path, method: str) -> None:
     """A cylinder of 3000 strips as long as the box, each 1e-6 of it apart at the ends."""
-    turn = np.linspace(0, 2 * np.pi, 1501)[:-1]
-    rim = np.column_stack([np.cos(turn), np.sin(turn)]) * 2.4e-4
-    ends = [np.column_stack([rim, np.full(1500, z)]) for z in (-0.5, 0.5)]
-    here, there = np.arange(1500), (np.arange(1500) + 1) % 1500
-    lower = np.column_stack([here, there, here + 1500])
-    upper = np.column_stack([there, there + 1500, here + 1500])
-    faces = np.concatenate([lower, upper])
-    pole = TriangleMesh(positions=np.concatenate(ends), faces=faces)
+    tube = trimesh.creation.revolve([[2.4e-4, -0.5], [2.4e-4, 0.5]], sections=1500)
+    assert len(tube.faces) == len(tube.vertices) == 3000
+    pole = TriangleMesh(positions=tube.vertices, faces=tube.faces)
     settings = AssetSettings(budgets=(1400,))
     asset = meshes.prepare(meshes.write_obj(tmp_path / "a.obj", pole), settings, method)
-    check(asset, settings)
+    meshes.check_levels(asset)
     assert asset.levels
 
 
@@ -177,7 +157,7 @@ def test_a_plate_a_hundred_thousandth_thick(tmp_path: Path) -> None:
     plate = meshes.moved(meshes.cube(10), [1.0, 1.0, 1e-5])
     settings = AssetSettings(budgets=(1200, 500))
     asset = meshes.prepare(meshes.write_obj(tmp_path / "a.obj", plate), settings)
-    check(asset, settings)
+    meshes.check_levels(asset)
     finest = asset.levels[0]
     assert len(finest.faces) == 1200
     assert asset.source.watertight
@@ -219,7 +199,7 @@ def test_as_many_faces_as_scans_have(tmp_path: Path, method: str, rings: int) ->
     assert len(ball.faces) == 800 * rings
     settings = AssetSettings(budgets=(1400,))
     asset = meshes.prepare(meshes.write_off(tmp_path / "a.off", ball), settings, method)
-    check(asset, settings)
+    meshes.check_levels(asset)
     # 1400 triangles of a ball leave chords of 0.1 % of its diagonal; five times that is a hole
     assert asset.levels[0].record.quality.error_p99 < 0.005
 
@@ -258,9 +238,11 @@ def _render(
     return render_view(scene, dataclasses.replace(settings, **changes), seed)
 
 
-def _picture(parts: list[Part], settings: RenderSettings = SETTINGS) -> NDArray[np.float32]:
+def _picture(
+    parts: list[Part], settings: RenderSettings = SETTINGS, **camera: Any
+) -> NDArray[np.float32]:
     """Return a picture that is finite and not negative."""
-    radiance_rgb = _render(join(parts), settings).radiance_rgb
+    radiance_rgb = _render(join(parts, **camera), settings).radiance_rgb
     assert np.isfinite(radiance_rgb).all() and (radiance_rgb >= 0).all()
     return radiance_rgb
 
@@ -328,11 +310,10 @@ def test_extreme_materials_at_grazing_angles(roughness: float) -> None:
         ([1, 1, 1], 1e-2),
     ):
         surface = material(specular=specular, roughness=roughness)
-        scene = join([_floor(surface), low, _lamp()], eye=(0, -0.9, height), target=(0, 0.5, 0))
-        picture = _render(scene).radiance_rgb
-        assert np.isfinite(picture).all(), (specular, height)
-        assert (picture >= 0).all(), (specular, height)
-        assert (picture.max() > 0) == (max(specular) > 0), (specular, height)
+        parts = [_floor(surface), low, _lamp()]
+        with case((specular, height)):
+            picture = _picture(parts, eye=(0, -0.9, height), target=(0, 0.5, 0))
+            assert (picture.max() > 0) == (max(specular) > 0)
 
 
 def test_extreme_shapes_and_lights() -> None:
@@ -377,40 +358,29 @@ def test_what_cannot_be_rendered_or_lit_has_a_reason() -> None:
 
 
 def test_cameras_in_rooms_on_faces_and_on_emitters_take_pictures() -> None:
-    inside = join([CLOSED, light(LAMP * 0.3 + [0, 0, 0.6], 5.0)], **INSIDE)
-    picture = _render(inside).radiance_rgb
-    assert np.isfinite(picture).all() and picture.min() > 0
+    assert _picture([CLOSED, light(LAMP * 0.3 + [0, 0, 0.6], 5.0)], **INSIDE).min() > 0
     for eye in ((0, 0, 0), (-1, -1, 0), (0, 0.1, 2)):
-        scene = join([_floor(), _lamp()], eye=eye, target=(0.5, 0.4, -0.2))
-        assert np.isfinite(_render(scene).radiance_rgb).all(), eye
+        with case(eye):
+            _picture([_floor(), _lamp()], eye=eye, target=(0.5, 0.4, -0.2))
 
 
-WIDE_VIEW = join([_floor(), light(LAMP * [9, 9, 1], 5.0)], fov_deg=60)
-
-
-@pytest.fixture(scope="module")
-def truth() -> NDArray[np.float32]:
-    """Return the wide view in 8 x 8 pixels, nearly converged."""
-    changes: dict[str, Any] = {"resolution": 8, "min_spp": 4096, "max_spp": 4096, "denoiser": "off"}
-    return _render(WIDE_VIEW, seed=1, **changes).radiance_rgb
-
-
-@pytest.mark.parametrize(("resolution", "spp"), [(8, 1024), (40, 128), (136, 16)])
-def test_any_multiple_of_eight_is_a_resolution(
-    resolution: int, spp: int, truth: NDArray[np.float32]
-) -> None:
+def test_any_multiple_of_eight_is_a_resolution() -> None:
     """8 is the least, 40 no power of two, 136 wider than 128; all show the same."""
-    view = _render(WIDE_VIEW, resolution=resolution, min_spp=spp, max_spp=spp)
-    assert view.radiance_rgb.shape == (resolution, resolution, 3)
-    assert view.hits.shape == (resolution, resolution)
-    block = resolution // 8
-    shown = view.radiance_rgb.reshape(8, block, 8, block, 3).mean(axis=(1, 3))
+    scene = join([_floor(), light(LAMP * [9, 9, 1], 5.0)], fov_deg=60)
+    nearly_converged = view_settings(4096, resolution=8, denoiser="off")
+    truth = _render(scene, nearly_converged, seed=1).radiance_rgb
     lit = truth > 0.05 * truth.max()
     # Measured: 0.065 at 8 pixels, where the denoiser smears a picture of nothing but edges; at the
     # others every 1/64 of a picture holds 3,200 samples or more, which leave 2 % of noise. A
     # picture upside down or a row off compares the floor with the black behind it.
-    assert np.median(abs(shown - truth)[lit] / truth[lit]) < (0.1 if resolution == 8 else 0.05)
-    assert decode_exr(encode_exr(view.radiance_rgb)).shape == view.radiance_rgb.shape
+    for resolution, spp, most in ((8, 1024, 0.1), (40, 128, 0.05), (136, 16, 0.05)):
+        with case(resolution):
+            view = _render(scene, resolution=resolution, min_spp=spp, max_spp=spp)
+            assert view.radiance_rgb.shape == (resolution, resolution, 3)
+            assert view.hits.shape == (resolution, resolution)
+            shown = block_means(view.radiance_rgb, resolution // 8)
+            assert np.median(abs(shown - truth)[lit] / truth[lit]) < most
+            assert decode_exr(encode_exr(view.radiance_rgb)).shape == view.radiance_rgb.shape
 
 
 @pytest.mark.usefixtures("llvm")
@@ -434,16 +404,6 @@ def plain() -> NDArray[np.float32]:
     return _picture(PLAIN, NOT_DENOISED)
 
 
-def _grid(cells: int) -> Part:
-    """The floor in 2 x cells x cells triangles."""
-    line = np.linspace(-1, 1, cells + 1)
-    x, y = np.meshgrid(line, line, indexing="ij")
-    p = np.stack([x, y, np.zeros_like(x)], axis=-1)
-    a, b, c, d = p[:-1, :-1], p[1:, :-1], p[1:, 1:], p[:-1, 1:]
-    pairs = [np.stack(corners, axis=-2).reshape(-1, 3, 3) for corners in ((a, b, c), (a, c, d))]
-    return flat(np.concatenate(pairs), GREY)
-
-
 def _without_area() -> Part:
     """A point and a line above the floor, as triangles."""
     corners = np.array([[[0, 0, 0.5]] * 3, [[0, 0, 0.5], [0.5, 0, 0.5], [1, 0, 0.5]]])
@@ -451,17 +411,15 @@ def _without_area() -> Part:
     return Part(triangles=corners, normals=up, material=GREY, kind="object")
 
 
-def _tilted(slope: float) -> Part:
-    return quad(FLOOR + np.array([[0, 0, -slope], [0, 0, slope]])[[0, 1, 1, 0]], GREY)
-
-
 SAME: dict[str, list[Part]] = {
     "a floor twice": [_floor(), _floor()],
-    "two floors through each other at 1e-6": [_floor(), _tilted(1e-6)],
-    "16200 triangles": [_grid(90)],
+    "two floors through each other at 1e-6": [
+        _floor(), quad(FLOOR + np.outer([-1e-6, 1e-6, 1e-6, -1e-6], [0, 0, 1]), GREY),
+    ],
+    "16200 triangles": [flat(2 * meshes.grid(90).corners, GREY)],
     "a point and a line as triangles": [_floor(), _without_area()],
     "a sliver of 1e-7": [_floor(), flat([[[-0.5, 0, 0.5], [0.5, 0, 0.5], [0, 1e-7, 0.5]]], GREY)],
-}
+}  # fmt: skip
 
 
 def test_what_adds_nothing_changes_nothing(plain: NDArray[np.float32]) -> None:

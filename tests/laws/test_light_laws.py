@@ -23,6 +23,7 @@ from tests.pipeline.renders.sampling import (
 from tests.pipeline.renders.scene_kit import (
     box,
     furnace,
+    furniture,
     join,
     light,
     material,
@@ -31,6 +32,8 @@ from tests.pipeline.renders.scene_kit import (
     sphere,
 )
 from tests.sky_maps import COLOURS, POLES, constant, six_poles, smooth
+
+pytestmark = pytest.mark.usefixtures("llvm")
 
 LIGHT = np.array([[-0.3, -0.2, 1.0], [0.4, -0.1, 1.2], [0.0, 0.5, 0.9]])
 FLOOR = [[-12, -12, 0], [12, -12, 0], [12, 12, 0], [-12, 12, 0]]
@@ -94,7 +97,12 @@ def test_unequal_lights_add_up_as_lamberts_formula_says() -> None:
 
 def test_light_scales_exactly() -> None:
     """Twice the radiance is twice the picture, bit for bit: no clamp, no absolute threshold."""
-    once, twice = (_traced(_glossy_room(factor)) for factor in (1.0, 2.0))
+
+    def room(strength: float) -> Scene:
+        lamps = [light(LIGHT, 4 * strength), light(LIGHT + np.array([1, 0, 0.5]), strength)]
+        return join([*furniture(), *lamps], eye=(0.5, -1.7, 0.6), fov_deg=45)
+
+    once, twice = (_traced(room(factor)) for factor in (1.0, 2.0))
     assert once.max() > 0
     np.testing.assert_array_equal(twice, 2 * once)
 
@@ -149,19 +157,6 @@ def test_a_bowl_fills_with_light_bounce_by_bounce(
     assert (SIGMAS * estimate.error < 0.02 * estimate.mean).all()  # small enough to tell
     # The facets make the light uneven by some 1e-3.
     assert_agree(estimate, exact(np.full((1, 1, 3), expected)), slack=3e-3)
-
-
-def _glossy_room(strength: float) -> Scene:
-    walls = [
-        quad(FLOOR, material(diffuse=[0.6, 0.4, 0.2], specular=0.3, roughness=0.6)),
-        quad([[-4, 2, 0], [4, 2, 0], [4, 2, 4], [-4, 2, 4]], material(diffuse=0.8)),
-    ]
-    lamps = [light(LIGHT, 4 * strength), light(LIGHT + np.array([1, 0, 0.5]), strength)]
-    row = material(diffuse=0.2, specular=[0.5, 0.6, 0.7], roughness=0.4)
-    return join([*walls, sphere([0.4, 0.3, 0.3], 0.3, row, rings=8), *lamps], eye=(0, -3, 2))
-
-
-pytestmark = pytest.mark.usefixtures("llvm")
 
 
 @pytest.mark.parametrize("shape", [sphere, box])

@@ -16,9 +16,7 @@ from model.hits.view_inputs import Channel
 from pipeline.renders import surface_table
 from pipeline.renders.tracer import load_tracer
 from pipeline.scenes.views import Visibility
-from scene_templates.families import DEFAULT_FAMILIES
 from scene_templates.rotations import uniform_rotation
-from scene_templates.settings import SceneSettings
 from storage.conventions import alpha_ggx
 from storage.optics import MIN_ALPHA, bsdf_lobes, scattered_again
 from storage.records.material import DIFFUSE, EMISSION, SPECULAR
@@ -44,9 +42,9 @@ from tests.pipeline.renders.scene_kit import (
     material,
     open_scene,
     quad,
+    sampled_like_scene,
     sphere,
 )
-from tests.pipeline.scenes.small_pool import first_scene, small_pool
 from tests.scenes_by_hand import mirrored, moved
 from tests.sky_maps import night, one_sun, smooth
 from tests.storage.test_optics import slow_albedo
@@ -196,14 +194,12 @@ def test_single_scattering_would_lose_most_of_it(monkeypatch: pytest.MonkeyPatch
     assert _mean_radiance_of_a_ball() == pytest.approx(0.409, abs=0.004)
 
 
-def _scene() -> Scene:
-    settings = SceneSettings(families=DEFAULT_FAMILIES, num_views=1)
-    return first_scene(settings, small_pool(), seed=11, scene_index=0)
+COMPOSED = sampled_like_scene(np.random.default_rng(0), num_views=1)
 
 
 @pytest.mark.parametrize(
     "made",
-    [_scene, lambda: open_scene(one_sun(3e3)), bumpy_room],
+    [lambda: COMPOSED, lambda: open_scene(one_sun(3e3)), bumpy_room],
     ids=["composed", "sky", "normal map"],
 )
 def test_rendering_commutes_with_motion(made: Callable[[], Scene]) -> None:
@@ -215,7 +211,7 @@ def test_rendering_commutes_with_motion(made: Callable[[], Scene]) -> None:
 
 
 def test_rendering_commutes_with_a_mirror_and_with_an_exchange_of_channels() -> None:
-    scene, order = _scene(), np.array([2, 0, 1])
+    scene, order = COMPOSED, np.array([2, 0, 1])
     recoloured = scene.materials.copy()
     for part in (DIFFUSE, SPECULAR, EMISSION):
         recoloured[:, part] = recoloured[:, part][:, order]
@@ -233,7 +229,7 @@ def test_rendering_commutes_with_a_mirror_and_with_an_exchange_of_channels() -> 
 
 
 def test_what_a_camera_sees_commutes_with_motion() -> None:
-    scene = _scene()
+    scene = COMPOSED
     there = moved(scene, uniform_rotation(np.random.default_rng(5)), [1.0, 2.0, -3.0])
     before, after = (Visibility(s).facts(s.c2w[0], float(s.fov_deg[0]), 64) for s in (scene, there))
     # 4096 rays: a few graze an edge and fall on the other side after rounding.

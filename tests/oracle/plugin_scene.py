@@ -23,8 +23,8 @@ neighbours, make both the same function: its interpolation between them is ours.
 """
 
 from collections.abc import Callable
-from functools import cache, partial
-from typing import Any, get_args
+from functools import cache
+from typing import Any
 
 import drjit as dr
 import mitsuba as mi
@@ -53,7 +53,7 @@ PLUGIN = "compensated_specular"
 """Name in scene dictionaries; it has the textures specular, again (Fms) and alpha."""
 
 _WIDTH = "squared_roughness"
-_AGAIN: dict[Smith, str] = {smith: f"scattered_again_{smith}" for smith in get_args(Smith)}
+_AGAIN = "scattered_again"
 _LEAST_COS = 1e-4
 """Only rays along the surface are below; the lookup divides by the cosine."""
 
@@ -98,7 +98,7 @@ def scaled_albedos(lobes: Lobes) -> tuple[NDArray[np.float64], NDArray[np.float6
 def _material(scene: Scene, row: int) -> Any:
     """Return the BSDF of a mesh: of one material row in textured scenes, read from faces else."""
     if scene.textures:
-        return _two_sided(normal_mapped(scene, row, _blend(textured_slots(scene, row, _SMITH))))
+        return _two_sided(normal_mapped(scene, row, _blend(textured_slots(scene, row))))
     return _two_sided(_blend({name: _face(name) for name in _SLOTS}))
 
 
@@ -217,14 +217,8 @@ def _add_attribute(mesh: Any, name: str, values: NDArray[np.float64]) -> None:
     mesh.add_attribute(f"face_{name}", values.shape[1], flat)
 
 
-def textured_slots(scene: Scene, row: int, smith: Smith) -> dict[str, Any]:
-    """Return the textures of a material row by their names in `plugin_scene`.
-
-    Args:
-        scene: that has textures.
-        row: of its materials.
-        smith: of the specular lobe.
-    """
+def textured_slots(scene: Scene, row: int) -> dict[str, Any]:
+    """Return the textures of a material row of a textured scene, by their names in `_blend`."""
     diffuse, specular, roughness = (_texels(scene, row, name) for name in TEXTURED)
     most, mirrored = diffuse.max(), specular.max()
     weight = mirrored / (most + mirrored) if most + mirrored > 0 else 0.0
@@ -234,7 +228,7 @@ def textured_slots(scene: Scene, row: int, smith: Smith) -> dict[str, Any]:
         "specular": _bitmap(specular / weight if weight > 0 else specular),
         "alpha": alpha,
         "weight": _bitmap(np.full((1, 1, 1), weight)),
-        "again": {"type": _AGAIN[smith], "specular": _bitmap(specular), "alpha": alpha},
+        "again": {"type": _AGAIN, "specular": _bitmap(specular), "alpha": alpha},
     }
 
 
@@ -277,8 +271,7 @@ def _bitmap(texels: NDArray[np.float64]) -> dict[str, Any]:
 def register_textures() -> None:
     """Make our textures known to Mitsuba; a variant must be set, and stays for the process."""
     _register(_WIDTH, _squared_roughness, "roughness", mean=dr.square)
-    for smith in get_args(Smith):
-        _register(_AGAIN[smith], partial(_scattered_again, smith), "specular", "alpha")
+    _register(_AGAIN, _scattered_again, "specular", "alpha")
     _register(PLUGIN, _compensated_specular, "specular", "again", "alpha")
 
 
@@ -314,9 +307,9 @@ def _squared_roughness(si: Any, active: Any, roughness: Any) -> Any:
     return dr.maximum(dr.square(roughness.eval_1(si, active)), MIN_ALPHA)
 
 
-def _scattered_again(smith: Smith, si: Any, active: Any, specular: Any, alpha: Any) -> Any:
+def _scattered_again(si: Any, active: Any, specular: Any, alpha: Any) -> Any:
     place = _texel_coordinate(dr.sqrt(alpha.eval_1(si, active)), ROUGHNESS_STEPS)
-    mean, color = _mean_table(smith).eval(mi.Point1f(place))[0], specular.eval(si, active)
+    mean, color = _mean_table(_SMITH).eval(mi.Point1f(place))[0], specular.eval(si, active)
     return color * mean / (1 - color * (1 - mean))
 
 

@@ -12,8 +12,8 @@ import os
 import signal
 import sys
 import time
-from collections.abc import Callable, Iterator, Mapping
-from contextlib import contextmanager
+from collections.abc import Callable, Mapping
+from contextlib import nullcontext
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -97,7 +97,6 @@ class Bench:
     """A folder of sources with a plan, a store beside it, and a child to work on them."""
 
     root: Path
-    limits: ChildLimits = LIMITS
 
     def __post_init__(self) -> None:
         self.root.mkdir(parents=True, exist_ok=True)
@@ -105,7 +104,12 @@ class Bench:
             self.set()
         heavy = ("pipeline.assets.prepare", "pipeline.assets.decimation.pymeshlab_filters")
         preload([*heavy, "tests.pipeline.assets.child_kit"])
-        self.child = IsolatedChild(limits=self.limits)
+        self.child = IsolatedChild(limits=LIMITS)
+
+    def hurry(self, **limits: Any) -> None:
+        """Work with a child of other limits from now on."""
+        self.child.close()
+        self.child = IsolatedChild(limits=dataclasses.replace(LIMITS, **limits))
 
     def set(self, **plan: str) -> None:
         """Say what children do: an action by method, such as `die` or `die once`."""
@@ -134,14 +138,15 @@ class Bench:
         """Prepare objects with a store beside the sources."""
         from tests.pipeline.assets.meshes_by_hand import record_of
 
-        @contextmanager
-        def borrow() -> Iterator[IsolatedChild]:
-            yield self.child
-
         records = [record_of(self.root / name, name) for name in names]
         place = AssetStore(self.root.parent / store)
         return stage.prepare_assets(
-            records, settings, place, borrow_child=borrow, workers=1, done=done
+            records,
+            settings,
+            place,
+            borrow_child=lambda: nullcontext(self.child),
+            workers=1,
+            done=done,
         )
 
     def made(self, name: str = "knot.obj", settings: AssetSettings = SETTINGS) -> Asset:

@@ -303,20 +303,12 @@ def is_watertight(mesh: TriangleMesh) -> bool:
     other = trimesh.Trimesh(mesh.positions, mesh.faces)
     if not (other.is_watertight and other.is_winding_consistent and other.volume > 0):
         return False
-    # the edges opposite a vertex must be one closed walk around it
-    follows: list[dict[int, int]] = [{} for _ in other.vertices]
-    for a, b, c in other.faces.tolist():
-        for vertex, start, end in ((a, b, c), (b, c, a), (c, a, b)):
-            follows[vertex][start] = end
-    for walk in filter(None, follows):
-        first = here = next(iter(walk))
-        steps = 0
-        while steps == 0 or here != first:
-            here = walk[here]
-            steps += 1
-        if steps != len(walk):
-            return False
-    return True
+    # the edges opposite a vertex, between its neighbours, must be one closed walk around it
+    corners = np.concatenate([np.roll(other.faces, step, axis=1) for step in range(3)])
+    beside = corners[:, :1] * len(other.vertices) + corners[:, 1:]
+    pairs, ends = np.unique(beside, return_inverse=True)
+    labels = trimesh.graph.connected_component_labels(ends.reshape(-1, 2), len(pairs))
+    return bool(labels.max() + 1 == len(np.unique(other.faces)))
 
 
 def pierced(mesh: TriangleMesh, *, faces: int) -> TriangleMesh:

@@ -1,6 +1,5 @@
 """The stage: the next method where one fails, each object once; deaths change no data."""
 
-import contextlib
 import dataclasses
 import json
 import os
@@ -8,9 +7,8 @@ import signal
 import subprocess
 import sys
 import time
-from collections.abc import Callable, Iterator
 from pathlib import Path
-from typing import Any, NoReturn
+from typing import NoReturn
 
 import pytest
 
@@ -131,33 +129,16 @@ def test_a_file_that_the_system_will_not_open_is_refused_today_only(bench: kit.B
     assert bench.run("loop.obj")[1] == []
 
 
-Hurried = Callable[..., kit.Bench]
-
-
-@pytest.fixture
-def hurried(bench: kit.Bench) -> Iterator[Hurried]:
-    """The same bench with other limits."""
-    with contextlib.ExitStack() as stack:
-
-        def make(**limits: Any) -> kit.Bench:
-            other = kit.Bench(bench.root, limits=dataclasses.replace(kit.LIMITS, **limits))
-            stack.callback(other.child.close)
-            return other
-
-        yield make
-
-
 @pytest.mark.parametrize(
     "actions",
     [("die", "eat", "leave", "fail", "crash"),
      pytest.param(("sleep",), marks=pytest.mark.slow("kills"))],
     ids=["deaths", "sleep"],
 )  # fmt: skip
-def test_a_child_that_dies_once_changes_no_byte(
-    bench: kit.Bench, hurried: Hurried, actions: tuple[str, ...]
-) -> None:
+def test_a_child_that_dies_once_changes_no_byte(bench: kit.Bench, actions: tuple[str, ...]) -> None:
     """A mesh of 1440 faces takes less than a second, and far below 15 on a busy machine."""
-    bench = hurried(wall_s=15.0) if "sleep" in actions else bench
+    if "sleep" in actions:
+        bench.hurry(wall_s=15.0)
     (undisturbed,), _ = bench.run("knot.obj", store="undisturbed")
     for times, action in enumerate(actions, start=1):
         bench.set(**{kit.FIRST: f"{action} once"})
@@ -177,11 +158,12 @@ def test_a_child_that_dies_once_changes_no_byte(
     ],
 )
 def test_what_the_environment_did_is_not_kept_and_leads_to_no_other_method(
-    bench: kit.Bench, hurried: Hurried, action: str, reason: str, tries: int
+    bench: kit.Bench, action: str, reason: str, tries: int
 ) -> None:
     bench.set(**{kit.FIRST: action})
-    hasty = hurried(wall_s=2.0) if action == "sleep" else bench
-    prepared, (failure,) = hasty.run("knot.obj")
+    if action == "sleep":
+        bench.hurry(wall_s=2.0)
+    prepared, (failure,) = bench.run("knot.obj")
     assert (prepared, failure.reason) == ([], reason)
     assert is_transient(failure.reason)
     assert bench.called == [kit.FIRST] * tries
@@ -209,17 +191,13 @@ def test_no_level_is_lost_because_its_child_died(bench: kit.Bench) -> None:
     [("crash", "crashed_signal_11", 2), ("burn", "timeout_cpu", 1), ("refuse", "degenerate", 1)],
 )
 def test_a_verdict_is_kept_as_plain_text(
-    bench: kit.Bench,
-    hurried: Hurried,
-    action: str,
-    reason: str,
-    tries: int,
-    monkeypatch: pytest.MonkeyPatch,
+    bench: kit.Bench, action: str, reason: str, tries: int, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     if action != "refuse":  # an unusable object is refused whatever other methods there are
         monkeypatch.setattr(stage, "methods_of", lambda *profile, **watertight: (kit.FIRST,))
     bench.set(**{kit.FIRST: action})
-    prepared, (failure,) = hurried(cpu_s=1).run("knot.obj")
+    bench.hurry(cpu_s=1)
+    prepared, (failure,) = bench.run("knot.obj")
     assert (prepared, failure.reason) == ([], reason)
     assert not is_transient(failure.reason)
     bench.set()

@@ -62,7 +62,6 @@ def _layers(path: Path) -> dict[str, Any]:
     node.image = image
     return {
         "type": image.type,
-        "has_data": bool(image.has_data),
         "outputs": [output.name for output in node.outputs],
     }
 

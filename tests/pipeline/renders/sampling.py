@@ -46,9 +46,11 @@ def view_settings(spp: int, **changes: Any) -> RenderSettings:
     return RenderSettings(**{**plain, **changes})
 
 
-def render_view(scene: Scene, settings: RenderSettings, seed: int = 0) -> RenderedView:
+def render_view(
+    scene: Scene, settings: RenderSettings, seed: int = 0, light_seed: int | None = None
+) -> RenderedView:
     """Return the first view of a scene, as the stage makes it."""
-    renderer = SceneRenderer(scene, settings)
+    renderer = SceneRenderer(scene, settings, light_seed=light_seed)
     return renderer.render_view(scene.c2w[0], float(scene.fov_deg[0]), seed)
 
 

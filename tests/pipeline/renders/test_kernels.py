@@ -1,4 +1,4 @@
-"""The kernel's BRDF by itself, and what is paid once: loading, compiling and reading back."""
+"""The kernel's BRDF by itself, and what is paid once: compiling and reading back."""
 
 import dataclasses
 import gc
@@ -7,7 +7,7 @@ import weakref
 from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
-from unittest.mock import Mock, create_autospec
+from unittest.mock import create_autospec
 
 import drjit as dr
 import mitsuba as mi
@@ -15,10 +15,7 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from pipeline.generation.scene_origins import RenderInput
-from pipeline.generation.scene_worker import ViewProgress, render_sample
-from pipeline.presets.registry import preset_settings
-from pipeline.renders import ggx, kernel_scene
+from pipeline.renders import ggx
 from pipeline.renders.device_memory import KernelInputs, read_back, record_launches
 from pipeline.renders.device_pictures import DevicePictures
 from pipeline.renders.ggx import AlbedoLookup, KernelLobes
@@ -130,20 +127,6 @@ def test_guided_passes_have_one_more_set_of_kernels_for_every_scene() -> None:
         tracer.radiance(camera_of(scene, PX), seed=0, spp=16)
         launched.append(_launched())
     assert launched[0] and launched[1] | launched[2] <= launched[0]
-
-
-def test_all_views_and_lights_share_one_load(monkeypatch: pytest.MonkeyPatch) -> None:
-    load = Mock(wraps=kernel_scene.build_mitsuba_scene)
-    monkeypatch.setattr(kernel_scene, "build_mitsuba_scene", load)
-    scene = sampled_like_scene(np.random.default_rng(3), num_views=2)
-    scene = scene.with_provenance({"camera_attempts": [0] * 2})
-    changes = {"renders.min_spp": 8, "renders.max_spp": 8, "renders.per_light": True}
-    changes["scenes.num_views"] = 2
-    settings = preset_settings("smoke", resolution=16, changes=changes)
-    scene_input = RenderInput(scene=scene)
-    sample = render_sample("000000000", scene_input, settings, [], ViewProgress(None, 0))
-    assert len(sample.views) == 2
-    assert load.call_count == 2  # what camera rays meet, and what all other rays meet
 
 
 def test_pictures_come_back_only_where_something_is_decided(reads: list[int]) -> None:

@@ -25,7 +25,7 @@ from pipeline.renders.guide_table import (
     bin_of,
     learn,
 )
-from pipeline.renders.renderer import RenderedView, SceneRenderer
+from pipeline.renders.renderer import SceneRenderer
 from pipeline.renders.tracer import PixelCamera
 from pipeline.renders.vector_tracer import (
     VectorTracer,
@@ -43,6 +43,7 @@ from tests.pipeline.renders.sampling import (
     camera_of,
     render_blocks,
     render_passes,
+    render_view,
     view_settings,
 )
 from tests.pipeline.renders.scene_kit import (
@@ -249,14 +250,8 @@ def test_views_of_a_scene_trace_their_light_paths_once(monkeypatch: pytest.Monke
 
 
 def test_lamps_apart_share_the_light_paths_of_a_scene() -> None:
-    scene = lit_scene()
-
-    def view(*, per_light: bool) -> RenderedView:
-        told = dataclasses.replace(SHARED, per_light=per_light)
-        renderer = SceneRenderer(scene, told, light_seed=5)
-        return renderer.render_view(scene.c2w[0], float(scene.fov_deg[0]), 0)
-
-    lamps, whole = view(per_light=True), view(per_light=False)
+    apart = dataclasses.replace(SHARED, per_light=True)
+    lamps, whole = (render_view(lit_scene(), each, light_seed=5) for each in (apart, SHARED))
     assert lamps.lights_rgb is not None
     np.testing.assert_array_equal(sum_of_lights(lamps.lights_rgb), lamps.radiance_rgb)
     assert psnr_log_db(lamps.radiance_rgb, whole.radiance_rgb) > whole.noise_floor_db

@@ -112,14 +112,8 @@ def test_commands_that_render_say_what_to_install(
 def test_a_probe_without_an_answer_is_tried_again_and_leads_to_no_other_library(
     monkeypatch: pytest.MonkeyPatch, tmp_path: Path, silent: int
 ) -> None:
-    limits_s: list[float] = []
-
-    def run(*_: object, timeout: float, **__: object) -> subprocess.CompletedProcess[str]:
-        limits_s.append(timeout)
-        if len(limits_s) <= silent:
-            raise subprocess.TimeoutExpired("probe", timeout)
-        return subprocess.CompletedProcess([], 0, stdout="", stderr="")
-
+    ended = subprocess.CompletedProcess([], 0, stdout="", stderr="")
+    run = Mock(side_effect=[subprocess.TimeoutExpired("probe", 1)] * silent + [ended])
     libraries = [tmp_path / f"libLLVM-{number}.so" for number in (1, 2)]
     for library in libraries:
         library.touch()
@@ -131,7 +125,7 @@ def test_a_probe_without_an_answer_is_tried_again_and_leads_to_no_other_library(
     else:
         with pytest.raises(EnvironmentFailure, match=r"libLLVM-1.so: .* no answer within 360 s"):
             choose_variant()
-    assert limits_s == [180, 360]
+    assert [call.kwargs["timeout"] for call in run.call_args_list] == [180, 360]
 
 
 CPU, GPU = "llvm_ad_rgb", "cuda_ad_rgb"

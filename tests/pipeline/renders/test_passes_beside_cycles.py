@@ -57,17 +57,10 @@ def _blender(scene: Scene, folder: Path) -> dict[str, NDArray[np.float32]]:
     run_blender(Path(__file__).with_name("cycles_passes_process.py"), folder)
     with OpenEXR.File(str(folder / "passes.exr"), separate_channels=True) as file:
         channels = {name: each.pixels for name, each in file.channels().items()}
-    found: dict[str, list[str]] = {}
-    for name in channels:
-        found.setdefault(name.split(".")[-2], []).append(name)
-    order = "RXGYBZVA"
-    return {
-        called: np.stack(
-            [channels[name] for name in sorted(names, key=lambda name: order.index(name[-1]))],
-            axis=-1,
-        )
-        for called, names in found.items()
-    }
+    found: dict[str, list[NDArray[np.float32]]] = {}
+    for name in sorted(channels, key=lambda name: "RXGYBZVA".index(name[-1])):
+        found.setdefault(name.split(".")[-2], []).append(channels[name])
+    return {called: np.stack(each, axis=-1) for called, each in found.items()}
 
 
 @pytest.mark.usefixtures("blender")

@@ -9,7 +9,6 @@ from unittest.mock import Mock
 
 import numpy as np
 import pytest
-import trimesh
 from numpy.typing import ArrayLike, NDArray
 
 from infra.bench.experiments.calibration import FIGURES, record_looks, unreachable
@@ -21,7 +20,6 @@ from infra.bench.workloads.traced_pictures import (
     shrink_reference,
 )
 from infra.render.raw_references import raw_reference
-from pipeline.foreign.mesh import TriangleMesh
 from pipeline.renders import pictures, preview
 from pipeline.renders.pictures import NUMPY, means, read_sums
 from pipeline.renders.preview import (
@@ -52,6 +50,7 @@ from storage.records.scene import Scene, SceneObject
 from storage.renderer import Image, Sampling
 from storage.settings.overrides import apply_overrides
 from tests.for_each import for_each
+from tests.pipeline.assets import meshes_by_hand
 from tests.pipeline.programs import printed_by
 from tests.pipeline.renders.sampling import (
     Estimate,
@@ -383,16 +382,9 @@ def test_plain_mitsuba_comes_to_the_same_picture(sampler: str) -> None:
     assert errors[0] > 50 and errors[1] > 53 and errors[2] > 62
 
 
-def _ball(subdivisions: int) -> TriangleMesh:
-    mesh = trimesh.creation.icosphere(subdivisions=subdivisions, radius=0.5)
-    return TriangleMesh(
-        positions=np.asarray(mesh.vertices, np.float64), faces=np.asarray(mesh.faces, np.int64)
-    )
-
-
 def test_a_finer_ball_looks_more_like_its_source() -> None:
-    """20480 triangles as the source, then 80, 320, 1280 and itself."""
-    meshes = [_ball(5), _ball(1), _ball(2), _ball(3), _ball(5)]
+    """20736 triangles as the source, then 100, 324, 1296 and itself."""
+    meshes = [meshes_by_hand.sphere(rings, 2 * rings) for rings in (72, 5, 9, 18, 72)]
     coarse, middle, fine, same, other_samples = picture_db(meshes, fixed_samples(32, 64))
     # a quarter of the distance with every step, 12 dB at most; a third of that is asked for
     assert coarse + 4 < middle and middle + 4 < fine

@@ -19,13 +19,11 @@ from scipy import stats
 
 from pipeline.renders.tracer import load_tracer
 from storage.records.scene import Scene
-from storage.seeds import seed_for
-from tests.pipeline.renders.sampling import block_means, camera_of
+from tests.pipeline.renders.sampling import block_means, render_passes
 from tests.pipeline.renders.scene_kit import Part, box, join, light, material, quad, sphere
 
 FOLDER = Path(__file__).parents[2] / "references" / "raw"
 RESOLUTION = 48
-PASS_SPP = 64
 _STORED_PASSES = 512
 
 _FLOOR = [[-1, -1, 0], [1, -1, 0], [1, 1, 0], [-1, 1, 0]]
@@ -53,12 +51,10 @@ def scenes() -> dict[str, Scene]:
     return {name: join(each, eye=eye, target=target) for name, each in parts.items()}
 
 
-def passes(scene: Scene, count: int, seed: int) -> NDArray[np.float64]:
+def passes(scene: Scene, count: int, first_seed: int) -> NDArray[np.float64]:
     """Return `count` independent passes [count, R, R, 3] of a scene's first view."""
-    tracer, camera = load_tracer(scene, max_depth=10, rr_depth=2), camera_of(scene, RESOLUTION)
-    seeds = [seed_for(seed, "pass", index) for index in range(count)]
-    pictures = [tracer.radiance(camera, seed=each, spp=PASS_SPP) for each in seeds]
-    return np.stack(pictures).astype(np.float64)
+    tracer = load_tracer(scene, max_depth=10, rr_depth=2)
+    return render_passes(tracer, scene, resolution=RESOLUTION, passes=count, first_seed=first_seed)
 
 
 def load(name: str) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
@@ -108,7 +104,7 @@ def mean_p(z: NDArray[np.float64]) -> float:
 
 @pytest.mark.parametrize("name", sorted(scenes()))
 def test_the_picture_is_the_stored_one_within_noise(name: str) -> None:
-    z = z_values(name, passes(scenes()[name], NUM_PASSES, seed=7).mean(axis=0))
+    z = z_values(name, passes(scenes()[name], NUM_PASSES, first_seed=7).mean(axis=0))
     assert min(smallest_p(z), mean_p(z)) > SIGNIFICANCE, (np.abs(z).max(), z.mean())
 
 
@@ -126,7 +122,7 @@ if __name__ == "__main__":
 
     activate(choose_variant())
     for scene_name, made in scenes().items():
-        taken = passes(made, _STORED_PASSES, seed=1_000_003)
+        taken = passes(made, _STORED_PASSES, first_seed=1_000_003)
         np.savez_compressed(
             FOLDER / f"{scene_name}.npz",
             mean_rgb=taken.mean(axis=0).astype(np.float32),

@@ -5,6 +5,7 @@ import itertools
 import json
 from collections.abc import Callable
 from typing import Any
+from unittest.mock import Mock
 
 import numpy as np
 import pytest
@@ -13,6 +14,8 @@ from numpy.typing import NDArray
 from pipeline.generation.scene_origins import RenderInput
 from pipeline.generation.scene_worker import ViewProgress, render_sample
 from pipeline.presets.registry import preset_settings
+from pipeline.presets.settings import DatasetSettings
+from pipeline.renders import kernel_scene
 from pipeline.renders.renderer import SceneRenderer
 from pipeline.renders.tracer import load_tracer
 from pipeline.renders.vector_tracer import VectorTracer
@@ -31,7 +34,7 @@ from storage.records.lights import (
     sum_of_parts,
 )
 from storage.records.retextured import NO_TEXTURES
-from storage.records.sample import decode_sample, encode_sample
+from storage.records.sample import Sample, decode_sample, encode_sample
 from storage.records.scene import Scene
 from storage.records.texture import Texture
 from storage.settings.described import settings_record
@@ -65,6 +68,7 @@ from tests.pipeline.renders.scene_kit import (
     noise_map,
     open_scene,
     quad,
+    sampled_like_scene,
     sphere,
     textured,
     textured_floor,
@@ -229,6 +233,8 @@ def test_a_faint_emitter_is_a_surface() -> None:
 
 SETTINGS = view_settings(32, noise_floor_db=60.0, aux_spp=16)
 
+APART = dataclasses.replace(SETTINGS, split=True, split_lobes=True)
+"""By bounces and by lobes."""
 KINDS = [{"split": True}, {"split_lobes": True}, {"split": True, "split_lobes": True}]
 FLOOR = quad([[-2, -2, 0], [2, -2, 0], [2, 2, 0], [-2, 2, 0]], material(diffuse=0.5))
 LAMP = np.array([[-0.5, -1.5, 2], [0.5, -1.5, 2], [0, -1, 2.4]])
@@ -249,13 +255,12 @@ def test_the_stored_picture_is_the_sum_of_its_parts(kind: dict[str, Any], max_sp
 
 
 def test_lights_apart_are_split_alike() -> None:
-    both = dataclasses.replace(SETTINGS, per_light=True, split=True, split_lobes=True)
-    view = render_view(lit_scene(), both)
+    view = render_view(lit_scene(), dataclasses.replace(APART, per_light=True))
     assert view.parts_rgb is not None and view.lights_rgb is not None
     assert {part.shape for part in view.parts_rgb.values()} == {(3, 32, 32, 3)}
     np.testing.assert_array_equal(sum_of_parts(view.parts_rgb), view.lights_rgb)
     np.testing.assert_array_equal(sum_of_lights(view.lights_rgb), view.radiance_rgb)
-    together = render_view(lit_scene(), dataclasses.replace(both, per_light=False))
+    together = render_view(lit_scene(), APART)
     assert together.parts_rgb is not None
     for name, part in view.parts_rgb.items():
         agreement = psnr_log_db(sum_of_lights(part), together.parts_rgb[name])
@@ -264,8 +269,7 @@ def test_lights_apart_are_split_alike() -> None:
 
 def test_light_that_is_not_there_is_exactly_nothing() -> None:
     """Only direct light on a lone floor; behind a screen, lit by a ceiling, none."""
-    settings = dataclasses.replace(SETTINGS, split=True, split_lobes=True)
-    alone = render_view(join([FLOOR, light(LAMP, 20.0)], eye=(0, -3, 2)), settings)
+    alone = render_view(join([FLOOR, light(LAMP, 20.0)], eye=(0, -3, 2)), APART)
     assert alone.parts_rgb is not None and alone.part_floors is not None
     np.testing.assert_array_equal(alone.parts_rgb["diffuse_direct"], alone.radiance_rgb)
     for name in ("diffuse_indirect", "specular_direct", "specular_indirect"):
@@ -277,7 +281,7 @@ def test_light_that_is_not_there_is_exactly_nothing() -> None:
     walls = [quad(corners, material(diffuse=0.8)) for corners in (screen, ceiling)]
     lamp = light([[-0.5, 1, 8], [0.5, 1, 8], [0, 1.5, 8.4]], 4000.0)
     room = [FLOOR, *walls, lamp]
-    hidden = render_view(join(room, eye=(0, -3, 3), target=(0, -1.5, 0), fov_deg=25), settings)
+    hidden = render_view(join(room, eye=(0, -3, 3), target=(0, -1.5, 0), fov_deg=25), APART)
     assert hidden.parts_rgb is not None
     np.testing.assert_array_equal(hidden.parts_rgb["diffuse_direct"], 0)
     np.testing.assert_array_equal(hidden.parts_rgb["diffuse_indirect"], hidden.radiance_rgb)
@@ -288,9 +292,7 @@ def test_what_has_no_lobe_shows_none_of_its_light_once_denoised() -> None:
     """A metal ball on a matt floor: only pixels at its rim show both."""
     ball = sphere([0, 0, 0.5], 0.5, material(specular=0.9, roughness=0.3), rings=8)
     scene = join([FLOOR, ball, light(LAMP, 20.0)], eye=(0, -3, 2), target=(0, 0, 0.4))
-    found = render_view(
-        scene, dataclasses.replace(SETTINGS, split=True, split_lobes=True)
-    ).parts_rgb
+    found = render_view(scene, APART).parts_rgb
     assert found is not None
     diffuse, specular = (
         (found[f"{lobe}_direct"] + found[f"{lobe}_indirect"]).max(axis=-1) > 0
@@ -308,7 +310,7 @@ def test_floors_of_parts_are_honest() -> None:
     Measured: the mean of six is 1.4 to 2.9 dB below the truth, part by part, and one of the 24 is
     2.7 dB above. The truths of 16,384 samples agree to 58 dB and more, 11 dB above every picture.
     """
-    few = dataclasses.replace(SETTINGS, min_spp=128, max_spp=256, split=True, split_lobes=True)
+    few = dataclasses.replace(APART, min_spp=128, max_spp=256)
     whole = dataclasses.replace(few, max_spp=16_384, min_spp=16_384, denoiser="off")
     truth = render_view(mirrors(), whole, seed=99).parts_rgb
     assert truth is not None
@@ -332,17 +334,27 @@ def test_too_many_pictures_are_rejected() -> None:
         SceneRenderer(scene, dataclasses.replace(SETTINGS, per_light=True, split=True))
 
 
+def _build(scene: Scene, **renders: Any) -> tuple[Sample, DatasetSettings]:
+    """Return a sample of two views, as a build with these settings of renders makes it."""
+    asked = {"min_spp": 8, "max_spp": 8, **renders}
+    changes = {f"renders.{name}": value for name, value in asked.items()} | {"scenes.num_views": 2}
+    settings = preset_settings("smoke", resolution=16, changes=changes)
+    scene_input = RenderInput(scene=scene.with_provenance({"camera_attempts": [0, 0]}))
+    return render_sample("000000007", scene_input, settings, [], ViewProgress(None, 7)), settings
+
+
+def test_all_views_and_lights_share_one_load(monkeypatch: pytest.MonkeyPatch) -> None:
+    load = Mock(wraps=kernel_scene.build_mitsuba_scene)
+    monkeypatch.setattr(kernel_scene, "build_mitsuba_scene", load)
+    scene = sampled_like_scene(np.random.default_rng(3), num_views=2)
+    assert len(_build(scene, per_light=True)[0].views) == 2
+    assert load.call_count == 2  # what camera rays meet, and what all other rays meet
+
+
 def test_a_build_with_the_setting_stores_what_verify_accepts() -> None:
     """`--set renders.per_light=true` or split, from the settings to the members of a sample."""
     for kind, per_light in (({}, True), (KINDS[0], False), (KINDS[2], True)):
-        asked = {**kind, "per_light": per_light, "min_spp": 8, "max_spp": 8}
-        changes = {f"renders.{name}": value for name, value in asked.items()}
-        settings = preset_settings(
-            "smoke", resolution=16, changes={**changes, "scenes.num_views": 2}
-        )
-        scene = tiny_scene(provenance={"camera_attempts": [0, 0]})
-        scene_input = RenderInput(scene=scene)
-        sample = render_sample("000000007", scene_input, settings, [], ViewProgress(None, 7))
+        sample, settings = _build(tiny_scene(), per_light=per_light, **kind)
         manifest = Manifest(
             build="smoke",
             settings=settings_record(settings),

@@ -23,7 +23,6 @@ from pipeline.scenes.pieces import (
     with_source_emission,
 )
 from pipeline.scenes.redrawn import with_new_lights
-from pipeline.scenes.shading_normals import flat_shaded
 from pipeline.scenes.triangle_budget import PooledAsset
 from scene_templates.layout import Emitter, Layout, ObjectPlacement, Pose
 from scene_templates.rotations import rotate_points
@@ -34,12 +33,12 @@ from storage.conventions import look_at_c2w
 from storage.errors import Rejected
 from storage.records.asset import Level, LevelSkin, SkinQuality
 from storage.records.lookup import texture_values
-from storage.records.material import EMISSION, default_rows
+from storage.records.material import EMISSION
 from storage.records.objects import locked_uids
 from storage.records.packed_maps import pack_map
 from storage.records.passes import view_passes
 from storage.records.retextured import without_constant_textures, without_normal_maps
-from storage.records.scene import Scene, SceneObject
+from storage.records.scene import Scene
 from storage.records.scene_facts import texture_families
 from storage.records.scene_file import scene_digest
 from storage.records.texture import Texture
@@ -186,13 +185,7 @@ def test_an_objects_texture_turns_with_it() -> None:
     for rotation in (np.eye(3), Rotation.from_euler("xyz", [0.4, -1.1, 2.0]).as_matrix()):
         centre = np.array([0.3, -0.2, 0.5])
         placed = rotate_points(corners.reshape(-1, 3), rotation) + centre
-        faces = np.arange(6, dtype=np.uint32).reshape(-1, 3)
-        piece = ScenePiece(
-            entry=SceneObject(name="box", kind="object"),
-            mesh=flat_shaded(placed.astype(np.float32), faces),
-            materials=default_rows(1),
-            material_index=np.zeros(2, np.int64),
-        )
+        piece = piece_of(placed.astype(np.float32), np.arange(6, dtype=np.uint32).reshape(-1, 3))
         pose = Pose(centre=centre, radius=1.0, rotation=rotation)
         placement = ObjectPlacement(pose=pose, surface=LOOK)
         layout = Layout(shell=(), objects=(placement,), emitters=())
@@ -235,30 +228,27 @@ def _corners(piece: ScenePiece) -> NDArray[np.float64]:
     return piece.mesh.positions[piece.mesh.faces].astype(np.float64)
 
 
-def _edges(piece: ScenePiece) -> dict[frozenset[bytes], int]:
-    """How many faces each edge has, by the bytes of its ends: as a renderer meets them."""
-    found: dict[frozenset[bytes], int] = {}
-    positions = piece.mesh.positions + np.float32(0)  # one zero, not two
-    for face in piece.mesh.faces:
-        ends = [positions[vertex].tobytes() for vertex in face]
-        for pair in zip(ends, ends[1:] + ends[:1], strict=True):
-            found[frozenset(pair)] = found.get(frozenset(pair), 0) + 1
-    return found
+def _faces_of_edges(piece: ScenePiece) -> list[int]:
+    """How many faces each edge has, by the places of its ends: as a renderer meets them."""
+    corners = piece.mesh.positions[piece.mesh.faces].reshape(-1, 3)
+    rows = np.unique(corners, axis=0, return_inverse=True)[1].reshape(-1, 3)
+    ends = np.sort(np.stack([rows, np.roll(rows, -1, axis=1)], axis=-1).reshape(-1, 2), axis=1)
+    return np.unique(ends, axis=0, return_counts=True)[1].tolist()
 
 
 def test_the_number_is_met_to_within_one_edge_and_what_was_closed_stays_closed() -> None:
     """No vertex in the middle of a neighbour's edge: through such a seam light may leak."""
     for name, smooth, count in itertools.product(ALL, (False, True), (13, 200, 701)):
         piece = _piece(ALL[name], smooth=smooth)
-        had, edges = len(piece.mesh.faces), set(_edges(piece).values())
+        had, edges = len(piece.mesh.faces), set(_faces_of_edges(piece))
         after, where = subdivide(piece, count), (name, smooth, count)
         if count <= had:
             assert len(after.mesh.faces) == had, where
         else:
             assert count - max(edges) < len(after.mesh.faces) <= count, where
-        assert name not in CLOSED or edges == set(_edges(after).values()) == {2}, where
+        assert name not in CLOSED or edges == set(_faces_of_edges(after)) == {2}, where
     odd = _piece(ALL["odd"], smooth=False)  # an edge of three faces is halved in all three
-    before, halved = (list(_edges(piece).values()) for piece in (odd, subdivide(odd, 900)))
+    before, halved = map(_faces_of_edges, (odd, subdivide(odd, 900)))
     assert before.count(3) == 1 and halved.count(3) >= 8 and set(halved) == {1, 2, 3}
 
 

@@ -42,6 +42,7 @@ from storage.records.scene import ARRAY_FIELDS, Scene
 from storage.records.scene_facts import lights, surfaces
 from storage.seeds import SceneKey
 from storage.settings.overrides import apply_overrides
+from tests.pipeline.renders.scene_kit import join, light, material, textured_floor
 from tests.pipeline.scenes.small_pool import (
     TOUCH,
     first_scene,
@@ -121,16 +122,11 @@ def test_light_is_seen_from_its_side_past_emitters_and_not_through_roofs() -> No
     assert problem == "sees too little of the objects"
     assert visibility_problem(below, ViewLaws(), has_objects=False) == "sees the back of the shell"
     assert visibility_problem(below, ViewLaws(max_shell_back=1.0), has_objects=False) is not None
-    scene = tiny_scene()
-    roof = scene.vertex_positions[:4] + np.array([0, 0, 1.5], np.float32)
-    covered = dataclasses.replace(
-        scene,
-        vertex_positions=np.concatenate([scene.vertex_positions, roof]),
-        vertex_normals=np.concatenate([scene.vertex_normals, scene.vertex_normals[:4]]),
-        faces=np.concatenate([scene.faces, scene.faces[:2] + np.uint32(7)]),
-        material_index=np.concatenate([scene.material_index, scene.material_index[:2]]),
-        object_index=np.concatenate([scene.object_index, scene.object_index[:2]]),
-    )
+    floor = textured_floor(material(diffuse=0.5))
+    roof = dataclasses.replace(floor, triangles=floor.triangles + np.array([0, 0, 1.5]))
+    lamp = light([[-0.1, -0.1, 2], [0, 0.1, 2], [0.1, -0.1, 2]], 100.0)
+    assert Visibility(join([floor, lamp])).facts(_camera([0, 0, 1.0]), 30.0, 16).lit == 1.0
+    covered = join([floor, roof, lamp])
     assert Visibility(covered).facts(_camera([0, 0, 1.0]), 30.0, 16).lit == 0.0
     # Below the roof the light of an even sky still comes from the sides, and of black none does.
     for around, lit in ((constant(1.0), 1.0), (constant(0.0), 0.0)):

@@ -22,7 +22,6 @@ from storage.settings.described import settings_record
 from tests.for_each import for_each
 from tests.pipeline.assets import meshes_by_hand as meshes
 from tests.pipeline.assets.source_materials import textured_kit as kit
-from tests.pipeline.foreign.gltf.gltf_writer import GltfWriter
 
 TOLERANCE = 0.02
 """JPEG and a palette of few colours are off by a few of 255 steps, near white a hundredth each."""
@@ -261,16 +260,11 @@ def _picture(values: ArrayLike | None = None) -> bytes:
 def _glb(
     path: Path, uv: ArrayLike = kit.UV_UP, tangent: ArrayLike | None = None, **info: Any
 ) -> Path:
-    tree, buffer = kit.textured_tree(_picture(), uv)
+    tangents = None if tangent is None else np.tile(np.asarray(tangent), (4, 1))
+    tree, buffer = kit.textured_tree(_picture(), uv, tangents=tangents)
     material = tree["materials"][0]
     material["normalTexture"] = {"index": 0, **info}
     material["pbrMetallicRoughness"] = {"baseColorFactor": [0.5, 0.5, 0.5, 1]}
-    if tangent is not None:
-        file = GltfWriter(tree=tree, data=bytearray(buffer))
-        attributes = tree["meshes"][0]["primitives"][0]["attributes"]
-        attributes["TANGENT"] = file.accessor(np.tile(np.asarray(tangent), (4, 1)), "f4")
-        buffer = bytes(file.data)
-        tree["buffers"][0]["byteLength"] = len(buffer)
     return meshes.write_glb(path, tree, buffer)
 
 

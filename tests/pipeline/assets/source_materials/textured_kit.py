@@ -54,7 +54,10 @@ def picture_bytes(values: NDArray, kind: str = "PNG", mode: str | None = None) -
 
 
 def textured_tree(
-    picture: bytes | str, uv_up: ArrayLike | None = UV_UP, mesh: TriangleMesh = SQUARE
+    picture: bytes | str,
+    uv_up: ArrayLike | None = UV_UP,
+    mesh: TriangleMesh = SQUARE,
+    tangents: ArrayLike | None = None,
 ) -> tuple[dict[str, Any], bytes]:
     """Return a glTF of a mesh with a picture, embedded or by its URI."""
     tree, buffer = gltf_tree(mesh)
@@ -68,6 +71,8 @@ def textured_tree(
     if uv_up is not None:
         uv = np.asarray(uv_up, np.float64) * [1, -1] + [0, 1]  # glTF has v down
         primitive["attributes"]["TEXCOORD_0"] = file.accessor(uv, "f4")
+    if tangents is not None:
+        primitive["attributes"]["TANGENT"] = file.accessor(np.asarray(tangents), "f4")
     tree["images"] = [{"uri": picture}]
     if isinstance(picture, bytes):
         tree["images"] = [{"bufferView": file.view(picture), "mimeType": "image/png"}]
