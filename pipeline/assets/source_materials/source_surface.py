@@ -34,52 +34,6 @@ class FacePoints(NamedTuple):
     weights: NDArray[np.float64]
 
 
-class SurfaceLookup:
-    """Finds points of one source, by search trees that are built once."""
-
-    def __init__(self, mesh: TriangleMesh) -> None:
-        """Build the trees of a clean, outward oriented mesh of the unit box."""
-        self._mesh = mesh
-        self._normals = unit_normals(mesh)
-        self._tree = igl.AABB()
-        self._tree.init(mesh.positions, mesh.faces)
-        self._triangles = Triangles(mesh.corners.astype(np.float32), np.arange(len(mesh.faces)))
-
-    def find(
-        self, points: NDArray[np.float64], normals: NDArray[np.float64], reach: float
-    ) -> tuple[FacePoints, NDArray[np.bool_]]:
-        """Return the source points that points [N, 3] with unit normals [N, 3] show.
-
-        The second result is True [N] where no surface nearby faced the same way.
-
-        Args:
-            points: points on or near the source.
-            normals: the level's normals there.
-            reach: largest distance to a surface, in the unit box.
-        """
-        squared, closest, nearest = self._tree.squared_distance(
-            self._mesh.positions, self._mesh.faces, points
-        )
-        faces = np.asarray(closest, np.int64).ravel()
-        locations = FacePoints(faces, barycentric(self._mesh.corners[faces], np.asarray(nearest)))
-        facing = (self._normals[faces] * normals).sum(axis=1) > 0
-        is_missed = ~(facing & (np.sqrt(np.asarray(squared).ravel()) <= reach))
-        best = np.full(len(points), np.inf)
-        for sign in (1.0, -1.0):
-            origins = (points - _BEHIND * sign * normals).astype(np.float32)
-            hits = self._triangles.intersect(origins, (sign * normals).astype(np.float32))
-            face = np.maximum(hits.triangle, 0)
-            distance = np.abs(hits.distance_m.astype(np.float64) - _BEHIND)
-            facing = (self._normals[face] * normals).sum(axis=1) > 0
-            taken = (hits.triangle != MISS) & facing & (distance <= reach) & (distance < best)
-            u, v = hits.uv.astype(np.float64)[:, taken]
-            best[taken] = distance[taken]
-            locations.faces[taken] = face[taken]
-            locations.weights[taken] = np.stack([1 - u - v, u, v], axis=1)
-            is_missed[taken] = False
-        return locations, is_missed
-
-
 def barycentric(corners: NDArray[np.float64], points: NDArray[np.float64]) -> NDArray[np.float64]:
     """Return barycentric coordinates [N, 3] of points [N, 3], clipped to triangles [N, 3, 3]."""
     first = corners[:, 1] - corners[:, 0]
@@ -117,9 +71,52 @@ class SourceSurface:
     """[F, 3] corner of that face for each corner."""
 
     @cached_property
-    def lookup(self) -> SurfaceLookup:
-        """Lookup of the points of the clean mesh that points of a level show."""
-        return SurfaceLookup(self.mesh)
+    def _tree(self) -> igl.AABB:
+        tree = igl.AABB()
+        tree.init(self.mesh.positions, self.mesh.faces)
+        return tree
+
+    @cached_property
+    def _triangles(self) -> Triangles:
+        return Triangles(self.mesh.corners.astype(np.float32), np.arange(len(self.mesh.faces)))
+
+    @cached_property
+    def _normals(self) -> NDArray[np.float64]:
+        return unit_normals(self.mesh)
+
+    def find(
+        self, points: NDArray[np.float64], normals: NDArray[np.float64], reach: float
+    ) -> tuple[FacePoints, NDArray[np.bool_]]:
+        """Return the source points that points [N, 3] with unit normals [N, 3] show.
+
+        The second result is True [N] where no surface nearby faced the same way.
+
+        Args:
+            points: points of a level, on or near the source.
+            normals: the level's normals there.
+            reach: largest distance to a surface, in the unit box.
+        """
+        squared, closest, nearest = self._tree.squared_distance(
+            self.mesh.positions, self.mesh.faces, points
+        )
+        faces = np.asarray(closest, np.int64).ravel()
+        locations = FacePoints(faces, barycentric(self.mesh.corners[faces], np.asarray(nearest)))
+        facing = (self._normals[faces] * normals).sum(axis=1) > 0
+        is_missed = ~(facing & (np.sqrt(np.asarray(squared).ravel()) <= reach))
+        best = np.full(len(points), np.inf)
+        for sign in (1.0, -1.0):
+            origins = (points - _BEHIND * sign * normals).astype(np.float32)
+            hits = self._triangles.intersect(origins, (sign * normals).astype(np.float32))
+            face = np.maximum(hits.triangle, 0)
+            distance = np.abs(hits.distance_m.astype(np.float64) - _BEHIND)
+            facing = (self._normals[face] * normals).sum(axis=1) > 0
+            taken = (hits.triangle != MISS) & facing & (distance <= reach) & (distance < best)
+            u, v = hits.uv.astype(np.float64)[:, taken]
+            best[taken] = distance[taken]
+            locations.faces[taken] = face[taken]
+            locations.weights[taken] = np.stack([1 - u - v, u, v], axis=1)
+            is_missed[taken] = False
+        return locations, is_missed
 
     def columns(self, at: FacePoints, cell: float) -> NDArray[np.float64]:
         """Return diffuse rgb, specular rgb and roughness [N, 7] at points of clean faces.
