@@ -16,6 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pipeline.assets.quality.measure import (
+    Surface,
     half_edges,
     level_mesh,
     round_digits,
@@ -365,7 +366,7 @@ def add_source_materials(
     levels: tuple[Level, ...],
     missed: Mapping[int, tuple[str, str]],
     source: SourceFile,
-    mesh: TriangleMesh,
+    clean: Surface,
     settings: AssetSettings,
 ) -> tuple[tuple[Level, ...], dict[int, tuple[str, str]], OwnMaterials | None]:
     """Return levels with skins, reasons of missing levels, and the state of the materials.
@@ -373,7 +374,7 @@ def add_source_materials(
     Args:
         levels: levels without skins.
         missed: reason and message by budget.
-        source: the object's file; `mesh` is its clean, oriented mesh.
+        source: the object's file; `clean` is its clean, oriented mesh.
         settings: `own_materials` keeps materials, and says what happens where they are lost.
 
     Raises:
@@ -385,7 +386,7 @@ def add_source_materials(
         return levels, reasons, None
     refuse = settings.own_materials.if_lost == "reject"
     try:
-        surface, materials = read_source_surface(source, mesh, settings.own_materials)
+        surface, materials = read_source_surface(source, clean, settings.own_materials)
     except Rejected as lost:
         if refuse:
             raise
@@ -467,7 +468,7 @@ def _require_near(quality: SkinQuality, budget: int, settings: OwnMaterialSettin
 
 
 def read_source_surface(
-    source: SourceFile, mesh: TriangleMesh, settings: OwnMaterialSettings
+    source: SourceFile, clean: Surface, settings: OwnMaterialSettings
 ) -> tuple[SourceSurface, OwnMaterials]:
     """Return the clean, oriented mesh of a source with its materials, and the lost ones.
 
@@ -481,7 +482,7 @@ def read_source_surface(
     source.notes.extend(pictures.notes)
     lost = {word for material in parts.materials for word in material.lost}
     lost -= {"emission"} if settings.emission else set()
-    return match_source_surface(mesh, parts), OwnMaterials(lost=tuple(sorted(lost)))
+    return match_source_surface(clean, parts), OwnMaterials(lost=tuple(sorted(lost)))
 
 
 def _parts(source: SourceFile, pictures: Pictures, settings: OwnMaterialSettings) -> TexturedMesh:

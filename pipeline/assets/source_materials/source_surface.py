@@ -10,12 +10,11 @@ from dataclasses import dataclass
 from functools import cached_property
 from typing import NamedTuple
 
-import igl
 import numpy as np
 from numpy.typing import NDArray
 
 from pipeline.assets.cleaning.clean import cell_keys, normalize, start_at_lowest
-from pipeline.assets.quality.measure import unit_normals
+from pipeline.assets.quality.measure import Surface
 from pipeline.foreign.material import Slot, SourceMaterial, TexturedMesh, source_columns
 from pipeline.foreign.mesh import TriangleMesh
 from storage.errors import Rejected
@@ -61,8 +60,8 @@ _LEAST_LENGTH = 0.1
 class SourceSurface:
     """The clean, outward oriented mesh of a source, with its materials."""
 
-    mesh: TriangleMesh
-    """Clean mesh in the unit box."""
+    surface: Surface
+    """Clean mesh in the unit box, with its search tree."""
     parts: TexturedMesh
     """Faces of the file, with texture coordinates and materials."""
     source_face: NDArray[np.int64]
@@ -70,19 +69,14 @@ class SourceSurface:
     source_corner: NDArray[np.int64]
     """[F, 3] corner of that face for each corner."""
 
-    @cached_property
-    def _tree(self) -> igl.AABB:
-        tree = igl.AABB()
-        tree.init(self.mesh.positions, self.mesh.faces)
-        return tree
+    @property
+    def mesh(self) -> TriangleMesh:
+        """Return the clean mesh in the unit box."""
+        return self.surface.mesh
 
     @cached_property
     def _triangles(self) -> Triangles:
         return Triangles(self.mesh.corners.astype(np.float32), np.arange(len(self.mesh.faces)))
-
-    @cached_property
-    def _normals(self) -> NDArray[np.float64]:
-        return unit_normals(self.mesh)
 
     def find(
         self, points: NDArray[np.float64], normals: NDArray[np.float64], reach: float
@@ -96,20 +90,17 @@ class SourceSurface:
             normals: the level's normals there.
             reach: largest distance to a surface, in the unit box.
         """
-        squared, closest, nearest = self._tree.squared_distance(
-            self.mesh.positions, self.mesh.faces, points
-        )
-        faces = np.asarray(closest, np.int64).ravel()
-        locations = FacePoints(faces, barycentric(self.mesh.corners[faces], np.asarray(nearest)))
-        facing = (self._normals[faces] * normals).sum(axis=1) > 0
-        is_missed = ~(facing & (np.sqrt(np.asarray(squared).ravel()) <= reach))
+        squared, faces, nearest = self.surface.find_nearest(points)
+        locations = FacePoints(faces, barycentric(self.mesh.corners[faces], nearest))
+        facing = (self.surface.normals[faces] * normals).sum(axis=1) > 0
+        is_missed = ~(facing & (np.sqrt(squared) <= reach))
         best = np.full(len(points), np.inf)
         for sign in (1.0, -1.0):
             origins = (points - _BEHIND * sign * normals).astype(np.float32)
             hits = self._triangles.intersect(origins, (sign * normals).astype(np.float32))
             face = np.maximum(hits.triangle, 0)
             distance = np.abs(hits.distance_m.astype(np.float64) - _BEHIND)
-            facing = (self._normals[face] * normals).sum(axis=1) > 0
+            facing = (self.surface.normals[face] * normals).sum(axis=1) > 0
             taken = (hits.triangle != MISS) & facing & (distance <= reach) & (distance < best)
             u, v = hits.uv.astype(np.float64)[:, taken]
             best[taken] = distance[taken]
@@ -269,13 +260,14 @@ def _rotate(
     return vectors - ahead / halves * (start + end)
 
 
-def match_source_surface(mesh: TriangleMesh, parts: TexturedMesh) -> SourceSurface:
+def match_source_surface(surface: Surface, parts: TexturedMesh) -> SourceSurface:
     """Match the faces of a clean, oriented mesh to those of its file.
 
     Raises:
         Rejected: materials_unreadable where many faces do not match, no_texture_coordinates or
             texture_coordinates_not_finite where a textured face has none.
     """
+    mesh = surface.mesh
     raw = normalize(parts.mesh)
     known = cell_keys(mesh.positions)
     order = np.argsort(known)
@@ -302,7 +294,7 @@ def match_source_surface(mesh: TriangleMesh, parts: TexturedMesh) -> SourceSurfa
     source_corner[missing] = np.arange(3)
     _require_coordinates(parts, source_face)
     return SourceSurface(
-        mesh=mesh, parts=parts, source_face=source_face, source_corner=source_corner
+        surface=surface, parts=parts, source_face=source_face, source_corner=source_corner
     )
 
 

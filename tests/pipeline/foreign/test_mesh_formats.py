@@ -15,6 +15,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from pxr import Gf, Usd, UsdGeom, UsdLux, UsdShade
 
+from pipeline.assets.quality.measure import Surface
 from pipeline.assets.settings import OwnMaterialSettings
 from pipeline.assets.source_materials.skin import _parts
 from pipeline.assets.source_materials.source_surface import FacePoints, SourceSurface
@@ -391,7 +392,7 @@ def assert_same(path: Path) -> None:
     corners = scene.vertex_positions[scene.faces[:count]]
     np.testing.assert_allclose(corners, parts.mesh.corners, atol=1e-6)
     surface = SourceSurface(
-        mesh=parts.mesh,
+        surface=Surface(parts.mesh, np.zeros((1, 3))),
         parts=parts,
         source_face=np.arange(count),
         source_corner=np.tile(np.arange(3), (count, 1)),

@@ -12,8 +12,8 @@ from pxr import Gf, Sdf, Usd, UsdGeom, UsdLux, UsdShade, UsdSkel, Vt
 
 from pipeline.exchange.usd.read_usd import read_usd
 from pipeline.foreign.material import source_columns
-from pipeline.foreign.source_file import read_source
 from pipeline.foreign.picture import Pictures
+from pipeline.foreign.source_file import read_source
 from pipeline.foreign.usd.materials import usd_textured_mesh
 from storage.errors import Rejected, TrilightError
 from storage.records.material import DIFFUSE, EMISSION, ROUGHNESS
