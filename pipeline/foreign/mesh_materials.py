@@ -32,13 +32,13 @@ from pipeline.foreign.material_files import (
 )
 from pipeline.foreign.mesh import FileMesh
 from pipeline.foreign.numbers import Malformed, parse_number
-from pipeline.foreign.picture import Picture, Pictures
+from pipeline.foreign.picture import FilePictures, Picture
 from pipeline.foreign.source_file import SourceFile
 from storage.errors import Rejected
 
 
 def read_textured_mesh(
-    source: SourceFile, pictures: Pictures, *, emission: bool, normals: bool = False
+    source: SourceFile, pictures: FilePictures, *, emission: bool, normals: bool = False
 ) -> TexturedMesh:
     """Return the triangles of an OBJ, OFF, PLY or STL with their materials; colors are sRGB.
 
@@ -108,7 +108,12 @@ _RGB_OF_XYZ = np.array(
 
 
 def _obj_materials(
-    names: Sequence[str], files: MaterialFiles, pictures: Pictures, *, emission: bool, normals: bool
+    names: Sequence[str],
+    files: MaterialFiles,
+    pictures: FilePictures,
+    *,
+    emission: bool,
+    normals: bool,
 ) -> tuple[list[SourceMaterial], list[str]]:
     """Return the materials of these names, and sentences on statements that are not read."""
     if not names or not files.libraries:
@@ -150,7 +155,7 @@ class _Reader:
     """Converts the materials of one MTL."""
 
     files: MaterialFiles
-    pictures: Pictures
+    pictures: FilePictures
 
     def material(self, fields: Fields) -> SourceMaterial:
         base = self._slot(fields.get("map_kd"), is_srgb=True)

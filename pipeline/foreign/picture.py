@@ -36,7 +36,7 @@ UNREADABLE_PICTURE = (
 
 MAX_BYTES = 256 << 20
 MAX_PIXELS = 64 << 20
-"""Maximum size of one picture of a scene; those of an object have a common one (`Pictures`)."""
+"""Maximum size of one picture of a scene; those of an object have a common one (`FilePictures`)."""
 
 _STRIP = 256  # rows; an even number, since pairs of rows are averaged
 _MOST = 65504.0
@@ -68,7 +68,7 @@ def read_linear_picture(
     return None
 
 
-class Pictures:
+class FilePictures:
     """The pictures of one object or of one scene, each decoded once.
 
     Those of an object have a common bound of pixels, and one that is not read refuses the object.

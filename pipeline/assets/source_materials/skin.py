@@ -35,7 +35,7 @@ from pipeline.foreign.gltf.primitives import gltf_textured_mesh
 from pipeline.foreign.material import TexturedMesh
 from pipeline.foreign.mesh import TriangleMesh
 from pipeline.foreign.mesh_materials import read_textured_mesh
-from pipeline.foreign.picture import Pictures, spread_points
+from pipeline.foreign.picture import FilePictures, spread_points
 from pipeline.foreign.source_file import SourceFile
 from storage.conventions import linear_from_srgb8, srgb8
 from storage.errors import Rejected, TrilightError
@@ -477,7 +477,7 @@ def read_source_surface(
             texture_too_large, texture_unreadable, no_texture_coordinates or
             texture_coordinates_not_finite.
     """
-    pictures = Pictures(settings.max_pixels)
+    pictures = FilePictures(settings.max_pixels)
     parts = _parts(source, pictures, settings)
     source.notes.extend(pictures.notes)
     lost = {word for material in parts.materials for word in material.lost}
@@ -485,7 +485,9 @@ def read_source_surface(
     return match_source_surface(clean, parts), OwnMaterials(lost=tuple(sorted(lost)))
 
 
-def _parts(source: SourceFile, pictures: Pictures, settings: OwnMaterialSettings) -> TexturedMesh:
+def _parts(
+    source: SourceFile, pictures: FilePictures, settings: OwnMaterialSettings
+) -> TexturedMesh:
     emission = settings.emission
     normals = settings.normal_maps
     if source.usd is not None:  # whose normal maps its limits have chosen

@@ -38,8 +38,8 @@ from pipeline.foreign.numbers import read_numbers
 from pipeline.foreign.picture import (
     MAX_BYTES,
     MAX_PIXELS,
+    FilePictures,
     Picture,
-    Pictures,
     decode_image,
     read_linear_picture,
 )
@@ -139,7 +139,7 @@ class StageReader:
         self._extras: list[tuple[str, dict[str, Any], dict[str, Texture] | None]] = []
         self._looks = MeshMaterials(
             read_stage_materials(meshes, _MAX_PICTURE_BYTES, self._read),
-            Pictures(MAX_PIXELS, lost=self._lost),
+            FilePictures(MAX_PIXELS, lost=self._lost),
             emission=True,
         )
         self._extras.append(("", {}, None))

@@ -16,7 +16,7 @@ from pipeline.foreign.gltf.document import GltfDocument
 from pipeline.foreign.gltf.nodes import entry, extension
 from pipeline.foreign.material import MOST_UV_SETS, RGB, Slot, SourceMaterial, with_normal_map
 from pipeline.foreign.numbers import Malformed, read_count, read_number, read_numbers
-from pipeline.foreign.picture import Picture, Pictures, Wrap
+from pipeline.foreign.picture import FilePictures, Picture, Wrap
 from storage.errors import Rejected
 
 DEFAULT = SourceMaterial(metallic=1.0)
@@ -35,24 +35,13 @@ class GltfMaterials:
     """
 
     document: GltfDocument
-    pictures: Pictures
+    pictures: FilePictures
     _: KW_ONLY
     emission: bool = False
     """True to read emission, too."""
     normals: bool = False
     """True to read normal maps, too."""
     _known: dict[int, SourceMaterial] = field(default_factory=dict, init=False)
-
-    def used_materials(self) -> dict[int, SourceMaterial]:
-        """Return the materials that meshes use, by index.
-
-        Raises:
-            Rejected: as reading a picture.
-        """
-        meshes = self.document.tree.get("meshes", ())
-        primitives = [row for mesh in meshes for row in mesh["primitives"]]
-        named = {row["material"] for row in primitives if "material" in row}
-        return {number: self.material(number) for number in sorted(named)}
 
     def material(self, number: int) -> SourceMaterial:
         """Return one material; raises Rejected as reading a picture."""

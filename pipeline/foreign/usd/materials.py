@@ -20,7 +20,7 @@ from pipeline.foreign.material import (
     TexturedMesh,
     with_normal_map,
 )
-from pipeline.foreign.picture import Picture, Pictures, has_colors
+from pipeline.foreign.picture import FilePictures, Picture, has_colors
 from pipeline.foreign.usd.object_source import StageMaterials, UsdSource
 from pipeline.foreign.usd.polygons import CutMesh
 from pipeline.foreign.usd.shaders import (
@@ -51,7 +51,7 @@ _UNBOUND = 0.18
 
 
 def usd_textured_mesh(
-    source: UsdSource, pictures: Pictures, *, emission: bool = False
+    source: UsdSource, pictures: FilePictures, *, emission: bool = False
 ) -> TexturedMesh:
     """Return the triangles of a USD file with their materials; emission only on request.
 
@@ -86,7 +86,7 @@ class MeshMaterials:
 
     stage: StageMaterials
     """Materials as the stage states them."""
-    pictures: Pictures
+    pictures: FilePictures
     _: KW_ONLY
     emission: bool = False
     """True to read emission, too."""
@@ -139,7 +139,10 @@ class MeshMaterials:
         """Replace the rows [T] and tints [T, 3, 3] of triangles of a material with primvars."""
         stated = self.stage.materials[row]
         mask = rows == row
-        values = {name: stated.read_values(name, cut) for name in stated.primvars}
+        values = {name: read_colors(cut, primvar) for name, primvar in stated.primvars.items()}
+        for name, primvar in stated.primvars.items():
+            if values[name] is None:
+                cut.placed.note(f"no primvar {primvar!r:.60}; its fallback taken")
         base = values.pop("diffuseColor", None)
         if base is not None:
             tints[mask] = np.clip(base, 0, 1)[mask]

@@ -27,7 +27,7 @@ from pipeline.foreign.material import LEAST_ROUGHNESS, SourceMaterial
 from pipeline.foreign.mesh import FileMesh
 from pipeline.foreign.mesh_materials import read_textured_mesh
 from pipeline.foreign.numbers import FINITE
-from pipeline.foreign.picture import Pictures, read_linear_picture
+from pipeline.foreign.picture import FilePictures, read_linear_picture
 from pipeline.foreign.polygons import triangulate
 from pipeline.foreign.source_file import SourceFile, load_mesh, read_source
 from storage.conventions import linear_from_srgb8
@@ -282,7 +282,7 @@ def test_a_missing_material_and_cut_values_are_named_and_cost_nothing_else(tmp_p
     files = {"m.mtl": b"newmtl m\nmap_Kd w.exr\n", "w.exr": wide}
     path = placed(tmp_path, b"mtllib m.mtl\nusemtl m\nf 1/1 2/2 3/3\nusemtl gone\n", files)
     read = read_source(path, ReadLimits(with_materials=True), tmp_path)
-    pictures = Pictures(1 << 20)
+    pictures = FilePictures(1 << 20)
     parts = read_textured_mesh(read, pictures, emission=False)
     bases = [parts.materials[row].base for row in parts.material]
     assert sorted(base is None for base in bases) == [False, True, True]
@@ -335,7 +335,7 @@ def test_shades_of_public_reports(shared: Path) -> None:
             path = shared / "cases" / name
             root = shared / "cases" / name.partition("/")[0] / "in"
             read = read_source(path, ReadLimits(with_materials=True), root)
-            parts = read_textured_mesh(read, Pictures(1 << 20), emission=False)
+            parts = read_textured_mesh(read, FilePictures(1 << 20), emission=False)
             area = np.linalg.norm(parts.mesh.double_area_vectors, axis=1) / 2
             found = Counter[tuple[float, ...]]()
             for face, share in enumerate(area / area.sum()):
@@ -386,7 +386,7 @@ WIDE = kit.UV_UP * [2.25, 1] + [0.75, 0]
 
 def assert_same(path: Path) -> None:
     source = read_source(path, kit.KEEP.read_limits)
-    parts = _parts(source, Pictures(1 << 20), OwnMaterialSettings())
+    parts = _parts(source, FilePictures(1 << 20), OwnMaterialSettings())
     scene = load_source(scene_source(str(path))).scene
     count = len(parts.mesh.faces)
     corners = scene.vertex_positions[scene.faces[:count]]
@@ -488,7 +488,9 @@ SMALL_PICTURE = kit.picture_bytes(kit.CORNERS)
 def look_at_parts(path: Path) -> str:
     """Read all of a file and return what is not read; what became of its numbers is finite."""
     source = read_source(path, kit.KEEP.read_limits)
-    for material in _parts(source, Pictures(1 << 20), OwnMaterialSettings(emission=True)).materials:
+    for material in _parts(
+        source, FilePictures(1 << 20), OwnMaterialSettings(emission=True)
+    ).materials:
         colors = (*material.base_rgb, *material.specular_rgb, *material.emission_rgb)
         numbers = (material.metallic, material.roughness, material.f0, material.specular_strength)
         moves = [[*slot.uv_matrix.flat, *slot.uv_offset] for slot in material.slots]
