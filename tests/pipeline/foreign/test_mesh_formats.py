@@ -488,9 +488,8 @@ SMALL_PICTURE = kit.picture_bytes(kit.CORNERS)
 def look_at_parts(path: Path) -> str:
     """Read all of a file and return what is not read; what became of its numbers is finite."""
     source = read_source(path, kit.KEEP.read_limits)
-    for material in _parts(
-        source, FilePictures(1 << 20), OwnMaterialSettings(emission=True)
-    ).materials:
+    glowing = OwnMaterialSettings(emission=True)
+    for material in _parts(source, FilePictures(1 << 20), glowing).materials:
         colors = (*material.base_rgb, *material.specular_rgb, *material.emission_rgb)
         numbers = (material.metallic, material.roughness, material.f0, material.specular_strength)
         moves = [[*slot.uv_matrix.flat, *slot.uv_offset] for slot in material.slots]
