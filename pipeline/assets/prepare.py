@@ -57,7 +57,9 @@ def prepare_asset(
     shared = faces_of_edges(mesh)
     safe = safe_method(base.start, method)
     levels, missed = _levels(measured, base, settings, safe)
-    levels, missed, materials = add_source_materials(levels, missed, source, mesh, settings)
+    levels, missed, materials = add_source_materials(
+        levels, missed, source, measured.surface, settings
+    )
     return AssetAttempt(
         method=safe,
         asset=Asset(

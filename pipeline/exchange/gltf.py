@@ -48,7 +48,7 @@ from pipeline.foreign.gltf.nodes import PlacedNode, entry, extension, placed_nod
 from pipeline.foreign.gltf.primitives import PlacedPrimitive, placed_primitives
 from pipeline.foreign.limits import ReadLimits
 from pipeline.foreign.numbers import read_number, read_numbers
-from pipeline.foreign.picture import MAX_PIXELS, decode_image
+from pipeline.foreign.picture import MAX_PIXELS, FilePictures
 from pipeline.foreign.source_file import read_source
 from pipeline.objects.licences import USER_PROVIDED
 from storage.atomic import write_atomically
@@ -94,12 +94,8 @@ class _GltfReader:
         self.lost: list[str] = []
         self._attribution = str(document.tree.get("asset", {}).get("copyright", ""))[:1000]
         self._converter = PartConverter(self.lost)
-        self._materials = GltfMaterials(
-            document,
-            lambda data, name: decode_image(data, name, MAX_PIXELS, self.lost, of_scene=True),
-            emission=True,
-            notes=self.lost,
-        )
+        pictures = FilePictures(MAX_PIXELS, lost=self.lost)
+        self._materials = GltfMaterials(document, pictures, emission=True)
 
     def scene(self) -> LoadedScene:
         """Build the scene of the file."""

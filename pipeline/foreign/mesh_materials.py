@@ -9,9 +9,10 @@ that there is no highlight.
 
 import dataclasses
 from collections.abc import Iterator, Mapping, Sequence, Set
+from dataclasses import dataclass
+from functools import partial
 
 import numpy as np
-from numpy.typing import NDArray
 
 from pipeline.foreign.material import (
     RGB,
@@ -31,13 +32,13 @@ from pipeline.foreign.material_files import (
 )
 from pipeline.foreign.mesh import FileMesh
 from pipeline.foreign.numbers import Malformed, parse_number
-from pipeline.foreign.picture import Decode, Picture
+from pipeline.foreign.picture import FilePictures, Picture
 from pipeline.foreign.source_file import SourceFile
 from storage.errors import Rejected
 
 
 def read_textured_mesh(
-    source: SourceFile, decode: Decode, *, emission: bool, normals: bool = False
+    source: SourceFile, pictures: FilePictures, *, emission: bool, normals: bool = False
 ) -> TexturedMesh:
     """Return the triangles of an OBJ, OFF, PLY or STL with their materials; colors are sRGB.
 
@@ -50,17 +51,18 @@ def read_textured_mesh(
     files = source.materials
     names = contents.material_names
     if source.kind == "obj" and (names or contents.color is None):
-        materials, unread = _obj_materials(names, files, decode, emission=emission, normals=normals)
+        materials, unread = _obj_materials(
+            names, files, pictures, emission=emission, normals=normals
+        )
         source.notes.extend(unread)
     elif (
         names
         and contents.uv is not None
         and (contents.color is None or set(names) <= {*files.data})
     ):
-        pictures = [
-            Picture(values=decode(files.require(name), name), is_srgb=True) for name in names
-        ]
-        materials = [SourceMaterial(base=Slot(picture=picture)) for picture in pictures]
+        values = [pictures.decode(name, name, partial(files.require, name)) for name in names]
+        bases = [Slot(picture=Picture(values=each, is_srgb=True)) for each in values]
+        materials = [SourceMaterial(base=base) for base in bases]
     elif contents.color is not None:
         why = "without texture coordinates" if contents.uv is None else "it is not there"
         source.notes.extend(f"picture {name[:60]!r}: {why}" for name in names)
@@ -106,7 +108,12 @@ _RGB_OF_XYZ = np.array(
 
 
 def _obj_materials(
-    names: Sequence[str], files: MaterialFiles, decode: Decode, *, emission: bool, normals: bool
+    names: Sequence[str],
+    files: MaterialFiles,
+    pictures: FilePictures,
+    *,
+    emission: bool,
+    normals: bool,
 ) -> tuple[list[SourceMaterial], list[str]]:
     """Return the materials of these names, and sentences on statements that are not read."""
     if not names or not files.libraries:
@@ -122,7 +129,7 @@ def _obj_materials(
         if absent:
             files.require(absent[0])
         raise Rejected("materials_unreadable", f"no library has the material {names[0]!r:.80}")
-    reader = _Reader(files, decode)
+    reader = _Reader(files, pictures)
     chosen = [known.get(name, {}) for name in names]
     try:
         materials = [reader.material(fields) for fields in chosen]
@@ -143,13 +150,12 @@ def _obj_materials(
     return materials, list(dict.fromkeys(unread))
 
 
+@dataclass(frozen=True, eq=False)
 class _Reader:
-    """Converts the materials of one MTL, decoding each picture once."""
+    """Converts the materials of one MTL."""
 
-    def __init__(self, files: MaterialFiles, decode: Decode) -> None:
-        self._files = files
-        self._decode = decode
-        self._values: dict[str, NDArray] = {}
+    files: MaterialFiles
+    pictures: FilePictures
 
     def material(self, fields: Fields) -> SourceMaterial:
         base = self._slot(fields.get("map_kd"), is_srgb=True)
@@ -199,12 +205,11 @@ class _Reader:
         if text is None:
             return None
         options, name = split_map(text)
-        if name not in self._values:
-            self._values[name] = self._decode(self._files.require(name), name)
+        values = self.pictures.decode(name, name, lambda: self.files.require(name))
         clamp = options.get("-clamp") == ["on"]
         picture = Picture(
-            values=self._values[name],
-            is_srgb=is_srgb and self._values[name].dtype != np.float16,  # floats are linear
+            values=values,
+            is_srgb=is_srgb and values.dtype != np.float16,  # floats are linear
             wrap=("clamp", "clamp") if clamp else ("repeat", "repeat"),
         )
         return Slot(

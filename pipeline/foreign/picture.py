@@ -6,9 +6,9 @@ and roughness is linear, whatever profile or gamma the file names.
 
 import io
 import warnings
-from collections.abc import Callable
+from collections.abc import Callable, Hashable
 from dataclasses import dataclass, field
-from typing import Literal
+from typing import Literal, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -23,8 +23,7 @@ from storage.records.exr import MAGIC
 Wrap = Literal["repeat", "clamp", "mirror", "black"]
 """Wrap modes; `black` is 0 beyond the picture, alpha included."""
 
-Decode = Callable[[bytes, str], NDArray]
-"""Function that returns the values of a picture's bytes; the name is for messages."""
+T = TypeVar("T")
 
 FORMATS = ("PNG", "JPEG", "WEBP", "TGA", "BMP", "TIFF")
 """Formats that are decoded; a file of another one is refused by its content."""
@@ -37,7 +36,7 @@ UNREADABLE_PICTURE = (
 
 MAX_BYTES = 256 << 20
 MAX_PIXELS = 64 << 20
-"""Maximum size of one picture of a scene; those of an object have a common one (`Decoder`)."""
+"""Maximum size of one picture of a scene; those of an object have a common one (`FilePictures`)."""
 
 _STRIP = 256  # rows; an even number, since pairs of rows are averaged
 _MOST = 65504.0
@@ -69,19 +68,44 @@ def read_linear_picture(
     return None
 
 
-class Decoder:
-    """Decodes the pictures of one object within a common bound of pixels."""
+class FilePictures:
+    """The pictures of one object or of one scene, each decoded once.
 
-    def __init__(self, max_pixels: int) -> None:
+    Those of an object have a common bound of pixels, and one that is not read refuses the object.
+    Each of a scene has a bound of its own, and is left out with a note.
+    """
+
+    def __init__(self, max_pixels: int, *, lost: list[str] | None = None) -> None:
+        """Set the bound; `lost` receives the notes on a scene, None is for an object."""
         self._pixels_left = max_pixels
-        self.notes: list[str] = []
+        self._values: dict[Hashable, NDArray] = {}
+        self.of_scene = lost is not None
+        self.notes: list[str] = [] if lost is None else lost
         """Sentences on parts of the pictures that are not read."""
 
-    def __call__(self, data: bytes, name: str) -> NDArray:
-        """Return `decode_image` within the pixels that are left."""
-        values = decode_image(data, name, self._pixels_left, self.notes)
-        self._pixels_left -= values.shape[0] * values.shape[1]
-        return values
+    def decode(self, key: Hashable, name: str, read: Callable[[], bytes]) -> NDArray:
+        """Return `decode_image` of the bytes that `read` returns, once for each `key`."""
+        if key not in self._values:
+            values = decode_image(
+                read(), name, self._pixels_left, self.notes, of_scene=self.of_scene
+            )
+            self._pixels_left -= 0 if self.of_scene else values.shape[0] * values.shape[1]
+            self._values[key] = values
+        return self._values[key]
+
+    def read_or_leave_out(self, where: str, read: Callable[[], T]) -> T | None:
+        """Return what `read` returns; None, with a note, where a scene lacks its picture.
+
+        Raises:
+            Rejected: texture_outside, texture_too_large; of an object, as `read`.
+        """
+        try:
+            return read()
+        except Rejected as why:
+            if not self.of_scene or why.reason in ("texture_outside", "texture_too_large"):
+                raise
+            self.notes.append(f"{where}a texture is left out: {why.message}")
+            return None
 
 
 def decode_image(

@@ -133,20 +133,24 @@ class Surface:
         self.mesh = mesh
         self._points, self.point_faces = sample_surface(mesh, uniform)
         self._uniform = uniform
-        self._normals = unit_normals(mesh)
+        self.normals = unit_normals(mesh)
+        """[F, 3] unit normal of each face."""
         self._tree = igl.AABB()
         self._tree.init(mesh.positions, mesh.faces)
+
+    def find_nearest(self, points: NDArray[np.float64]) -> tuple[NDArray, NDArray, NDArray]:
+        """Return squared distance [N], face [N] and nearest point [N, 3] of points [N, 3]."""
+        squared, faces, nearest = self._tree.squared_distance(
+            self.mesh.positions, self.mesh.faces, points
+        )
+        return np.ravel(squared), np.ravel(faces).astype(np.int64), np.asarray(nearest)
 
     def hausdorff_deviation(self, other: TriangleMesh) -> Deviation:
         """Return the sampled Hausdorff distances to and from `other`, point by point."""
         points = self._points
         squared, nearest, _ = igl.point_mesh_squared_distance(points, other.positions, other.faces)
-        cosine = np.einsum(
-            "ij,ij->i", self._normals[self.point_faces], unit_normals(other)[nearest]
-        )
-        back = self._tree.squared_distance(
-            self.mesh.positions, self.mesh.faces, sample_surface(other, self._uniform)[0]
-        )[0]
+        cosine = np.einsum("ij,ij->i", self.normals[self.point_faces], unit_normals(other)[nearest])
+        back, _, _ = self.find_nearest(sample_surface(other, self._uniform)[0])
         return Deviation(
             to_other=np.sqrt(squared) / self.mesh.diagonal,
             from_other=np.sqrt(back) / self.mesh.diagonal,

@@ -16,6 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pipeline.assets.quality.measure import (
+    Surface,
     half_edges,
     level_mesh,
     round_digits,
@@ -34,7 +35,7 @@ from pipeline.foreign.gltf.primitives import gltf_textured_mesh
 from pipeline.foreign.material import TexturedMesh
 from pipeline.foreign.mesh import TriangleMesh
 from pipeline.foreign.mesh_materials import read_textured_mesh
-from pipeline.foreign.picture import Decode, Decoder, spread_points
+from pipeline.foreign.picture import FilePictures, spread_points
 from pipeline.foreign.source_file import SourceFile
 from storage.conventions import linear_from_srgb8, srgb8
 from storage.errors import Rejected, TrilightError
@@ -215,7 +216,7 @@ def _bake_texels(
     missed = 0
     for first in range(0, len(points), _BLOCK):
         part = slice(first, first + _BLOCK)
-        locations, is_missed = source.lookup.find(points[part], normals[part], reach)
+        locations, is_missed = source.find(points[part], normals[part], reach)
         columns[part, : NORMAL.start] = source.columns(locations, 1 / density)
         if source.has_normal_maps:
             mapped = source.normals(locations, 1 / density, (normals[part], along[part]))
@@ -338,7 +339,7 @@ def level_emission(
     corners = level.corners
     points = np.einsum("pc,fcd->fpd", weights, corners)
     normals = np.repeat(unit_normals(level), len(weights), axis=0)
-    locations, _ = source.lookup.find(points.reshape(-1, 3), normals, reach)
+    locations, _ = source.find(points.reshape(-1, 3), normals, reach)
     cell = float(np.sqrt(np.median(level.areas) / len(weights)))
     seen = source.emission(locations, cell).reshape(len(corners), -1, 3)
     mean = seen.mean(axis=1)
@@ -365,7 +366,7 @@ def add_source_materials(
     levels: tuple[Level, ...],
     missed: Mapping[int, tuple[str, str]],
     source: SourceFile,
-    mesh: TriangleMesh,
+    clean: Surface,
     settings: AssetSettings,
 ) -> tuple[tuple[Level, ...], dict[int, tuple[str, str]], OwnMaterials | None]:
     """Return levels with skins, reasons of missing levels, and the state of the materials.
@@ -373,7 +374,7 @@ def add_source_materials(
     Args:
         levels: levels without skins.
         missed: reason and message by budget.
-        source: the object's file; `mesh` is its clean, oriented mesh.
+        source: the object's file; `clean` is its clean, oriented mesh.
         settings: `own_materials` keeps materials, and says what happens where they are lost.
 
     Raises:
@@ -385,7 +386,7 @@ def add_source_materials(
         return levels, reasons, None
     refuse = settings.own_materials.if_lost == "reject"
     try:
-        surface, materials = read_source_surface(source, mesh, settings.own_materials)
+        surface, materials = read_source_surface(source, clean, settings.own_materials)
     except Rejected as lost:
         if refuse:
             raise
@@ -467,7 +468,7 @@ def _require_near(quality: SkinQuality, budget: int, settings: OwnMaterialSettin
 
 
 def read_source_surface(
-    source: SourceFile, mesh: TriangleMesh, settings: OwnMaterialSettings
+    source: SourceFile, clean: Surface, settings: OwnMaterialSettings
 ) -> tuple[SourceSurface, OwnMaterials]:
     """Return the clean, oriented mesh of a source with its materials, and the lost ones.
 
@@ -476,25 +477,27 @@ def read_source_surface(
             texture_too_large, texture_unreadable, no_texture_coordinates or
             texture_coordinates_not_finite.
     """
-    decode = Decoder(settings.max_pixels)
-    parts = _parts(source, decode, settings)
-    source.notes.extend(decode.notes)
+    pictures = FilePictures(settings.max_pixels)
+    parts = _parts(source, pictures, settings)
+    source.notes.extend(pictures.notes)
     lost = {word for material in parts.materials for word in material.lost}
     lost -= {"emission"} if settings.emission else set()
-    return match_source_surface(mesh, parts), OwnMaterials(lost=tuple(sorted(lost)))
+    return match_source_surface(clean, parts), OwnMaterials(lost=tuple(sorted(lost)))
 
 
-def _parts(source: SourceFile, decode: Decode, settings: OwnMaterialSettings) -> TexturedMesh:
+def _parts(
+    source: SourceFile, pictures: FilePictures, settings: OwnMaterialSettings
+) -> TexturedMesh:
     emission = settings.emission
     normals = settings.normal_maps
     if source.usd is not None:  # whose normal maps its limits have chosen
         from pipeline.foreign.usd.materials import usd_textured_mesh  # slow to load
 
-        return usd_textured_mesh(source.usd, decode, emission=emission)
+        return usd_textured_mesh(source.usd, pictures, emission=emission)
     if source.gltf is not None:
-        materials = GltfMaterials(source.gltf, decode, emission=emission, normals=normals)
+        materials = GltfMaterials(source.gltf, pictures, emission=emission, normals=normals)
         return gltf_textured_mesh(source.gltf, materials)
-    return read_textured_mesh(source, decode, emission=emission, normals=normals)
+    return read_textured_mesh(source, pictures, emission=emission, normals=normals)
 
 
 def _torn_seams(level: TriangleMesh, source: SourceSurface, reach: float, texel: float) -> float:
@@ -512,7 +515,7 @@ def _torn_seams(level: TriangleMesh, source: SourceSurface, reach: float, texel:
     points = ((1 - along) * inner[:, 0] + along * inner[:, 1]).reshape(-1, 3)
     side_positions = []
     for side in sides.T:
-        locations, _ = source.lookup.find(points, np.tile(normal[side], (len(_ALONG), 1)), reach)
+        locations, _ = source.find(points, np.tile(normal[side], (len(_ALONG), 1)), reach)
         corners = source.mesh.corners[locations.faces]
         side_positions.append(np.einsum("nc,ncd->nd", locations.weights, corners))
     gap = np.linalg.norm(side_positions[0] - side_positions[1], axis=1).reshape(len(_ALONG), -1)

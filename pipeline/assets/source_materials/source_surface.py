@@ -10,12 +10,11 @@ from dataclasses import dataclass
 from functools import cached_property
 from typing import NamedTuple
 
-import igl
 import numpy as np
 from numpy.typing import NDArray
 
 from pipeline.assets.cleaning.clean import cell_keys, normalize, start_at_lowest
-from pipeline.assets.quality.measure import unit_normals
+from pipeline.assets.quality.measure import Surface
 from pipeline.foreign.material import Slot, SourceMaterial, TexturedMesh, source_columns
 from pipeline.foreign.mesh import TriangleMesh
 from storage.errors import Rejected
@@ -32,52 +31,6 @@ class FacePoints(NamedTuple):
 
     faces: NDArray[np.int64]
     weights: NDArray[np.float64]
-
-
-class SurfaceLookup:
-    """Finds points of one source, by search trees that are built once."""
-
-    def __init__(self, mesh: TriangleMesh) -> None:
-        """Build the trees of a clean, outward oriented mesh of the unit box."""
-        self._mesh = mesh
-        self._normals = unit_normals(mesh)
-        self._tree = igl.AABB()
-        self._tree.init(mesh.positions, mesh.faces)
-        self._triangles = Triangles(mesh.corners.astype(np.float32), np.arange(len(mesh.faces)))
-
-    def find(
-        self, points: NDArray[np.float64], normals: NDArray[np.float64], reach: float
-    ) -> tuple[FacePoints, NDArray[np.bool_]]:
-        """Return the source points that points [N, 3] with unit normals [N, 3] show.
-
-        The second result is True [N] where no surface nearby faced the same way.
-
-        Args:
-            points: points on or near the source.
-            normals: the level's normals there.
-            reach: largest distance to a surface, in the unit box.
-        """
-        squared, closest, nearest = self._tree.squared_distance(
-            self._mesh.positions, self._mesh.faces, points
-        )
-        faces = np.asarray(closest, np.int64).ravel()
-        locations = FacePoints(faces, barycentric(self._mesh.corners[faces], np.asarray(nearest)))
-        facing = (self._normals[faces] * normals).sum(axis=1) > 0
-        is_missed = ~(facing & (np.sqrt(np.asarray(squared).ravel()) <= reach))
-        best = np.full(len(points), np.inf)
-        for sign in (1.0, -1.0):
-            origins = (points - _BEHIND * sign * normals).astype(np.float32)
-            hits = self._triangles.intersect(origins, (sign * normals).astype(np.float32))
-            face = np.maximum(hits.triangle, 0)
-            distance = np.abs(hits.distance_m.astype(np.float64) - _BEHIND)
-            facing = (self._normals[face] * normals).sum(axis=1) > 0
-            taken = (hits.triangle != MISS) & facing & (distance <= reach) & (distance < best)
-            u, v = hits.uv.astype(np.float64)[:, taken]
-            best[taken] = distance[taken]
-            locations.faces[taken] = face[taken]
-            locations.weights[taken] = np.stack([1 - u - v, u, v], axis=1)
-            is_missed[taken] = False
-        return locations, is_missed
 
 
 def barycentric(corners: NDArray[np.float64], points: NDArray[np.float64]) -> NDArray[np.float64]:
@@ -107,8 +60,8 @@ _LEAST_LENGTH = 0.1
 class SourceSurface:
     """The clean, outward oriented mesh of a source, with its materials."""
 
-    mesh: TriangleMesh
-    """Clean mesh in the unit box."""
+    surface: Surface
+    """Clean mesh in the unit box, with its search tree."""
     parts: TexturedMesh
     """Faces of the file, with texture coordinates and materials."""
     source_face: NDArray[np.int64]
@@ -116,10 +69,45 @@ class SourceSurface:
     source_corner: NDArray[np.int64]
     """[F, 3] corner of that face for each corner."""
 
+    @property
+    def mesh(self) -> TriangleMesh:
+        """Return the clean mesh in the unit box."""
+        return self.surface.mesh
+
     @cached_property
-    def lookup(self) -> SurfaceLookup:
-        """Lookup of the points of the clean mesh that points of a level show."""
-        return SurfaceLookup(self.mesh)
+    def _triangles(self) -> Triangles:
+        return Triangles(self.mesh.corners.astype(np.float32), np.arange(len(self.mesh.faces)))
+
+    def find(
+        self, points: NDArray[np.float64], normals: NDArray[np.float64], reach: float
+    ) -> tuple[FacePoints, NDArray[np.bool_]]:
+        """Return the source points that points [N, 3] with unit normals [N, 3] show.
+
+        The second result is True [N] where no surface nearby faced the same way.
+
+        Args:
+            points: points of a level, on or near the source.
+            normals: the level's normals there.
+            reach: largest distance to a surface, in the unit box.
+        """
+        squared, faces, nearest = self.surface.find_nearest(points)
+        locations = FacePoints(faces, barycentric(self.mesh.corners[faces], nearest))
+        facing = (self.surface.normals[faces] * normals).sum(axis=1) > 0
+        is_missed = ~(facing & (np.sqrt(squared) <= reach))
+        best = np.full(len(points), np.inf)
+        for sign in (1.0, -1.0):
+            origins = (points - _BEHIND * sign * normals).astype(np.float32)
+            hits = self._triangles.intersect(origins, (sign * normals).astype(np.float32))
+            face = np.maximum(hits.triangle, 0)
+            distance = np.abs(hits.distance_m.astype(np.float64) - _BEHIND)
+            facing = (self.surface.normals[face] * normals).sum(axis=1) > 0
+            taken = (hits.triangle != MISS) & facing & (distance <= reach) & (distance < best)
+            u, v = hits.uv.astype(np.float64)[:, taken]
+            best[taken] = distance[taken]
+            locations.faces[taken] = face[taken]
+            locations.weights[taken] = np.stack([1 - u - v, u, v], axis=1)
+            is_missed[taken] = False
+        return locations, is_missed
 
     def columns(self, at: FacePoints, cell: float) -> NDArray[np.float64]:
         """Return diffuse rgb, specular rgb and roughness [N, 7] at points of clean faces.
@@ -272,13 +260,14 @@ def _rotate(
     return vectors - ahead / halves * (start + end)
 
 
-def match_source_surface(mesh: TriangleMesh, parts: TexturedMesh) -> SourceSurface:
+def match_source_surface(surface: Surface, parts: TexturedMesh) -> SourceSurface:
     """Match the faces of a clean, oriented mesh to those of its file.
 
     Raises:
         Rejected: materials_unreadable where many faces do not match, no_texture_coordinates or
             texture_coordinates_not_finite where a textured face has none.
     """
+    mesh = surface.mesh
     raw = normalize(parts.mesh)
     known = cell_keys(mesh.positions)
     order = np.argsort(known)
@@ -305,7 +294,7 @@ def match_source_surface(mesh: TriangleMesh, parts: TexturedMesh) -> SourceSurfa
     source_corner[missing] = np.arange(3)
     _require_coordinates(parts, source_face)
     return SourceSurface(
-        mesh=mesh, parts=parts, source_face=source_face, source_corner=source_corner
+        surface=surface, parts=parts, source_face=source_face, source_corner=source_corner
     )
 
 

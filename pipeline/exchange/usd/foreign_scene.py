@@ -38,6 +38,7 @@ from pipeline.foreign.numbers import read_numbers
 from pipeline.foreign.picture import (
     MAX_BYTES,
     MAX_PIXELS,
+    FilePictures,
     Picture,
     decode_image,
     read_linear_picture,
@@ -138,9 +139,8 @@ class StageReader:
         self._extras: list[tuple[str, dict[str, Any], dict[str, Texture] | None]] = []
         self._looks = MeshMaterials(
             read_stage_materials(meshes, _MAX_PICTURE_BYTES, self._read),
-            lambda data, name: decode_image(data, name, MAX_PIXELS, self._lost, of_scene=True),
+            FilePictures(MAX_PIXELS, lost=self._lost),
             emission=True,
-            notes=self._lost,
         )
         self._extras.append(("", {}, None))
 

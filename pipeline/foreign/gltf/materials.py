@@ -16,7 +16,7 @@ from pipeline.foreign.gltf.document import GltfDocument
 from pipeline.foreign.gltf.nodes import entry, extension
 from pipeline.foreign.material import MOST_UV_SETS, RGB, Slot, SourceMaterial, with_normal_map
 from pipeline.foreign.numbers import Malformed, read_count, read_number, read_numbers
-from pipeline.foreign.picture import Decode, Picture, Wrap
+from pipeline.foreign.picture import FilePictures, Picture, Wrap
 from storage.errors import Rejected
 
 DEFAULT = SourceMaterial(metallic=1.0)
@@ -29,31 +29,19 @@ _MOST_EMISSION = 1e9
 
 @dataclass(eq=False)
 class GltfMaterials:
-    """Reads the materials of one glTF on demand, decoding each picture once."""
+    """Reads the materials of one glTF on demand.
+
+    In a scene, numbers that are malformed or beyond their range are replaced, with notes.
+    """
 
     document: GltfDocument
-    decode: Decode
-    """Function that returns the values of a picture's bytes."""
+    pictures: FilePictures
     _: KW_ONLY
     emission: bool = False
     """True to read emission, too."""
     normals: bool = False
     """True to read normal maps, too."""
-    notes: list[str] | None = None
-    """Receives sentences on parts that are left out; None refuses the file for these."""
-    _values: dict[int, NDArray] = field(default_factory=dict, init=False)
     _known: dict[int, SourceMaterial] = field(default_factory=dict, init=False)
-
-    def used_materials(self) -> dict[int, SourceMaterial]:
-        """Return the materials that meshes use, by index.
-
-        Raises:
-            Rejected: as reading a picture.
-        """
-        meshes = self.document.tree.get("meshes", ())
-        primitives = [row for mesh in meshes for row in mesh["primitives"]]
-        named = {row["material"] for row in primitives if "material" in row}
-        return {number: self.material(number) for number in sorted(named)}
 
     def material(self, number: int) -> SourceMaterial:
         """Return one material; raises Rejected as reading a picture."""
@@ -137,13 +125,7 @@ class GltfMaterials:
         info = row.get(name)
         if info is None:
             return None
-        try:
-            return self._texture(info, is_srgb=is_srgb)
-        except Rejected as why:
-            if self.notes is None or why.reason in ("texture_outside", "texture_too_large"):
-                raise
-            self.notes.append(f"a texture is left out: {why.message}")
-            return None
+        return self.pictures.read_or_leave_out("", lambda: self._texture(info, is_srgb=is_srgb))
 
     def _texture(self, info: Mapping[str, Any], *, is_srgb: bool) -> Slot:
         tree = self.document.tree
@@ -173,12 +155,10 @@ class GltfMaterials:
         )
 
     def _picture(self, number: int) -> NDArray:
-        if number not in self._values:
-            image = entry(self.document.tree, "images", number)
-            name = str(image.get("uri", image.get("name", f"picture {number}")))
-            name = "an embedded picture" if name.startswith("data:") else name
-            self._values[number] = self.decode(self.document.picture_bytes(image), name)
-        return self._values[number]
+        image = entry(self.document.tree, "images", number)
+        name = str(image.get("uri", image.get("name", f"picture {number}")))
+        name = "an embedded picture" if name.startswith("data:") else name
+        return self.pictures.decode(number, name, lambda: self.document.picture_bytes(image))
 
     def _rgb(self, row: Mapping[str, Any], name: str, count: int, most: float = 1.0) -> RGB:
         red, green, blue = self._numbers(row, name, (1.0,) * count, most)[:3]
@@ -196,16 +176,16 @@ class GltfMaterials:
         """Return factors clamped to [0, `most`]; malformed ones become the default, with a note."""
         try:
             factors = [*read_numbers(row.get(name, default), len(default), name)]
-            if most > 1 and max(factors) > most and self.notes is None:
+            if most > 1 and max(factors) > most and not self.pictures.of_scene:
                 raise Malformed(f"{name} is {max(factors):g}; expected at most {most:g}")
         except Malformed as error:
-            if self.notes is None:
+            if not self.pictures.of_scene:
                 raise
-            self.notes.append(f"{error}; {[*default]} taken")
+            self.pictures.notes.append(f"{error}; {[*default]} taken")
             return list(default)
         clamped = [min(max(value, 0.0), most) for value in factors]
-        if self.notes is not None and clamped != factors:
-            self.notes.append(f"{name}: clamped to [0, {most:g}]")
+        if self.pictures.of_scene and clamped != factors:
+            self.pictures.notes.append(f"{name}: clamped to [0, {most:g}]")
         return clamped
 
 

@@ -180,7 +180,9 @@ def gltf_textured_mesh(document: GltfDocument, materials: GltfMaterials) -> Text
         has_colors = any(instance.colors is not None for instance in primitives)
         if not document.tree.get("materials") and not has_colors:
             raise Rejected("no_materials", "the glTF has no materials")
-        known = materials.used_materials()
+        stated = [row for mesh in document.tree.get("meshes", ()) for row in mesh["primitives"]]
+        used = {row["material"] for row in stated if "material" in row}
+        known = {number: materials.material(number) for number in sorted(used)}
         rows: dict[int | None, int] = {number: row for row, number in enumerate(known)}
         numbers = [rows.get(instance.material, len(rows)) for instance in primitives]
         counts = [len(instance.faces) for instance in primitives]

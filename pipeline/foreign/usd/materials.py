@@ -20,7 +20,7 @@ from pipeline.foreign.material import (
     TexturedMesh,
     with_normal_map,
 )
-from pipeline.foreign.picture import Decode, Picture, has_colors
+from pipeline.foreign.picture import FilePictures, Picture, has_colors
 from pipeline.foreign.usd.object_source import StageMaterials, UsdSource
 from pipeline.foreign.usd.polygons import CutMesh
 from pipeline.foreign.usd.shaders import (
@@ -50,14 +50,16 @@ _UNBOUND = 0.18
 """Gray of a mesh without material and display color, as USD shows it."""
 
 
-def usd_textured_mesh(source: UsdSource, decode: Decode, *, emission: bool = False) -> TexturedMesh:
+def usd_textured_mesh(
+    source: UsdSource, pictures: FilePictures, *, emission: bool = False
+) -> TexturedMesh:
     """Return the triangles of a USD file with their materials; emission only on request.
 
     Raises:
         Rejected: no_materials, materials_unreadable, no_texture_coordinates, or as reading a
             picture.
     """
-    looks = MeshMaterials(source.materials, decode, emission=emission)
+    looks = MeshMaterials(source.materials, pictures, emission=emission)
     if len(looks.primvars) > MOST_UV_SETS:
         count = len(looks.primvars)
         raise Rejected("no_texture_coordinates", f"textures lie on {count} sets of them")
@@ -84,18 +86,14 @@ class MeshMaterials:
 
     stage: StageMaterials
     """Materials as the stage states them."""
-    decode: Decode
-    """Function that returns the values of a picture's bytes."""
+    pictures: FilePictures
     _: KW_ONLY
     emission: bool = False
     """True to read emission, too."""
-    notes: list[str] | None = None
-    """Receives sentences on pictures that are left out; None refuses the file."""
-    _values: dict[str, NDArray] = field(default_factory=dict, init=False)
     _known: dict[tuple[int, bytes], int] = field(default_factory=dict, init=False)
 
     def __post_init__(self) -> None:
-        """Convert all materials, decoding each picture once.
+        """Convert all materials.
 
         Raises:
             Rejected: materials_unreadable, or as reading a picture.
@@ -141,7 +139,10 @@ class MeshMaterials:
         """Replace the rows [T] and tints [T, 3, 3] of triangles of a material with primvars."""
         stated = self.stage.materials[row]
         mask = rows == row
-        values = {name: stated.read_values(name, cut) for name in stated.primvars}
+        values = {name: read_colors(cut, primvar) for name, primvar in stated.primvars.items()}
+        for name, primvar in stated.primvars.items():
+            if values[name] is None:
+                cut.placed.note(f"no primvar {primvar!r:.60}; its fallback taken")
         base = values.pop("diffuseColor", None)
         if base is not None:
             tints[mask] = np.clip(base, 0, 1)[mask]
@@ -240,19 +241,18 @@ class MeshMaterials:
         if node is None:
             return None
         is_grey = name in _COLORS and node.output != "rgb"
-        try:
-            return self._read_slot(node, f"{stated.where}.{name}", is_grey=is_grey)
-        except Rejected as why:
-            if self.notes is None or why.reason in ("texture_outside", "texture_too_large"):
-                raise
-            self.notes.append(f"{stated.where}.{name}: a texture is left out: {why.message}")
-            return None
+        where = f"{stated.where}.{name}: "
+        return self.pictures.read_or_leave_out(
+            where, lambda: self._read_slot(node, where, is_grey=is_grey)
+        )
 
     def _read_slot(self, node: TextureNode, where: str, *, is_grey: bool) -> Slot:
-        values = self._picture(node)
+        path = node.resolved or node.named
+        files = self.stage.pictures
+        values = self.pictures.decode(path, node.named, lambda: files.require(path))
         is_srgb = node.color_space == "sRGB"
         if node.color_space not in ("sRGB", "raw"):
-            is_srgb = has_colors(self.stage.pictures.require(node.resolved or node.named))
+            is_srgb = has_colors(files.require(path))
         channel = _CHANNELS[node.output]
         channels = [channel] * 3 + [3] if is_grey else [0, 1, 2, 3]
         if is_grey:
@@ -261,8 +261,8 @@ class MeshMaterials:
         picture = Picture(values=values, is_srgb=is_srgb, wrap=node.wrap)
         if (node.scale != 1).any() or node.bias.any():
             picture = _scale_picture(picture, node.scale[channels], node.bias[channels])
-            if self.notes is not None and picture.values[..., :3].max() > 1:
-                self.notes.append(f"{where}: texels above 1 are clamped, but for emission")
+            if self.pictures.of_scene and picture.values[..., :3].max() > 1:
+                self.pictures.notes.append(f"{where}texels above 1 are clamped, but for emission")
         return Slot(
             picture=picture,
             uv_set=self.primvars.index(node.primvar),
@@ -270,12 +270,6 @@ class MeshMaterials:
             uv_offset=node.uv_offset,
             channel=channel,
         )
-
-    def _picture(self, node: TextureNode) -> NDArray:
-        path = node.resolved or node.named
-        if path not in self._values:
-            self._values[path] = self.decode(self.stage.pictures.require(path), node.named)
-        return self._values[path]
 
 
 def _replace_values(

@@ -145,14 +145,6 @@ class StatedMaterial:
         """Return whether the material uses the specular workflow."""
         return bool(self.constants["useSpecularWorkflow"].any())
 
-    def read_values(self, name: str, cut: CutMesh) -> NDArray[np.float64] | None:
-        """Return the primvar of an input at corners [T, 3, 3]; None, with a note, without one."""
-        primvar = self.primvars[name]
-        values = read_colors(cut, primvar)
-        if values is None:
-            cut.placed.note(f"no primvar {primvar!r:.60}; its fallback taken")
-        return values
-
 
 def read_colors(cut: CutMesh, primvar: str) -> NDArray[np.float64] | None:
     """Return numbers or colors at corners as colors [T, 3, 3]; None for anything else."""

@@ -15,6 +15,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from pxr import Gf, Usd, UsdGeom, UsdLux, UsdShade
 
+from pipeline.assets.quality.measure import Surface
 from pipeline.assets.settings import OwnMaterialSettings
 from pipeline.assets.source_materials.skin import _parts
 from pipeline.assets.source_materials.source_surface import FacePoints, SourceSurface
@@ -26,7 +27,7 @@ from pipeline.foreign.material import LEAST_ROUGHNESS, SourceMaterial
 from pipeline.foreign.mesh import FileMesh
 from pipeline.foreign.mesh_materials import read_textured_mesh
 from pipeline.foreign.numbers import FINITE
-from pipeline.foreign.picture import Decoder, read_linear_picture
+from pipeline.foreign.picture import FilePictures, read_linear_picture
 from pipeline.foreign.polygons import triangulate
 from pipeline.foreign.source_file import SourceFile, load_mesh, read_source
 from storage.conventions import linear_from_srgb8
@@ -281,12 +282,12 @@ def test_a_missing_material_and_cut_values_are_named_and_cost_nothing_else(tmp_p
     files = {"m.mtl": b"newmtl m\nmap_Kd w.exr\n", "w.exr": wide}
     path = placed(tmp_path, b"mtllib m.mtl\nusemtl m\nf 1/1 2/2 3/3\nusemtl gone\n", files)
     read = read_source(path, ReadLimits(with_materials=True), tmp_path)
-    decode = Decoder(1 << 20)
-    parts = read_textured_mesh(read, decode, emission=False)
+    pictures = FilePictures(1 << 20)
+    parts = read_textured_mesh(read, pictures, emission=False)
     bases = [parts.materials[row].base for row in parts.material]
     assert sorted(base is None for base in bases) == [False, True, True]
     assert read.notes == ["material 'gone': no library has it; its faces have MTL's defaults"]
-    assert decode.notes == ["picture 'w.exr': values beyond [0, 1] (0 to 1.5)"]
+    assert pictures.notes == ["picture 'w.exr': values beyond [0, 1] (0 to 1.5)"]
 
 
 SHAPES: dict[str, tuple[int, float | None]] = {
@@ -341,7 +342,7 @@ def test_shades_of_public_reports(shared: Path) -> None:
             path = shared / "cases" / name
             root = shared / "cases" / name.partition("/")[0] / "in"
             read = read_source(path, ReadLimits(with_materials=True), root)
-            parts = read_textured_mesh(read, Decoder(1 << 20), emission=False)
+            parts = read_textured_mesh(read, FilePictures(1 << 20), emission=False)
             area = np.linalg.norm(parts.mesh.double_area_vectors, axis=1) / 2
             found = Counter[tuple[float, ...]]()
             for face, share in enumerate(area / area.sum()):
@@ -383,13 +384,13 @@ WIDE = kit.UV_UP * [2.25, 1] + [0.75, 0]
 
 def assert_same(path: Path) -> None:
     source = read_source(path, kit.KEEP.read_limits)
-    parts = _parts(source, Decoder(1 << 20), OwnMaterialSettings())
+    parts = _parts(source, FilePictures(1 << 20), OwnMaterialSettings())
     scene = load_source(scene_source(str(path))).scene
     count = len(parts.mesh.faces)
     corners = scene.vertex_positions[scene.faces[:count]]
     np.testing.assert_allclose(corners, parts.mesh.corners, atol=1e-6)
     surface = SourceSurface(
-        mesh=parts.mesh,
+        surface=Surface(parts.mesh, np.zeros((1, 3))),
         parts=parts,
         source_face=np.arange(count),
         source_corner=np.tile(np.arange(3), (count, 1)),
@@ -485,7 +486,8 @@ SMALL_PICTURE = kit.picture_bytes(kit.CORNERS)
 def look_at_parts(path: Path) -> str:
     """Read all of a file and return what is not read; what became of its numbers is finite."""
     source = read_source(path, kit.KEEP.read_limits)
-    for material in _parts(source, Decoder(1 << 20), OwnMaterialSettings(emission=True)).materials:
+    glowing = OwnMaterialSettings(emission=True)
+    for material in _parts(source, FilePictures(1 << 20), glowing).materials:
         colors = (*material.base_rgb, *material.specular_rgb, *material.emission_rgb)
         numbers = (material.metallic, material.roughness, material.f0, material.specular_strength)
         moves = [[*slot.uv_matrix.flat, *slot.uv_offset] for slot in material.slots]

@@ -14,7 +14,7 @@ from pxr import Gf, Usd, UsdGeom
 
 from pipeline.assets.cleaning.clean import clean, normalize
 from pipeline.assets.cleaning.orient import orient_outward
-from pipeline.assets.quality.measure import level_mesh
+from pipeline.assets.quality.measure import Surface, level_mesh
 from pipeline.assets.settings import AssetSettings, OwnMaterialSettings
 from pipeline.assets.source_materials.skin import add_skin, read_source_surface
 from pipeline.foreign.mesh import TriangleMesh
@@ -235,7 +235,7 @@ def test_a_level_over_its_bound_goes_without_and_one_far_from_its_source_is_told
     source = read_source(path, kit.KEEP.read_limits)
     mesh, _ = orient_outward(clean(normalize(load_mesh(source))))
     lax = dataclasses.replace(kit.OWN, max_colour_error=1.0)
-    surface, _ = read_source_surface(source, mesh, lax)
+    surface, _ = read_source_surface(source, Surface(mesh, np.zeros((1, 3))), lax)
     level = meshes.prepare(path, kit.KEEP).levels[0]
     assert add_skin(level, surface, lax).skin is not None
     with pytest.raises(Rejected, match="colours_missed"):

@@ -17,7 +17,7 @@ from pipeline.exchange.gltf import read_gltf
 from pipeline.exchange.textured_triangles import LoadedScene
 from pipeline.foreign.limits import ReadLimits
 from pipeline.foreign.material import SourceMaterial, source_columns
-from pipeline.foreign.picture import Decoder
+from pipeline.foreign.picture import FilePictures
 from pipeline.foreign.source_file import load_mesh, read_source
 from storage.errors import Rejected, TrilightError
 from storage.records.lookup import textured_rows
@@ -35,7 +35,7 @@ def surface(path: Path) -> NDArray[np.float64]:
     """Return corners and diffuse color [T, 12] of an object's triangles that have an area."""
     source = read_source(path, KEPT)
     try:
-        parts = _parts(source, Decoder(1 << 26), OwnMaterialSettings())
+        parts = _parts(source, FilePictures(1 << 26), OwnMaterialSettings())
     except Rejected as why:
         assert why.reason == "no_materials"
         corners = load_mesh(source).corners

@@ -12,6 +12,7 @@ from pxr import Gf, Sdf, Usd, UsdGeom, UsdLux, UsdShade, UsdSkel, Vt
 
 from pipeline.exchange.usd.read_usd import read_usd
 from pipeline.foreign.material import source_columns
+from pipeline.foreign.picture import FilePictures
 from pipeline.foreign.source_file import read_source
 from pipeline.foreign.usd.materials import usd_textured_mesh
 from storage.errors import Rejected, TrilightError
@@ -52,7 +53,7 @@ def of_object(path: Path) -> Looks:
     """Return the triangles of an object with their colors and roughness."""
     usd = read_source(path, KEEP.read_limits).usd
     assert usd is not None
-    parts = usd_textured_mesh(usd, lambda data, name: np.zeros((1, 1, 4), np.uint8))
+    parts = usd_textured_mesh(usd, FilePictures(1 << 20))
     tint = np.ones((len(parts.material), 3)) if parts.color is None else parts.color.mean(axis=1)
     columns = np.zeros((len(tint), 7))
     for row in np.unique(parts.material):
