@@ -102,19 +102,16 @@ print(peak_bytes() - before)
 """
 
 
-def test_a_head_is_read_without_the_list_and_says_the_same(tmp_path: Path) -> None:
+def test_a_head_is_read_without_the_list_and_so_are_rows_with_an_index_of_members(
+    tmp_path: Path,
+) -> None:
     write_manifest_of(tmp_path, 5_000)
     path = tmp_path / "manifest.json"
     whole, head = read_manifest(path), read_head(path)
     assert len(whole.shards) == 20 and head == dataclasses.replace(whole, shards=())
     cut = path.read_bytes()[: path.read_bytes().index(b"train-000001")]  # as a maker fetches it
     assert decode_head(io.BytesIO(cut), "here") == head
-
-
-def test_rows_with_an_index_of_members_are_read(tmp_path: Path) -> None:
-    """As manifests were before version 5."""
-    write_manifest_of(tmp_path, 300)
-    path = tmp_path / "manifest.json"
+    # as manifests were before version 5
     record = json.loads(path.read_bytes())
     for row in record["shards"]:
         row["members"] = [["000000000.json", 512, 9]]
@@ -204,13 +201,6 @@ def test_a_billion_planned_shards_cost_nothing(tmp_path: Path) -> None:
 SETTINGS = SplitSettings(scenes_per_shard=4)
 
 
-def test_shares_of_objects_are_as_stated() -> None:
-    splits = [split_of_object(sha256_hex(str(i).encode()), SETTINGS) for i in range(4000)]
-    for split, share in (("train", 0.75), ("validation", 0.125), ("test", 0.125)):
-        # 4000 draws: a standard error of at most 0.007, so 0.03 is over four of them
-        assert abs(splits.count(split) / 4000 - share) < 0.03
-
-
 @given(st.integers(1, 100_000), st.integers(1, 300))
 def test_whole_shards_hold_every_scene(num_scenes: int, scenes_per_shard: int) -> None:
     settings = SplitSettings(scenes_per_shard=scenes_per_shard)
@@ -228,12 +218,16 @@ def test_every_cycle_has_each_split(cycle: int) -> None:
     assert splits.count("validation") == splits.count("test") == 1
 
 
-def test_a_small_dataset_has_all_splits_and_one_without_objects_is_one_clear_line() -> None:
+def test_a_small_dataset_has_all_splits_in_shares_and_one_without_objects_is_named() -> None:
     names = [shard_name(index, SETTINGS) for index in range(shards_for(24, SETTINGS))]
     assert {name.split("-")[0] for name in names} == set(SPLITS)
     with pytest.raises(TrilightError, match="split 'validation': none of the 5"):
         require_objects({"train": 5}, {"train", "validation"})
     require_objects({"train": 5}, {"train"})
+    splits = [split_of_object(sha256_hex(str(i).encode()), SETTINGS) for i in range(4000)]
+    for split, share in (("train", 0.75), ("validation", 0.125), ("test", 0.125)):
+        # 4000 draws: a standard error of at most 0.007, so 0.03 is over four of them
+        assert abs(splits.count(split) / 4000 - share) < 0.03
 
 
 def test_randomness_has_a_name() -> None:
@@ -366,6 +360,14 @@ def test_shards_scenes_and_what_to_do_next(tmp_path: Path) -> None:
     # a shard without its note, as a kill leaves it
     note_of(publication.folder, "train-000001.tar").unlink()
     assert read_status(str(tmp_path)).shards_done == 1
+    # a manifest that does not say how it is divided is refused
+    path = publication.folder.manifest
+    manifest = read_manifest(path)
+    for splits in ({}, {"splits": {"shards": 3}}, {"splits": 3}):
+        settings = {k: v for k, v in manifest.settings.items() if k != "splits"} | splits
+        write_manifest(path, dataclasses.replace(manifest, settings=settings))
+        with pytest.raises(TrilightError):
+            read_status(str(tmp_path))
 
 
 def test_only_a_bucket_is_asked_what_it_holds(
@@ -400,16 +402,6 @@ def test_rate_and_cost_are_those_of_the_logs(tmp_path: Path) -> None:
     assert found.remaining_s == 12 / (4 / 20)
     assert found.core_hours == 4 * 10 * 2 / 3600
     assert found.last_scene_unix_s == 1010.0
-
-
-def test_a_manifest_that_does_not_say_how_it_is_divided_is_refused(tmp_path: Path) -> None:
-    path = begin_tiny(tmp_path, 4).folder.manifest
-    manifest = read_manifest(path)
-    for splits in ({}, {"splits": {"shards": 3}}, {"splits": 3}):
-        settings = {k: v for k, v in manifest.settings.items() if k != "splits"} | splits
-        write_manifest(path, dataclasses.replace(manifest, settings=settings))
-        with pytest.raises(TrilightError):
-            read_status(str(tmp_path))
 
 
 def test_of_many_logs_few_are_read_and_the_last_scenes_are_all_there(

@@ -76,25 +76,21 @@ def test_a_whole_dataset_has_no_fault_and_every_shard_is_looked_at(
         assert looked == [shard.name for shard in dataset.manifest.shards]
 
 
-def test_a_manifest_that_a_maker_writes_meanwhile_is_whole(dataset: Dataset) -> None:
+def test_what_was_not_read_or_a_maker_writes_meanwhile_is_not_called_damaged(
+    dataset: Dataset,
+) -> None:
+    for error, is_damage in ((RecursionError(), True), (Unreadable("no answer."), False)):
+        with pytest.raises(TrilightError) as caught, reading("set", "a.tar"):
+            raise error
+        assert ("is damaged" in str(caught.value)) == is_damage
     write_manifest(dataset.folder.manifest, dataset.manifest)  # with a seal
     dataset = open_dataset(str(dataset.folder.root))
     write_manifest(dataset.folder.manifest, dataclasses.replace(dataset.manifest, num_scenes=9))
     found = verify_dataset(dataset)
     assert (found.problems, found.manifest.num_samples) == ([], 5)
-
-
-def test_a_shard_that_grows_meanwhile_is_not_called_damaged(dataset: Dataset) -> None:
     rewrite(dataset, "train-000000.tar", lambda key, members: None, key=lambda key: f"1{key[1:]}")
     with pytest.raises(TrilightError, match=r"written while the shards .* Verify it again\."):
         verify_dataset(dataset)
-
-
-def test_only_what_was_read_is_called_damaged() -> None:
-    for error, is_damage in ((RecursionError(), True), (Unreadable("no answer."), False)):
-        with pytest.raises(TrilightError) as caught, reading("set", "a.tar"):
-            raise error
-        assert ("is damaged" in str(caught.value)) == is_damage
 
 
 def test_every_bad_sample_of_every_bad_shard_is_named(dataset: Dataset) -> None:
