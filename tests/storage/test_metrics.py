@@ -95,7 +95,7 @@ def test_a_preview_is_monotone_ends_at_white_and_has_known_values() -> None:
     assert srgb8([-1, 0, 0.003, 0.2140, 1, 7]).tolist() == [0, 0, 10, 127, 255, 255]
 
 
-def test_a_decade_is_zero_db_a_tenth_twenty_and_linear_sees_nothing_above_one() -> None:
+def test_a_decade_is_zero_db_linear_sees_nothing_above_one_and_background_earns_nothing() -> None:
     assert psnr_log_db(np.full((4, 4, 3), 9.0), np.full((4, 4, 3), 99.0)) == pytest.approx(0)
     picture = np.random.default_rng(0).random((8, 8, 3)) * 10
     brighter = (1 + picture) * 10**0.1 - 1
@@ -107,9 +107,6 @@ def test_a_decade_is_zero_db_a_tenth_twenty_and_linear_sees_nothing_above_one() 
     # Twelve and seven: one side clamped elsewhere would still pass with a value of 1 on the other.
     assert psnr_linear_db(np.full(9, 12.0), np.full(9, 7.0)) == MAX_DB
     assert psnr_linear_db(np.full(9, 0.5), np.full(9, 0.6)) == pytest.approx(20)
-
-
-def test_background_earns_nothing() -> None:
     hits = np.zeros((10, 10), bool)
     hits[0, 0] = True
     a, b = np.zeros((10, 10, 3)), np.zeros((10, 10, 3))
@@ -129,13 +126,9 @@ def test_the_interval_of_a_mean_goes_by_clusters() -> None:
     assert mean_interval([0.5] * 4, ["a", "a", "b", "b"]) == (0.5, 0.5)
 
 
-def _smooth_picture() -> np.ndarray:
+def test_pepper_is_noise_and_not_a_smooth_error_and_seams_are_steps_between_tiles() -> None:
     ramp = np.linspace(0.2, 1.5, 64)
-    return np.stack([ramp[:, None] * ramp] * 3, axis=-1)
-
-
-def test_pepper_is_noise_and_not_a_smooth_error() -> None:
-    picture = _smooth_picture()
+    picture = np.stack([ramp[:, None] * ramp] * 3, axis=-1)
     rng = np.random.default_rng(0)
     peppers = [
         pepper(
@@ -150,10 +143,6 @@ def test_pepper_is_noise_and_not_a_smooth_error() -> None:
     assert pepper(offset, picture) < 1e-6
     blurred = np.full_like(picture, picture.mean())
     assert pepper(blurred, picture) == 0
-
-
-def test_seams_are_steps_between_tiles() -> None:
-    picture = _smooth_picture()
     noise = np.random.default_rng(0).normal(0, 0.01, picture.shape)
     noisy = radiance_from_log10(log10_radiance(picture) + noise)
     assert seam(noisy, picture) == pytest.approx(1, abs=0.05)

@@ -76,9 +76,7 @@ def test_a_whole_dataset_has_no_fault_and_every_shard_is_looked_at(
         assert looked == [shard.name for shard in dataset.manifest.shards]
 
 
-def test_what_was_not_read_or_a_maker_writes_meanwhile_is_not_called_damaged(
-    dataset: Dataset,
-) -> None:
+def test_only_what_was_read_whole_is_called_damaged(dataset: Dataset) -> None:
     for error, is_damage in ((RecursionError(), True), (Unreadable("no answer."), False)):
         with pytest.raises(TrilightError) as caught, reading("set", "a.tar"):
             raise error

@@ -391,9 +391,7 @@ def test_a_texture_is_the_sum_of_its_tents(texture: Texture) -> None:
         assert texture_values(texture, (u, v)) == pytest.approx(_slow(texture, u, v), abs=1e-13)
 
 
-def test_row_0_is_the_bottom_far_coordinates_lose_no_digits_and_eight_bits_are_decoded_first() -> (
-    None
-):
+def test_row_0_is_the_bottom_far_places_lose_no_digits_and_bytes_are_decoded_first() -> None:
     texture = Texture(texels=np.array([[[0], [0.25]], [[0.5], [0.75]]], np.float32))
     corners = {(0.25, 0.25): 0, (0.75, 0.25): 1, (0.25, 0.75): 2, (0.75, 0.75): 3}
     for place, value in corners.items():

@@ -297,9 +297,7 @@ def test_every_pass_comes_back_from_a_file(rays_a_side: int) -> None:
         np.testing.assert_array_equal(found[name], kept, err_msg=name)
 
 
-def test_a_sample_gives_the_same_numbers_stored_or_not_and_computes_none_twice(
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:
+def test_stored_passes_are_those_computed_and_none_twice(monkeypatch: pytest.MonkeyPatch) -> None:
     names = ("object", "depth_axis_m", "shading_normal")
     sample = with_passes(names[:2])
     read = decode_sample(sample.key, encode_sample(sample, "compact"))

@@ -15,7 +15,7 @@ from safetensors.numpy import save
 
 from storage.digests import sha256_hex
 from storage.errors import TrilightError
-from storage.records.asset import Asset, decode_asset, encode_asset
+from storage.records.asset import decode_asset, encode_asset
 from storage.records.lookup import FLAT
 from storage.records.retextured import (
     NEW,
@@ -432,8 +432,7 @@ def test_a_large_file_is_refused_before_it_is_read(tmp_path: Path) -> None:
     assert read_scene_file(path).objects == tiny_scene().objects
 
 
-@pytest.fixture
-def asset() -> Asset:
+def test_an_asset_survives_the_file_and_what_is_none_is_refused_in_one_line() -> None:
     ball = small_pool()[0].asset
     quality = dataclasses.replace(QUALITY, error_p99=1 / 3, open_edges=7)
     levels = []
@@ -441,10 +440,7 @@ def asset() -> Asset:
         record = dataclasses.replace(each.record, method="meshoptimizer", quality=quality)
         levels.append(dataclasses.replace(each, record=record))
     source = dataclasses.replace(SOURCE, num_faces_turned=3, front_share=0.1)
-    return dataclasses.replace(ball, source=source, levels=tuple(levels))
-
-
-def test_an_asset_survives_the_file(asset: Asset) -> None:
+    asset = dataclasses.replace(ball, source=source, levels=tuple(levels))
     again = decode_asset(encode_asset(asset))
     for field in ("geometry_sha256", "source_sha256", "recipe", "source"):
         assert getattr(again, field) == getattr(asset, field)
@@ -454,9 +450,6 @@ def test_an_asset_survives_the_file(asset: Asset) -> None:
         assert np.array_equal(there.positions, here.positions)
         assert np.array_equal(there.faces, here.faces)
     assert encode_asset(again) == encode_asset(asset)
-
-
-def test_what_is_no_asset_or_was_cut_off_is_refused_in_one_line(asset: Asset) -> None:
     weight = {"weight": np.zeros(3, np.float32)}
     headers = (
         "not JSON", "[]", '{"levels": [{}]}', '{"levels": [{"quality": {}}]}',

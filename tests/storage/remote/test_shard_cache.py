@@ -48,7 +48,9 @@ def test_equal_names_of_different_places_do_not_meet(server: Site, cache: Path) 
     assert found == [b"a" * BYTES, b"b" * BYTES]
 
 
-def test_what_was_not_read_for_longest_goes_first(server: Site, cache: Path) -> None:
+def test_what_was_not_read_for_longest_goes_first_and_what_is_being_read_stays(
+    server: Site, cache: Path
+) -> None:
     a, b, c, d = put(server, "a.tar", "b.tar", "c.tar", "d.tar")
     store = ShardCache(cache, 3 * BYTES)
     for number, url in enumerate((a, b, c, a)):
@@ -63,10 +65,6 @@ def test_what_was_not_read_for_longest_goes_first(server: Site, cache: Path) -> 
     assert [server.gets()[f"/{name}.tar"] for name in "abc"] == [1, 1, 1]
     fetch(store, b)
     assert server.gets()["/b.tar"] == 2
-
-
-def test_what_is_being_read_stays(server: Site, cache: Path) -> None:
-    a, b, c = put(server, "a.tar", "b.tar", "c.tar")
     store = ShardCache(cache, BYTES)
     with store.open(a, num_bytes=BYTES, sha256=digest("a")) as stream:
         fetch(store, b)
@@ -98,7 +96,9 @@ def test_without_a_hash_a_query_may_tell_two_files_apart(server: Site, cache: Pa
     assert all(set(path.name) <= set("0123456789abcdef-") for path in cache.iterdir())
 
 
-def test_threads_fetch_a_shard_once(server: Site, cache: Path) -> None:
+def test_threads_fetch_a_shard_once_and_processes_share_a_cache_that_is_too_small(
+    server: Site, cache: Path
+) -> None:
     (url,) = put(server, "a.tar")
     server.faults["/a.tar"] = [Fault(stall_after=10)]  # so that all are waiting together
     store = ShardCache(cache, 10**6)
@@ -106,10 +106,7 @@ def test_threads_fetch_a_shard_once(server: Site, cache: Path) -> None:
         found = list(pool.map(lambda _: fetch(store, url), range(8)))
     assert found == [b"a" * BYTES] * 8
     assert server.ranges_of("/a.tar") == ["", "bytes=10-"]
-
-
-def test_processes_share_a_cache_that_is_too_small(server: Site, cache: Path) -> None:
-    """Every read is right while the others evict; afterwards the cache keeps its bound."""
+    # every read is right while the others evict; afterwards the cache keeps its bound
     names = [f"{letter}.tar" for letter in "abcdef"]
     put(server, *names)
     with multiprocessing.get_context("forkserver").Pool(2) as children:
@@ -176,16 +173,6 @@ def test_a_wrong_size_and_a_place_that_cannot_be_written_are_named(
         read(server.url)
 
 
-def test_a_dataset_is_the_same_through_a_server(server: Site, local: Dataset) -> None:
-    remote = open_dataset(f"{server.url}/")
-    assert remote.manifest == local.manifest
-    assert remote.objects_lock() == local.objects_lock()
-    assert remote.failures() == local.failures()
-    assert read(server.url) == expected(local)
-    with pytest.raises(TrilightError, match="is on a server; expected a local folder"):
-        _ = remote.folder
-
-
 OUTLIVED = {
     "statuses": [Fault(status=500), Fault(status=503), Fault(status=429)],
     "cut": [Fault(cut_after=0), Fault(cut_after=5000), Fault(cut_after=1)],
@@ -217,13 +204,22 @@ def test_what_passes_by_itself_is_outlived(
     assert kept.read_bytes() == (local.folder.root / SHARD).read_bytes()
 
 
-def test_a_transfer_goes_on_where_it_broke(server: Site, local: Dataset) -> None:
+def test_a_dataset_is_the_same_through_a_server_and_goes_on_where_it_broke(
+    server: Site, local: Dataset
+) -> None:
     size = local.shards_of("train")[0].num_bytes
     server.faults[PATH] = [Fault(cut_after=size // 2), Fault(cut_after=size // 4)]
     read(server.url)
     assert server.ranges_of(PATH) == ["", f"bytes={size // 2}-", f"bytes={size // 2 + size // 4}-"]
     beside = (local.folder.root / "manifest.json").stat().st_size
     assert server.sent == size + beside, "no byte of the shard came twice"
+    remote = open_dataset(f"{server.url}/")
+    assert remote.manifest == local.manifest
+    assert remote.objects_lock() == local.objects_lock()
+    assert remote.failures() == local.failures()
+    assert read(server.url) == expected(local)
+    with pytest.raises(TrilightError, match="is on a server; expected a local folder"):
+        _ = remote.folder
 
 
 @pytest.mark.parametrize(
