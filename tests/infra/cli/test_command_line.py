@@ -93,7 +93,7 @@ def test_the_first_page_has_five_sections_and_a_first_command() -> None:
     assert version.exit_code == 0 and re.match(r"trilight \d", version.stdout)
 
 
-def test_presets_lists_what_there_is_by_its_name_for_people() -> None:
+def test_presets_lists_names_for_people_and_settings_as_set_takes_them() -> None:
     shown = trilight(["presets"], env={"COLUMNS": "120"}).stdout
     for name in (
         *DATASET_PRESETS,
@@ -104,9 +104,6 @@ def test_presets_lists_what_there_is_by_its_name_for_people() -> None:
     ):
         assert name in shown
     assert json.loads(trilight(["presets", "--json"]).stdout)["datasets"][0]["scenes"] == 24
-
-
-def test_the_settings_of_a_preset_are_listed_as_set_takes_them() -> None:
     told = json.loads(trilight(["presets", "tiny", "--json"]).stdout)
     values = told["trilight generate tiny"]
     assert apply_overrides(preset_settings("pretrain-256"), values) == preset_settings("tiny")
@@ -168,14 +165,11 @@ def test_what_cannot_be_asked_is_one_line() -> None:
             assert ended.exit_code == 1 and ended.mistake.startswith(message)
 
 
-def test_the_real_command_names_no_module() -> None:
+def test_the_real_command_names_no_module_and_lacks_memory_in_one_sentence(tmp_path: Path) -> None:
     found = run_program([sys.executable, "-m", "trilight", "verify"], status=2)
     assert "infra.cli" not in found.stdout + found.stderr
     assert "trilight verify" in found.stdout + found.stderr
-
-
-def test_too_little_memory_is_one_sentence(tmp_path: Path) -> None:
-    """Where more is left, libraries end the process in ways of their own."""
+    # where more memory is left, libraries end the process in ways of their own
     train = f"{sys.executable} -m trilight train smoke --data {tmp_path} --out {tmp_path}/run"
     ended = run_program(["bash", "-c", f"ulimit -v 300000; exec {train}"], status=1)
     *before, last = ended.stderr.splitlines()
