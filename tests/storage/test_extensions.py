@@ -86,15 +86,12 @@ def test_mistakes_in_a_file_are_one_line_that_names_it(
         load_extension(path)  # and mended, it loads
 
 
-@for_each("name", ["nowhere.py", "folder.py", "own.txt", f"a{os.pathsep}b.py"])
-def test_what_is_no_file_of_python_is_named(tmp_path: Path, name: str) -> None:
+def test_no_file_of_python_two_of_one_name_and_one_that_changes_are_refused(tmp_path: Path) -> None:
     (tmp_path / "folder.py").mkdir()
     (tmp_path / "own.txt").touch()
-    with pytest.raises(TrilightError, match=r"^extension .*(expected a Python file|cannot be)"):
-        load_extension(tmp_path / name)
-
-
-def test_two_files_of_one_name_and_one_that_changes_under_a_run_are_refused(tmp_path: Path) -> None:
+    for name in ("nowhere.py", "folder.py", "own.txt", f"a{os.pathsep}b.py"):
+        with pytest.raises(TrilightError, match=r"^extension .*(expected a Python file|cannot be)"):
+            load_extension(tmp_path / name)
     (tmp_path / "other").mkdir()
     load_extension(written(tmp_path, ADDS))
     with pytest.raises(TrilightError, match=r"another own\.py is loaded already"):

@@ -193,13 +193,11 @@ def test_who_waits_says_for_whom_and_since_when(
     assert re.search(rf"a\\x1b\]0;b.claim: waiting for \d+ s for {holding}", caplog.messages[0])
 
 
-@for_each(
-    "text",
-    ["", "x", "h 1", "h x 5", "h 1 9999999999999999999", "h 1 nan", "\x1b[1m 1 5", "a b c d"],
-)
-def test_a_claim_that_says_nothing_readable_is_anothers(text: str, tmp_path: Path) -> None:
-    (tmp_path / "a").write_text(text)
-    assert describe_holder(tmp_path / "a").isprintable()
+def test_a_claim_that_says_nothing_readable_is_anothers(tmp_path: Path) -> None:
+    cut_or_odd = ("", "x", "h 1", "h x 5", "h 1 9999999999999999999", "h 1 nan")
+    for text in (*cut_or_odd, "\x1b[1m 1 5", "a b c d"):
+        (tmp_path / "a").write_text(text)
+        assert describe_holder(tmp_path / "a").isprintable(), text
     os.mkfifo(tmp_path / "fifo")
     for name in ("fifo", "none", "."):
         assert describe_holder(tmp_path / name) == "another process"

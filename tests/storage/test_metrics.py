@@ -246,7 +246,7 @@ def test_what_is_not_there_is_named() -> None:
 DOWN = np.array([[0, 0, -1]], np.float32)
 
 
-def test_rays_from_both_sides_past_the_floor_and_only_up_to_it() -> None:
+def test_rays_meet_both_sides_up_to_their_length_also_where_lights_stand_first_or_alone() -> None:
     origins = np.array([[0.5, -0.2, 3], [0.5, -0.2, -3], [5, 0, 3]], np.float32)
     met = Surfaces(tiny_scene()).intersect(
         origins, np.array([[0, 0, -2], [0, 0, 1], [0, 0, -1]], "f4")
@@ -258,9 +258,6 @@ def test_rays_from_both_sides_past_the_floor_and_only_up_to_it() -> None:
     above, down = np.repeat(origins[:1], 3, axis=0), np.repeat(DOWN, 3, axis=0)
     free = Surfaces(tiny_scene()).is_free(above, down, np.array([2.9, 3.1, 1e9], np.float32))
     assert free.tolist() == [True, False, False]
-
-
-def test_rows_are_those_of_the_scene_where_lights_stand_first_or_alone() -> None:
     scene = tiny_scene()
     order = [2, 0, 1]
     moved = tiny_scene(

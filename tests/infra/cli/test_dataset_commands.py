@@ -182,10 +182,8 @@ def test_merge_select_and_reshard(tmp_path: Path) -> None:
     assert "0 of 12 scenes" in expect_output(
         "shards", "list", tmp_path / "ab", "--where", "max(coverage) > 2"
     )
-    size = ("--scenes-per-shard", "5", "--json")
-    outcome = json.loads(
-        expect_output("shards", "reshard", tmp_path / "ab", "--out", tmp_path / "d", *size)
-    )
+    size = ("--scenes-per-shard", "5")
+    outcome = expect_json("shards", "reshard", tmp_path / "ab", "--out", tmp_path / "d", *size)
     assert outcome["scenes_by_split"] == {"test": 4, "train": 8}
     assert outcome["dataset_digest"] == open_dataset(str(tmp_path / "d")).digest
     out = ("--out", tmp_path / "e")
@@ -271,12 +269,10 @@ def test_status_says_how_far_and_what_next(tmp_path: Path) -> None:
     publication = begin_tiny(tmp_path, 12)
     make_tiny_shard(publication, 0)
     log_scene(publication.folder, "x", 0, seconds=1800.0, cores=2, num_rejected=0)
-    shown = trilight(["status", str(tmp_path)], env={"COLUMNS": "200"})
-    assert shown.exit_code == 0, shown.output
+    shown = expect_output("status", tmp_path, **WIDE)
     for text in ("1 of 3", "4 of 12", "no_camera", "1.00 core-hours, 0.04 USD", "--scenes 12"):
-        assert text in shown.output
-    told = trilight(["status", str(tmp_path), "--json", "--price", "0.5"])
-    row = json.loads(told.output)
+        assert text in shown
+    row = expect_json("status", tmp_path, "--price", "0.5")
     assert (row["shards_done"], row["scenes_planned"], row["finished"]) == (1, 12, False)
     assert row["cost_usd"] == 0.5
     announce_objects(publication.folder, 7)

@@ -262,9 +262,7 @@ def _parameters(**given: Any) -> dict[str, Any]:
     return {**plain, "data": ["a"], "changes": None, **given}
 
 
-def test_a_command_has_every_option_and_torchrun_where_processes_are_several(
-    tmp_path: Path,
-) -> None:
+def test_a_command_has_every_option_and_torchrun_for_several_processes(tmp_path: Path) -> None:
     one = TrainOptions(data=("a", "b"), resume=True, steps=5).command()
     assert one[1:] == ("-m trilight train smoke --data a --data b --resume --steps 5").split()
     two = TrainOptions(processes=2).command()
@@ -281,7 +279,7 @@ def test_a_command_has_every_option_and_torchrun_where_processes_are_several(
     assert str(tmp_path / "none") in trilight(words[2:]).mistake
 
 
-def test_the_form_has_every_run_and_every_setting() -> None:
+def test_the_form_has_every_run_and_setting_and_a_wrong_one_is_refused_before_a_run() -> None:
     schema = train_model.parameters.model_dump()
     assert schema["properties"]["run"]["enum"] == ["tiny", *TRAINING_PRESETS]
     groups = schema["definitions"]
@@ -291,9 +289,6 @@ def test_the_form_has_every_run_and_every_setting() -> None:
     assert groups["LossSettingsChanges"]["properties"]["perceptual"]["anyOf"][0]["enum"] == [
         "lpips", "ms_ssim", "none",
     ]  # fmt: skip
-
-
-def test_a_wrong_form_is_refused_before_a_run_exists_and_laws_before_the_command() -> None:
     wrong: list[tuple[dict[str, Any], str]] = [
         ({"run": "pretain"}, "run"),
         ({"changes": {"warm_up": 3}}, "changes.warm_up"),

@@ -343,7 +343,7 @@ def test_the_facts_of_a_dataset_name_its_preset_as_people_type_it(dataset: Datas
     room.close()
 
 
-def test_rows_come_sorted_page_by_page_and_small_pictures_as_stored(dataset_asker: Asker) -> None:
+def test_rows_come_page_by_page_and_pictures_and_scenes_as_stored(dataset_asker: Asker) -> None:
     falling = dataset_asker.ask("api/rows?sort=floor&descending=1")[1]["rows"]
     assert [row["floor"] for row in falling] == sorted(30.0 + row for row in range(8))[::-1]
     rest = dataset_asker.ask("api/rows?from=6")[1]
@@ -362,9 +362,6 @@ def test_rows_come_sorted_page_by_page_and_small_pictures_as_stored(dataset_aske
         ("000000006/0?px=9999", 422), ("000000006/0?px=-1", 422), ("000000006", 404),
     ):  # fmt: skip
         assert dataset_asker.ask(f"api/thumbnail/{wrong}")[0] == status, wrong
-
-
-def test_a_scene_opens_as_a_page_of_its_own_with_its_target(dataset_asker: Asker) -> None:
     assert b'id="stage"' in dataset_asker.ask("scene/000000003/")[1]
     facts = dataset_asker.ask("scene/000000003/api/scene")[1]
     assert facts["target_px"] == 16 and "target" in [each["name"] for each in facts["engines"]]

@@ -269,7 +269,9 @@ def test_equal_members_give_equal_samples_with_and_without_what_is_held(
 
 
 @pytest.mark.usefixtures("held")
-def test_a_map_is_unpacked_once(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_map_is_unpacked_once_and_what_is_refused_stays_refused(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
     members, values = encode_sample(textured_sample(KEY)), packed_maps._PackedMap.values
     unpack: Any = mock.create_autospec(values, side_effect=values)
     monkeypatch.setattr(packed_maps._PackedMap, "values", unpack)
@@ -280,6 +282,14 @@ def test_a_map_is_unpacked_once(monkeypatch: pytest.MonkeyPatch) -> None:
     assert one.texels is other.texels
     with pytest.raises(ValueError, match="read-only"):
         one.texels[0] = 0
+    # neither a damaged copy of a held map, nor one under another name, nor one of another kind
+    name, of_sky = map_member(colour_texture().sha256), map_member(sky().sha256)
+    for wrong in (members[name][:-9], members[of_sky], encode_sample(textured_sample(KEY, 1))):
+        swapped = wrong if isinstance(wrong, bytes) else wrong[map_member(colour_texture(1).sha256)]
+        for _ in range(2):
+            with pytest.raises(TrilightError):
+                decode_sample(KEY, {**members, name: swapped})
+    decode_sample(KEY, members)
 
 
 def test_memory_is_bounded_and_the_oldest_goes(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -300,20 +310,6 @@ def test_memory_is_bounded_and_the_oldest_goes(monkeypatch: pytest.MonkeyPatch) 
     asked(9, side=20)
     asked(9, side=20)  # larger than all that may be held
     assert made[-2:] == [9, 9] and held.num_bytes <= 1000
-
-
-@pytest.mark.usefixtures("held")
-def test_what_is_refused_stays_refused() -> None:
-    """A damaged copy of a held map, a held map under another name, and one of another kind."""
-    members = encode_sample(textured_sample(KEY))
-    decode_sample(KEY, members)
-    name, other = map_member(colour_texture().sha256), map_member(sky().sha256)
-    for wrong in (members[name][:-9], members[other], encode_sample(textured_sample(KEY, 1))):
-        swapped = wrong if isinstance(wrong, bytes) else wrong[map_member(colour_texture(1).sha256)]
-        for _ in range(2):
-            with pytest.raises(TrilightError):
-                decode_sample(KEY, {**members, name: swapped})
-    decode_sample(KEY, members)
 
 
 def test_threads_share_it(held: HeldMaps) -> None:
