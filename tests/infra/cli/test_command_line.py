@@ -112,14 +112,6 @@ def test_presets_lists_names_for_people_and_settings_as_set_takes_them() -> None
     assert "did you mean tiny?" in trilight(["presets", "tny"]).mistake
 
 
-def test_a_digest_is_on_one_line(monkeypatch: pytest.MonkeyPatch) -> None:
-    out = io.StringIO()
-    narrow = console._TextConsole(file=out, width=60, markup=False)
-    monkeypatch.setattr(console, "console", narrow)
-    console.print_rows("title", [("a long name of a digest", "ab" * 32), ("other", "words")])
-    assert f"a long name of a digest {'ab' * 32}\n" in out.getvalue()
-
-
 MISTAKES = {
     "evaluat": "command 'evaluat' is unknown; did you mean evaluate? Expected one of generate,",
     "shards merg": "shards: command 'merg' is unknown; did you mean merge?",
@@ -258,7 +250,7 @@ def test_the_page_of_quantities_names_what_a_condition_can_ask() -> None:
         condition(text)
 
 
-def test_a_log_has_a_line_of_progress_a_minute(
+def test_a_log_has_a_line_of_progress_a_minute_and_a_digest_is_on_one_line(
     monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     now = [0.0]
@@ -273,6 +265,11 @@ def test_a_log_has_a_line_of_progress_a_minute(
         bars.advance(task)
         said = capsys.readouterr().out
     assert said.splitlines() == [f"scenes {done} of 8, noted" for done in (3, 6, 7)]
+    out = io.StringIO()
+    narrow = console._TextConsole(file=out, width=60, markup=False)
+    monkeypatch.setattr(console, "console", narrow)
+    console.print_rows("title", [("a long name of a digest", "ab" * 32), ("other", "words")])
+    assert f"a long name of a digest {'ab' * 32}\n" in out.getvalue()
 
 
 def test_what_is_printed_tells_the_terminal_nothing(monkeypatch: pytest.MonkeyPatch) -> None:

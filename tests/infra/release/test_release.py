@@ -172,9 +172,7 @@ def test_the_hub_gets_every_file_and_reads_as_it_was(dataset: Dataset, tmp_path:
     assert not verify_dataset(there).problems
 
 
-def test_what_kind_a_folder_is_and_a_dry_run_sends_nothing(
-    dataset: Dataset, tmp_path: Path
-) -> None:
+def test_what_kind_a_folder_is_and_what_sends_nothing(dataset: Dataset, tmp_path: Path) -> None:
     assert kind_of(dataset.folder.root) == "dataset"
     for name, kind in (("model.safetensors", "model"), ("index.html", "space")):
         place = tmp_path / kind
@@ -187,9 +185,7 @@ def test_what_kind_a_folder_is_and_a_dry_run_sends_nothing(
     said = expect_output(*words, "--private", "--dry-run")
     assert "Would be uploaded" in said
     assert f"Next: trilight {' '.join(words)} --private" in said
-
-
-def test_nothing_is_sent_that_nobody_could_use(dataset: Dataset, tmp_path: Path) -> None:
+    # nothing is sent that nobody could use
     root = dataset.folder.root
     for name in ("set", "a/b/c", "ada/my set", "ada/-set", "a--b/set", "ada/set.git"):
         with pytest.raises(TrilightError, match="expected USER/NAME"):

@@ -85,11 +85,6 @@ def test_every_container_has_a_home_that_it_may_write(services: Any) -> None:
         assert service["environment"]["HOME"] == "/tmp", name
 
 
-def _deploying() -> dict[str, Any]:
-    (job,) = (part for name, _, part in containers() if name == "trilight-deploy")
-    return job
-
-
 def test_nobody_can_start_a_server_without_a_password_or_a_pool_that_offers_commands(
     services: Any,
 ) -> None:
@@ -102,9 +97,13 @@ def test_nobody_can_start_a_server_without_a_password_or_a_pool_that_offers_comm
             assert command[:3] == ["python", "-m", "pipeline.flows.guarded_server"], name
         if "worker" in name:
             assert "--no-create-pool-if-not-found" in command and "--type" not in command, name
-    for words in (services["deploy"]["command"].split(), _deploying()["command"]):
+    (deploying,) = (part for name, _, part in containers() if name == "trilight-deploy")
+    for words in (services["deploy"]["command"].split(), deploying["command"]):
         assert words[:3] == ["python", "-m", deployments.__name__]
         assert len(words) == 5 and words[4].endswith(".json")  # the pool's own template
+    # what makes the limits is told how many cards there are: where they are made, there is none
+    assert "TRILIGHT_CARDS" in services["deploy"]["environment"]
+    assert "TRILIGHT_CARDS" in {row["name"] for row in deploying["env"]}
 
 
 def test_no_password_stands_in_a_file_and_every_port_is_on_loopback(services: Any) -> None:
@@ -166,12 +165,6 @@ def test_deployments_name_flows_that_are_there_and_write_to_volumes() -> None:
         path, function = row["entrypoint"].split(":")
         assert f"def {function}(" in (ROOT / path).read_text()
         assert row["work_pool"] == {"name": row["name"]}
-
-
-def test_what_makes_the_limits_is_told_how_many_cards_there_are(services: Any) -> None:
-    """Where they are made, there is no card."""
-    assert "TRILIGHT_CARDS" in services["deploy"]["environment"]
-    assert "TRILIGHT_CARDS" in {row["name"] for row in _deploying()["env"]}
 
 
 def test_the_worker_keeps_to_its_namespace_and_jobs_name_the_secret(

@@ -338,7 +338,7 @@ def test_mean_greatest_and_constant_are_those_of_the_texels_and_stay_known() -> 
     assert Texture(texels=np.full((3, 2, 1), 255, np.uint8)).constant == np.ones(1)
 
 
-def test_six_directions_and_coloured_poles_stand_where_the_conventions_say() -> None:
+def test_directions_and_coloured_poles_stand_where_the_conventions_say_and_back() -> None:
     """The table of Blender: centre +X, a quarter +Y, three quarters -Y, the border -X, top +Z."""
     expected = {"+X": (0.5, 0.5), "+Y": (0.25, 0.5), "-Y": (0.75, 0.5)}
     for name, place in expected.items():
@@ -351,9 +351,6 @@ def test_six_directions_and_coloured_poles_stand_where_the_conventions_say() -> 
         for name, direction in POLES.items():
             found = environment_values(environment, rotation @ direction)
             assert found == pytest.approx(COLOURS[name])
-
-
-def test_directions_and_places_are_inverse() -> None:
     rng = np.random.default_rng(0)
     directions = rng.normal(size=(1000, 3))
     directions /= np.linalg.norm(directions, axis=1, keepdims=True)
