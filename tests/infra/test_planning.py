@@ -29,7 +29,7 @@ def _measured(core_s: tuple[float, ...], num_bytes: int = 150_000) -> list[tuple
     return [(seconds, num_bytes) for seconds in core_s]
 
 
-def test_equal_scenes_add_up_exactly() -> None:
+def test_equal_scenes_add_up_exactly_and_two_million_come_with_warnings() -> None:
     """The first scene, which compiles, is left out; nothing varies, so intervals are points."""
     order = GenerateOptions(build="pretrain-256", scenes=2560)
     found = predict_cost(_measured((99.0, 36.0, 36.0)), order, cores=16, usd_per_core_hour=0.5)
@@ -41,6 +41,16 @@ def test_equal_scenes_add_up_exactly() -> None:
     assert found.gigabytes.value == pytest.approx(0.384)
     assert found.num_tasks <= MAX_TASKS
     assert found.notes == ()
+    order = GenerateOptions(build="pretrain-256", scenes=2_000_000)
+    measured = _measured((400.0, 400.0))
+    found = predict_cost(measured, order, cores=4096, usd_per_core_hour=0.04)
+    assert found.num_tasks == MAX_TASKS
+    assert found.manifest_mb < 2  # it lists 7,813 shards, however many views they hold
+    assert any("flow runs" in note for note in found.notes)
+    fewer = predict_cost(
+        measured, dataclasses.replace(order, scenes=500), cores=1, usd_per_core_hour=1
+    )
+    assert fewer.notes == ()
 
 
 def test_an_interval_covers_the_mean_as_often_as_it_says() -> None:
@@ -58,19 +68,6 @@ def test_an_interval_covers_the_mean_as_often_as_it_says() -> None:
         assert interval.low <= interval.value <= interval.high
         hits += interval.low <= truth <= interval.high
     assert hits >= 160
-
-
-def test_two_million_scenes_come_with_warnings() -> None:
-    order = GenerateOptions(build="pretrain-256", scenes=2_000_000)
-    measured = _measured((400.0, 400.0))
-    found = predict_cost(measured, order, cores=4096, usd_per_core_hour=0.04)
-    assert found.num_tasks == MAX_TASKS
-    assert found.manifest_mb < 2  # it lists 7,813 shards, however many views they hold
-    assert any("flow runs" in note for note in found.notes)
-    fewer = predict_cost(
-        measured, dataclasses.replace(order, scenes=500), cores=1, usd_per_core_hour=1
-    )
-    assert fewer.notes == ()
 
 
 def test_what_is_measured_are_the_first_scenes_of_the_dataset_in_order(
@@ -142,19 +139,6 @@ def _responds(code: str, text: str, consequence: str, mend: str) -> doctor.Findi
     return doctor.Finding("ok", text)
 
 
-def test_a_machine_on_which_all_probes_end_well_lacks_nothing(
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:
-    """Probes would take seconds in processes; what is not well has its consequence and cure."""
-    monkeypatch.setattr(doctor, "_probe", _responds)
-    monkeypatch.setattr(doctor, "render_facts", lambda variant: FACTS)
-    findings = list(doctor.examine())
-    assert [finding.name for finding in findings] == list(doctor.CHECKS)
-    for finding in findings:
-        assert finding.state != "missing", finding
-        assert bool(finding.consequence) == bool(finding.mend) == (finding.state != "ok")
-
-
 @pytest.mark.slow("packaging")
 def test_a_machine_that_passes_tests_lacks_nothing() -> None:
     assert [finding for finding in doctor.examine() if finding.state == "missing"] == []
@@ -176,7 +160,7 @@ def test_a_user_without_a_home_has_one_in_the_cache(
     assert "has no home directory" in finding.found
 
 
-def test_each_finding_comes_before_the_next_look() -> None:
+def test_findings_come_one_by_one_and_none_is_missing(monkeypatch: pytest.MonkeyPatch) -> None:
     """The probes take seconds each; who waits sees the first at once, and what is looked at."""
     told: list[str] = []
     found = doctor.examine(told.append)
@@ -184,6 +168,14 @@ def test_each_finding_comes_before_the_next_look() -> None:
     assert told == ["machine"]
     assert next(found).name == "disk"
     assert told == ["machine", "disk"]
+    # Probes would take seconds in processes; what is not well has its consequence and cure.
+    monkeypatch.setattr(doctor, "_probe", _responds)
+    monkeypatch.setattr(doctor, "render_facts", lambda variant: FACTS)
+    findings = list(doctor.examine())
+    assert [finding.name for finding in findings] == list(doctor.CHECKS)
+    for finding in findings:
+        assert finding.state != "missing", finding
+        assert bool(finding.consequence) == bool(finding.mend) == (finding.state != "ok")
 
 
 def test_what_confines_children_is_said(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -202,21 +194,16 @@ def test_what_confines_children_is_said(monkeypatch: pytest.MonkeyPatch) -> None
             assert (finding.state, finding.found.endswith(said)) == (state, True)
 
 
-@pytest.mark.parametrize(
-    ("code", "said"),
-    [
-        ("raise SystemExit('filters are gone')", "filters are gone"),
-        ("import os; os.abort()", "ended with status -6"),
-        ("import nothing_of_that_name", "No module named 'nothing_of_that_name'"),
-    ],
-)
-def test_a_probe_that_fails_is_missing(code: str, said: str) -> None:
-    finding = doctor._probe(code, "x 1", "no x", "get x")
-    assert finding.state == "missing"
-    assert said in finding.found
-
-
-def test_no_llvm_is_missing_and_says_what_to_install(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_probe_that_fails_and_no_llvm_are_missing(monkeypatch: pytest.MonkeyPatch) -> None:
+    for code, said in {
+        "raise SystemExit('filters are gone')": "filters are gone",
+        "import os; os.abort()": "ended with status -6",
+        "import nothing_of_that_name": "No module named 'nothing_of_that_name'",
+    }.items():
+        with case(code):
+            finding = doctor._probe(code, "x 1", "no x", "get x")
+            assert finding.state == "missing"
+            assert said in finding.found
     monkeypatch.setattr("pipeline.renders.mitsuba_variant.llvm_libraries", list)
     monkeypatch.setattr(doctor, "_probe", _responds)
     monkeypatch.setattr(doctor, "CHECKS", {"renderer": doctor._renderer})

@@ -23,7 +23,7 @@ from storage.extensions import (
 from storage.registry import Registry
 from tests.command_line import run_program
 from tests.extensions_kit import room_for_extensions, written
-from tests.for_each import for_each
+from tests.for_each import case, for_each
 
 WORDS: Registry[str] = Registry("word", str, {"one": "1"}, decides=("data",))
 """A table to which the extensions of these tests add."""
@@ -86,15 +86,12 @@ def test_mistakes_in_a_file_are_one_line_that_names_it(
         load_extension(path)  # and mended, it loads
 
 
-@for_each("name", ["nowhere.py", "folder.py", "own.txt", f"a{os.pathsep}b.py"])
-def test_what_is_no_file_of_python_is_named(tmp_path: Path, name: str) -> None:
+def test_no_file_of_python_two_of_one_name_and_one_that_changes_are_refused(tmp_path: Path) -> None:
     (tmp_path / "folder.py").mkdir()
     (tmp_path / "own.txt").touch()
-    with pytest.raises(TrilightError, match=r"^extension .*(expected a Python file|cannot be)"):
-        load_extension(tmp_path / name)
-
-
-def test_two_files_of_one_name_and_one_that_changes_under_a_run_are_refused(tmp_path: Path) -> None:
+    for name in ("nowhere.py", "folder.py", "own.txt", f"a{os.pathsep}b.py"):
+        with pytest.raises(TrilightError, match=r"^extension .*(expected a Python file|cannot be)"):
+            load_extension(tmp_path / name)
     (tmp_path / "other").mkdir()
     load_extension(written(tmp_path, ADDS))
     with pytest.raises(TrilightError, match=r"another own\.py is loaded already"):
@@ -118,21 +115,17 @@ def test_what_decides_nothing_is_not_recorded(tmp_path: Path) -> None:
     assert set(extension_digests("weights")) == {"silent.py"}
 
 
-@for_each(
-    ("before", "now", "message"),
-    [
+def test_other_extensions_are_refused_with_a_next_step() -> None:
+    for before, now, message in [
         ({}, {"a.py": "1"}, "begun without the extension a.py; leave --extend a.py away"),
         ({"a.py": "1"}, {}, "begun with the extension a.py, which is not given; add --extend a.py"),
         ({"a.py": "1"}, {"a.py": "2"}, "another extension a.py: its sha256 was 1, now 2; restore"),
-    ],
-)
-def test_other_extensions_are_refused_with_a_next_step(
-    before: dict[str, str], now: dict[str, str], message: str
-) -> None:
-    require_same_extensions("it", before, before)
-    with pytest.raises(TrilightError) as caught:
-        require_same_extensions("it", before, now)
-    assert message in str(caught.value)
+    ]:
+        with case(before):
+            require_same_extensions("it", before, before)
+            with pytest.raises(TrilightError) as caught:
+                require_same_extensions("it", before, now)
+            assert message in str(caught.value)
 
 
 def test_what_decides_something_is_registered_by_a_file_that_a_person_named(tmp_path: Path) -> None:

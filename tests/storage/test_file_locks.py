@@ -37,7 +37,7 @@ from storage.remote.shard_cache import ShardCache
 from storage.settings.ranges import Within
 from storage.typed_json import FINITE, Sha256, read_json, read_json_lines
 from tests.conftest import ROOT
-from tests.for_each import for_each
+from tests.for_each import case, for_each
 from tests.storage.remote.cache_readers import remote
 from train.folder import RunFolder, claim_run
 from train.loop.distributed import DistributedContext
@@ -52,17 +52,13 @@ with hold_lock(Path(sys.argv[1])) as ours:
 """
 
 
-def test_a_claim_has_one_holder(tmp_path: Path) -> None:
+def test_a_claim_has_one_holder_and_ends_with_its_process(tmp_path: Path) -> None:
     path = tmp_path / "folder" / "a.claim"
     with hold_lock(path) as first, hold_lock(path) as second:
         assert first
         assert not second
     with hold_lock(path) as third:
         assert third
-
-
-def test_a_claim_ends_with_its_process(tmp_path: Path) -> None:
-    path = tmp_path / "a.claim"
     command = [sys.executable, "-c", HOLD, str(path)]
     with subprocess.Popen(command, stdout=subprocess.PIPE, text=True, cwd=ROOT) as holder:
         assert holder.stdout is not None
@@ -120,24 +116,19 @@ def test_leftovers_are_cleared_only_where_nobody_works(tmp_path: Path) -> None:
         assert young.exists()  # of another machine, perhaps, that our locks do not reach
 
 
-@for_each(
-    ("number", "passes", "message"),
-    [
+def test_what_may_pass_is_told_from_what_will_not_and_never_waited_for() -> None:
+    """A scheduler tries the first kind again."""
+    for number, passes, message in [
         (errno.ENOSPC, True, "a: the disk is full. What was finished is safe"),
         (errno.EDQUOT, True, "a: the disk is full"),
         (errno.EIO, True, "a: cannot write b"),
         (errno.EACCES, False, "a: cannot write b"),
-    ],
-)
-def test_what_may_pass_is_told_from_what_will_not(number: int, passes: bool, message: str) -> None:
-    """A scheduler tries the first kind again."""
-    error = write_error(Path("a/b"), OSError(number, os.strerror(number)))
-    assert isinstance(error, EnvironmentFailure) == passes
-    assert str(error).startswith(message)
-
-
-def test_a_folder_that_can_never_be_made_is_said_at_once() -> None:
-    """Where /proc says of a folder that it does not exist, as a deleted one would, waiting ends."""
+    ]:
+        with case(number):
+            error = write_error(Path("a/b"), OSError(number, os.strerror(number)))
+            assert isinstance(error, EnvironmentFailure) == passes
+            assert str(error).startswith(message)
+    # where /proc says of a folder that it does not exist, as a deleted one would, waiting ends
     with pytest.raises(TrilightError, match="/proc/nowhere"):
         hold_lock(Path("/proc/nowhere/lock")).__enter__()
 
@@ -202,13 +193,11 @@ def test_who_waits_says_for_whom_and_since_when(
     assert re.search(rf"a\\x1b\]0;b.claim: waiting for \d+ s for {holding}", caplog.messages[0])
 
 
-@for_each(
-    "text",
-    ["", "x", "h 1", "h x 5", "h 1 9999999999999999999", "h 1 nan", "\x1b[1m 1 5", "a b c d"],
-)
-def test_a_claim_that_says_nothing_readable_is_anothers(text: str, tmp_path: Path) -> None:
-    (tmp_path / "a").write_text(text)
-    assert describe_holder(tmp_path / "a").isprintable()
+def test_a_claim_that_says_nothing_readable_is_anothers(tmp_path: Path) -> None:
+    cut_or_odd = ("", "x", "h 1", "h x 5", "h 1 9999999999999999999", "h 1 nan")
+    for text in (*cut_or_odd, "\x1b[1m 1 5", "a b c d"):
+        (tmp_path / "a").write_text(text)
+        assert describe_holder(tmp_path / "a").isprintable(), text
     os.mkfifo(tmp_path / "fifo")
     for name in ("fifo", "none", "."):
         assert describe_holder(tmp_path / name) == "another process"
@@ -268,9 +257,6 @@ def test_a_durable_line_takes_the_place_of_one_that_a_kill_has_cut(tmp_path: Pat
     assert path.read_bytes() == b"two\nthree\n"
     with pytest.raises(TrilightError, match="cannot write"):
         append_line(tmp_path, "x")
-
-
-def test_lines_forgive_an_end_that_a_kill_has_cut_and_nothing_else() -> None:
     whole = b'{"count": 1}\n{"count": 2}\n'
     for torn in (b"", b'{"cou', b"\xff\xff", b"\0\0\0"):
         rows = read_json_lines(whole + torn, Note, "log", torn_end=True)

@@ -95,7 +95,7 @@ def test_a_preview_is_monotone_ends_at_white_and_has_known_values() -> None:
     assert srgb8([-1, 0, 0.003, 0.2140, 1, 7]).tolist() == [0, 0, 10, 127, 255, 255]
 
 
-def test_a_decade_is_zero_db_a_tenth_twenty_and_equal_pictures_are_capped() -> None:
+def test_a_decade_is_zero_db_linear_sees_nothing_above_one_and_background_earns_nothing() -> None:
     assert psnr_log_db(np.full((4, 4, 3), 9.0), np.full((4, 4, 3), 99.0)) == pytest.approx(0)
     picture = np.random.default_rng(0).random((8, 8, 3)) * 10
     brighter = (1 + picture) * 10**0.1 - 1
@@ -104,15 +104,9 @@ def test_a_decade_is_zero_db_a_tenth_twenty_and_equal_pictures_are_capped() -> N
     a, b = np.random.default_rng(1).random((2, 6, 6, 3)) * 100
     for psnr in (psnr_log_db, psnr_linear_db):
         assert psnr(a, b) == psnr(b, a)
-
-
-def test_linear_sees_nothing_above_one() -> None:
     # Twelve and seven: one side clamped elsewhere would still pass with a value of 1 on the other.
     assert psnr_linear_db(np.full(9, 12.0), np.full(9, 7.0)) == MAX_DB
     assert psnr_linear_db(np.full(9, 0.5), np.full(9, 0.6)) == pytest.approx(20)
-
-
-def test_background_earns_nothing() -> None:
     hits = np.zeros((10, 10), bool)
     hits[0, 0] = True
     a, b = np.zeros((10, 10, 3)), np.zeros((10, 10, 3))
@@ -132,13 +126,9 @@ def test_the_interval_of_a_mean_goes_by_clusters() -> None:
     assert mean_interval([0.5] * 4, ["a", "a", "b", "b"]) == (0.5, 0.5)
 
 
-def _smooth_picture() -> np.ndarray:
+def test_pepper_is_noise_and_not_a_smooth_error_and_seams_are_steps_between_tiles() -> None:
     ramp = np.linspace(0.2, 1.5, 64)
-    return np.stack([ramp[:, None] * ramp] * 3, axis=-1)
-
-
-def test_pepper_is_noise_and_not_a_smooth_error() -> None:
-    picture = _smooth_picture()
+    picture = np.stack([ramp[:, None] * ramp] * 3, axis=-1)
     rng = np.random.default_rng(0)
     peppers = [
         pepper(
@@ -153,10 +143,6 @@ def test_pepper_is_noise_and_not_a_smooth_error() -> None:
     assert pepper(offset, picture) < 1e-6
     blurred = np.full_like(picture, picture.mean())
     assert pepper(blurred, picture) == 0
-
-
-def test_seams_are_steps_between_tiles() -> None:
-    picture = _smooth_picture()
     noise = np.random.default_rng(0).normal(0, 0.01, picture.shape)
     noisy = radiance_from_log10(log10_radiance(picture) + noise)
     assert seam(noisy, picture) == pytest.approx(1, abs=0.05)
@@ -169,19 +155,7 @@ def test_seams_are_steps_between_tiles() -> None:
     assert seam(noisy[:8, :8], picture[:8, :8]) > 0, "tiles of a pixel have nothing inside"
 
 
-def test_the_floor_in_closed_form() -> None:
-    scene = from_above()
-    hits = first_hits(scene, resolution=4)
-    _, rays = camera_rays(scene.c2w[0], 90, 4)
-    assert hits.met.all()  # the lamp hangs behind the camera; the picture is the floor exactly
-    np.testing.assert_allclose(hits.depth_m, -1 / rays[..., 2], rtol=1e-12)
-    np.testing.assert_allclose(hits.position[0, 0], [-0.75, 0.75, 0], atol=1e-12)
-    np.testing.assert_array_equal(hits.geometric_normal, np.broadcast_to([0, 0, 1], (4, 4, 3)))
-    np.testing.assert_array_equal(hits.object, 0)
-    np.testing.assert_array_equal(hits.material, np.broadcast_to(scene.materials[0], (4, 4, 10)))
-
-
-def test_emitters_are_hidden_and_normals_interpolated() -> None:
+def test_the_floor_in_closed_form_emitters_are_hidden_and_normals_interpolated() -> None:
     slanted = np.tile(np.array([0, 0, 1], np.float32), (7, 1))
     slanted[0] = [0.6, 0, 0.8]
     scene = from_above(4, 40, vertex_normals=slanted)  # the lamp is before the floor
@@ -193,6 +167,15 @@ def test_emitters_are_hidden_and_normals_interpolated() -> None:
     expected = shares.sum(axis=-2) / np.linalg.norm(shares.sum(axis=-2))
     np.testing.assert_allclose(corner.shading_normal, expected, rtol=1e-6)
     assert corner.shading_normal[0] > 0.05
+    scene = from_above()
+    hits = first_hits(scene, resolution=4)
+    _, rays = camera_rays(scene.c2w[0], 90, 4)
+    assert hits.met.all()  # the lamp hangs behind the camera; the picture is the floor exactly
+    np.testing.assert_allclose(hits.depth_m, -1 / rays[..., 2], rtol=1e-12)
+    np.testing.assert_allclose(hits.position[0, 0], [-0.75, 0.75, 0], atol=1e-12)
+    np.testing.assert_array_equal(hits.geometric_normal, np.broadcast_to([0, 0, 1], (4, 4, 3)))
+    np.testing.assert_array_equal(hits.object, 0)
+    np.testing.assert_array_equal(hits.material, np.broadcast_to(scene.materials[0], (4, 4, 10)))
 
 
 def test_a_small_triangle_far_away_keeps_its_digits() -> None:
@@ -263,7 +246,7 @@ def test_what_is_not_there_is_named() -> None:
 DOWN = np.array([[0, 0, -1]], np.float32)
 
 
-def test_rays_from_both_sides_past_the_floor_and_only_up_to_it() -> None:
+def test_rays_meet_both_sides_up_to_their_length_also_where_lights_stand_first_or_alone() -> None:
     origins = np.array([[0.5, -0.2, 3], [0.5, -0.2, -3], [5, 0, 3]], np.float32)
     met = Surfaces(tiny_scene()).intersect(
         origins, np.array([[0, 0, -2], [0, 0, 1], [0, 0, -1]], "f4")
@@ -275,9 +258,6 @@ def test_rays_from_both_sides_past_the_floor_and_only_up_to_it() -> None:
     above, down = np.repeat(origins[:1], 3, axis=0), np.repeat(DOWN, 3, axis=0)
     free = Surfaces(tiny_scene()).is_free(above, down, np.array([2.9, 3.1, 1e9], np.float32))
     assert free.tolist() == [True, False, False]
-
-
-def test_rows_are_those_of_the_scene_where_lights_stand_first() -> None:
     scene = tiny_scene()
     order = [2, 0, 1]
     moved = tiny_scene(
@@ -289,9 +269,6 @@ def test_rows_are_those_of_the_scene_where_lights_stand_first() -> None:
     met = Surfaces(moved).intersect(above, np.repeat(DOWN, 3, axis=0))
     assert met.triangle[1:].tolist() == [1, 2]
     assert met.triangle[0] in (1, 2), "the lamp lets rays pass"
-
-
-def test_lights_alone() -> None:
     surfaces = Surfaces(join([light([[-1, 0, -1], [1, 0, -1], [0, 0, 1]], 1.0)]))
     origin = np.array([[0, 1, 0]], np.float32)
     toward = np.array([[0, -1, 0]], np.float32)

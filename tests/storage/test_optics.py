@@ -104,13 +104,15 @@ def test_the_mean_is_that_of_the_albedo(smith: Smith, expected: float) -> None:
     assert abs(mean_albedo(np.ones(1), smith)[0] - expected) < 6e-4
 
 
-def test_a_colour_returns_its_own_series_of_reflections() -> None:
+def test_a_colour_returns_its_own_series_of_reflections_and_single_precision_stays() -> None:
     """Fms = F Eavg (1 + F (1 - Eavg) + ...): each further reflection absorbs again."""
     specular, alpha = np.array([[1.0, 0.5, 0.0]]), np.array([0.49])
     mean = mean_albedo(alpha, "correlated")[0]
     series = sum(specular * mean * (specular * (1 - mean)) ** k for k in range(200))
     np.testing.assert_allclose(scattered_again(specular, alpha, "correlated"), series, rtol=1e-12)
     assert scattered_again(specular, alpha, "correlated")[0, 0] == pytest.approx(1)
+    base, metal = np.full((2, 3), 0.5, np.float32), np.zeros((2, 1), np.float32)
+    assert {each.dtype for each in constant_albedos(base, metal)} == {np.dtype(np.float32)}
 
 
 @for_each(("f0", "f90"), [(0.04, 1.0), (0.0, 0.0), (0.02, 0.5), (1.0, 1.0)])
@@ -128,8 +130,3 @@ def test_the_lobe_has_the_cosine_weighted_mean_of_schlick(
     assert specular + 0 * base == pytest.approx(curve.mean(axis=0), abs=1e-6)
     assert diffuse == pytest.approx(base * (1 - metal) * (1 - specular))
     assert (diffuse + specular <= 1 + 1e-12).all()
-
-
-def test_single_precision_stays() -> None:
-    base, metal = np.full((2, 3), 0.5, np.float32), np.zeros((2, 1), np.float32)
-    assert {each.dtype for each in constant_albedos(base, metal)} == {np.dtype(np.float32)}

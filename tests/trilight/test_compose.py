@@ -173,10 +173,22 @@ def test_every_name_is_there(module: ModuleType, missing: str) -> None:
         getattr(module, missing)
 
 
-def test_no_name_is_one_that_a_wheel_needs() -> None:
+def test_names_are_exported_as_imports_call_them_and_none_is_a_wheels(tmp_path: Path) -> None:
     """There `trilight.train` is a package: importing it would replace a function of that name."""
     modules = {path.stem for path in (ROOT / "trilight").glob("*.py")}
     assert not {*trilight.__all__, *modules} & {*PACKAGES, "tests"}
+    module = tmp_path / "package.py"
+    module.write_text(
+        "from typing import TYPE_CHECKING\n"
+        "if TYPE_CHECKING:\n"
+        "    from json import dumps as dumps\n"
+        "    from os.path import join as joined, split as split\n"
+    )
+    assert offered_names(str(module)) == {
+        "dumps": ("json", "dumps"),
+        "joined": ("os.path", "join"),
+        "split": ("os.path", "split"),
+    }
 
 
 def test_each_path_of_a_training_may_be_a_path() -> None:
@@ -186,21 +198,20 @@ def test_each_path_of_a_training_may_be_a_path() -> None:
     assert (start.branch, start.lpips) == ("old", "vgg")
 
 
-@for_each("example", sorted((ROOT / "examples").glob("*.py")))
-def test_examples_import_from_the_face_alone(example: Path) -> None:
-    ours = {
-        node.module
-        for node in ast.walk(ast.parse(example.read_text()))
-        if isinstance(node, ast.ImportFrom) and (node.module or "").split(".")[0] in PACKAGES
-    }
-    assert not ours
-
-
-@for_each("page", ["docs/reference/python.md", "README.md"])
-def test_documents_name_what_is_there(page: str) -> None:
-    text = (ROOT / page).read_text()
-    named = set(re.findall(r"\btrilight\.([A-Za-z_]+)", "\n".join(_code(text))))
-    assert named <= {*trilight.__all__, "extend"}
+def test_examples_import_from_the_face_alone_and_documents_name_what_is_there() -> None:
+    examples = sorted((ROOT / "examples").glob("*.py"))
+    assert examples
+    for example in examples:
+        ours = {
+            node.module
+            for node in ast.walk(ast.parse(example.read_text()))
+            if isinstance(node, ast.ImportFrom) and (node.module or "").split(".")[0] in PACKAGES
+        }
+        assert not ours, example
+    for page in ("docs/reference/python.md", "README.md"):
+        text = (ROOT / page).read_text()
+        named = set(re.findall(r"\btrilight\.([A-Za-z_]+)", "\n".join(_code(text))))
+        assert named <= {*trilight.__all__, "extend"}, page
 
 
 def _code(text: str) -> list[str]:
@@ -258,37 +269,18 @@ def test_the_page_is_a_program() -> None:
 
 
 @pytest.mark.slow("commands")
-def test_the_page_runs(tmp_path: Path) -> None:
+def test_the_page_and_the_lines_of_the_readme_run(tmp_path: Path) -> None:
     """As one program without `if __name__ == "__main__"`, in a folder of its own."""
     program = tmp_path / "program.py"
     program.write_text("\n".join(CODE).replace(*FEW_SAMPLES))
     _require_runs(tmp_path, str(program))
     made = {path.name for path in tmp_path.iterdir()}
     assert {"still.usdz", "still.exr", "network.png", "set", "run", "evaluation"} <= made
-
-
-@pytest.mark.slow("commands")
-def test_the_lines_of_the_readme_run(tmp_path: Path) -> None:
     (code,) = _code((ROOT / "README.md").read_text())
     assert len(code.strip().splitlines()) <= 10
     (tmp_path / "program.py").write_text(code)
     _require_runs(tmp_path, str(tmp_path / "program.py"))
     assert (tmp_path / "knot.png").stat().st_size > 500
-
-
-def test_a_name_is_exported_as_its_import_calls_it(tmp_path: Path) -> None:
-    module = tmp_path / "package.py"
-    module.write_text(
-        "from typing import TYPE_CHECKING\n"
-        "if TYPE_CHECKING:\n"
-        "    from json import dumps as dumps\n"
-        "    from os.path import join as joined, split as split\n"
-    )
-    assert offered_names(str(module)) == {
-        "dumps": ("json", "dumps"),
-        "joined": ("os.path", "join"),
-        "split": ("os.path", "split"),
-    }
 
 
 def test_every_camera_is_rendered_but_where_some_are_named(monkeypatch: pytest.MonkeyPatch) -> None:

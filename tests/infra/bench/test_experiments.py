@@ -143,16 +143,11 @@ def test_every_preset_has_its_own_size_on_a_gpu_and_a_small_one_here() -> None:
             assert (small.loss, small.precision) == (settings.loss, settings.precision)
 
 
-def test_too_little_memory_has_no_figures(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_no_memory_has_no_figures_and_no_gpu_is_said(monkeypatch: pytest.MonkeyPatch) -> None:
     drawn = mock.Mock(side_effect=torch.OutOfMemoryError("CUDA out of memory"))
     monkeypatch.setattr(gpu_steps, "drawn_batch", drawn)
     assert step_figures("smoke", 1, CPU) == {}
     assert drawn.call_args.args[1] == 1, "fewer scenes were tried, down to one"
-
-
-def test_without_a_gpu_the_result_says_that_a_picture_is_compared_with_itself(
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:
     monkeypatch.setattr(gpu_steps, "picture_figures", mock.Mock(return_value={"db": 100.0}))
     notes: list[str] = []
     context = SimpleNamespace(options=BenchOptions(device="cpu"), note=notes.append)
@@ -305,10 +300,15 @@ def test_equal_sides_differ_by_nothing_and_a_step_less_by_something(tmp_path: Pa
     assert measured_rows("paired-training", tmp_path, same)[SIDE_B].values[name] == 0
 
 
-def test_an_interrupted_installation_does_not_count(
+def test_an_interrupted_installation_does_not_count_and_what_fails_is_named(
     monkeypatch: pytest.MonkeyPatch, tmp_path: Path
 ) -> None:
     monkeypatch.setenv("TRILIGHT_CACHE", str(tmp_path))
+    monkeypatch.setattr(environment, "PYTHON", "3.0")
+    with pytest.raises(TrilightError, match=r"^Blender .*python3\.0 is not on the path.*\.$"):
+        environment.blender_python()
+    with pytest.raises(TrilightError, match=r"^Blender .*could not load it: no such wheel\.$"):
+        environment._run("load it", ["sh", "-c", "echo first; echo no such wheel >&2; exit 3"])
     assert environment.installed_python() is None
     steps: list[str] = []
 
@@ -328,17 +328,6 @@ def test_an_interrupted_installation_does_not_count(
     assert f"bpy=={environment.BLENDER} " in environment.LOCK.read_text()
     environment.blender_python()
     assert len(steps) == 2 + 3  # and is remembered
-
-
-def test_a_python_that_is_missing_and_a_failing_step_are_named(
-    monkeypatch: pytest.MonkeyPatch, tmp_path: Path
-) -> None:
-    monkeypatch.setenv("TRILIGHT_CACHE", str(tmp_path))
-    monkeypatch.setattr(environment, "PYTHON", "3.0")
-    with pytest.raises(TrilightError, match=r"^Blender .*python3\.0 is not on the path.*\.$"):
-        environment.blender_python()
-    with pytest.raises(TrilightError, match=r"^Blender .*could not load it: no such wheel\.$"):
-        environment._run("load it", ["sh", "-c", "echo first; echo no such wheel >&2; exit 3"])
 
 
 def test_a_view_is_rendered_once(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

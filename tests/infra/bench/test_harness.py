@@ -149,10 +149,15 @@ def test_every_declaration_is_whole() -> None:
                 assert trials and len(set(trials)) == len(trials)
 
 
-def test_points_are_measured_in_turn(tmp_path: Path) -> None:
+def test_points_are_measured_in_turn_and_a_failed_trial_counts_for_none(tmp_path: Path) -> None:
     found = measured(tmp_path, "a", "b")
     assert calls == [(trial, point) for trial in ("a", "b") for point in TOY_FIGURES]
     assert found.whole_trials() == ["a", "b"]
+    found = measured(tmp_path, "a", "bad", "c")
+    assert found.whole_trials() == ["a", "c"]
+    assert found.left_out == {"bad": "no_scene: it has no light"}
+    with pytest.raises(TrilightError, match="no trial could be measured: no_scene"):
+        measured(tmp_path / "none", "bad")
 
 
 def test_columns_are_over_the_trials_and_pairs_have_their_interval(tmp_path: Path) -> None:
@@ -172,14 +177,6 @@ def test_columns_are_over_the_trials_and_pairs_have_their_interval(tmp_path: Pat
     of_one_scene = dataclasses.replace(one, cluster=lambda trial: "one scene")
     low, high = rows_of(of_one_scene, found)[0].intervals[name]
     assert low == high == cheap.values[name], "intervals are over clusters"
-
-
-def test_a_trial_that_fails_for_one_point_counts_for_none(tmp_path: Path) -> None:
-    found = measured(tmp_path, "a", "bad", "c")
-    assert found.whole_trials() == ["a", "c"]
-    assert found.left_out == {"bad": "no_scene: it has no light"}
-    with pytest.raises(TrilightError, match="no trial could be measured: no_scene"):
-        measured(tmp_path / "none", "bad")
 
 
 def test_results_name_a_dataset_and_not_where_it_lies(tmp_path: Path) -> None:
@@ -230,7 +227,7 @@ def _resume(path: Path, wanted: dict) -> Run:
     return found
 
 
-def test_another_file_is_refused(tmp_path: Path) -> None:
+def test_another_file_a_name_twice_and_what_is_missing_are_refused(tmp_path: Path) -> None:
     for text in ['{"key": 1}\n', "no json\n", "[]\n", '{"plan": {}}\n', "[" * 100_000 + "\n"]:
         with case(text):
             path = tmp_path / "other.jsonl"
@@ -239,6 +236,12 @@ def test_another_file_is_refused(tmp_path: Path) -> None:
                 TrilightError, match="no rows of `trilight bench`.*expected a file that it wrote"
             ):
                 read_runs(path)
+    one = experiment("a")
+    twice = dataclasses.replace(one, points=lambda *given: [*one.points(*given)] * 2)
+    bare = dataclasses.replace(one, needs=("data",))
+    for wrong, said in ((twice, "'cheap' is there twice"), (bare, "--data is not given; expected")):
+        with pytest.raises(TrilightError, match=said):
+            run(wrong, TINY, BenchOptions(), tmp_path / "x.jsonl")
 
 
 def test_the_table_has_every_point_and_the_plot_every_kind(tmp_path: Path) -> None:
@@ -288,21 +291,9 @@ def test_a_run_of_versions_resumes_on_other_machines_commits_and_options(
     assert len(read_runs(out)) == 2
 
 
-def test_a_name_that_is_there_twice_and_what_is_missing_are_named(tmp_path: Path) -> None:
-    one = experiment("a")
-    twice = dataclasses.replace(one, points=lambda *given: [*one.points(*given)] * 2)
-    bare = dataclasses.replace(one, needs=("data",))
-    for wrong, said in ((twice, "'cheap' is there twice"), (bare, "--data is not given; expected")):
-        with pytest.raises(TrilightError, match=said):
-            run(wrong, TINY, BenchOptions(), tmp_path / "x.jsonl")
-
-
-def test_without_a_name_all_are_listed() -> None:
+def test_all_are_listed_and_an_installed_trilight_has_none(monkeypatch: pytest.MonkeyPatch) -> None:
     listed = trilight(["bench"])
     assert listed.exit_code == 0 and "paired-training" in listed.stdout
-
-
-def test_an_installed_trilight_says_where_the_bench_is(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.delitem(sys.modules, "infra.bench.experiment")
     monkeypatch.setitem(sys.modules, "infra.bench", None)
     done = trilight(["bench", "frontier"])
@@ -376,7 +367,7 @@ def made_up_looks(num_layouts: int, seed: int = 0) -> list[Look]:
     return looks
 
 
-def test_the_fit_finds_what_matters_and_keeps_its_risk_on_other_layouts() -> None:
+def test_the_fit_finds_what_matters_in_any_unit_and_keeps_its_risk_on_other_layouts() -> None:
     looks = made_up_looks(240)
     found = fit_metric("log", looks)
     weights = found.weights
@@ -388,6 +379,16 @@ def test_the_fit_finds_what_matters_and_keeps_its_risk_on_other_layouts() -> Non
     assert result.over_1 <= 2 * ALLOWED["log"]["wide"], "0.5 dB of noise, of which 1.5 % may be out"
     assert 0 < result.caution_db < 2
     assert found.judged["128"].layouts == 120
+    # nor do the weights depend on the unit of a measure
+    looks = [look for look in made_up_looks(40) if look.px == 64]
+    other = [
+        dataclasses.replace(
+            look, figures={**look.figures, "log_move": 9 * look.figures["log_move"]}
+        )
+        for look in looks
+    ]
+    ours, theirs = (fit_weights("log", each).weights for each in (looks, other))
+    assert ours == pytest.approx(theirs, abs=1e-6)
 
 
 def test_the_shift_keeps_the_risk_also_where_sampling_stops_and_a_larger_one_does_not() -> None:
@@ -403,32 +404,17 @@ def test_the_shift_keeps_the_risk_also_where_sampling_stops_and_a_larger_one_doe
     assert risk(shift_db) <= 0.015 < risk(shift_db + 0.05)
 
 
-def test_sampling_stops_at_the_first_look_that_states_the_target() -> None:
+def test_sampling_stops_at_the_first_look_that_states_the_target_of_those_that_are_known() -> None:
     looks = [look for look in made_up_looks(1) if look.px == 128]
     stated = np.array([33.0, 35.0, 39.0, 41.0])
     rows = stops("log", looks, stated)
     assert rows == [1, 2, 2, 3, 3, 3], "34 to 44 dB"
-
-
-def test_what_the_reference_leaves_open_is_left_out() -> None:
     (look, *_) = made_up_looks(1)
     for figures in ({"log_open": 0.5, "log_true": 1.0}, {"log_true": -1.0}):
         assert not filter_known(
             "log", [dataclasses.replace(look, figures={**look.figures, **figures})]
         )
     assert filter_known("log", [look]) == [look]
-
-
-def test_fitted_weights_do_not_depend_on_the_unit_of_a_measure() -> None:
-    looks = [look for look in made_up_looks(40) if look.px == 64]
-    other = [
-        dataclasses.replace(
-            look, figures={**look.figures, "log_move": 9 * look.figures["log_move"]}
-        )
-        for look in looks
-    ]
-    ours, theirs = (fit_weights("log", each).weights for each in (looks, other))
-    assert ours == pytest.approx(theirs, abs=1e-6)
 
 
 def _written(path: Path, looks: list[Look], versions: dict[str, str]) -> None:

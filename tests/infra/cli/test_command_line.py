@@ -93,7 +93,7 @@ def test_the_first_page_has_five_sections_and_a_first_command() -> None:
     assert version.exit_code == 0 and re.match(r"trilight \d", version.stdout)
 
 
-def test_presets_lists_what_there_is_by_its_name_for_people() -> None:
+def test_presets_lists_names_for_people_and_settings_as_set_takes_them() -> None:
     shown = trilight(["presets"], env={"COLUMNS": "120"}).stdout
     for name in (
         *DATASET_PRESETS,
@@ -104,23 +104,12 @@ def test_presets_lists_what_there_is_by_its_name_for_people() -> None:
     ):
         assert name in shown
     assert json.loads(trilight(["presets", "--json"]).stdout)["datasets"][0]["scenes"] == 24
-
-
-def test_the_settings_of_a_preset_are_listed_as_set_takes_them() -> None:
     told = json.loads(trilight(["presets", "tiny", "--json"]).stdout)
     values = told["trilight generate tiny"]
     assert apply_overrides(preset_settings("pretrain-256"), values) == preset_settings("tiny")
     assert told["trilight train tiny"]["num_steps"] == TRAINING_PRESETS["smoke"]().num_steps
     assert "renders.resolution" in trilight(["presets", "pretrain-256"]).stdout
     assert "did you mean tiny?" in trilight(["presets", "tny"]).mistake
-
-
-def test_a_digest_is_on_one_line(monkeypatch: pytest.MonkeyPatch) -> None:
-    out = io.StringIO()
-    narrow = console._TextConsole(file=out, width=60, markup=False)
-    monkeypatch.setattr(console, "console", narrow)
-    console.print_rows("title", [("a long name of a digest", "ab" * 32), ("other", "words")])
-    assert f"a long name of a digest {'ab' * 32}\n" in out.getvalue()
 
 
 MISTAKES = {
@@ -168,14 +157,11 @@ def test_what_cannot_be_asked_is_one_line() -> None:
             assert ended.exit_code == 1 and ended.mistake.startswith(message)
 
 
-def test_the_real_command_names_no_module() -> None:
+def test_the_real_command_names_no_module_and_lacks_memory_in_one_sentence(tmp_path: Path) -> None:
     found = run_program([sys.executable, "-m", "trilight", "verify"], status=2)
     assert "infra.cli" not in found.stdout + found.stderr
     assert "trilight verify" in found.stdout + found.stderr
-
-
-def test_too_little_memory_is_one_sentence(tmp_path: Path) -> None:
-    """Where more is left, libraries end the process in ways of their own."""
+    # where more memory is left, libraries end the process in ways of their own
     train = f"{sys.executable} -m trilight train smoke --data {tmp_path} --out {tmp_path}/run"
     ended = run_program(["bash", "-c", f"ulimit -v 300000; exec {train}"], status=1)
     *before, last = ended.stderr.splitlines()
@@ -264,7 +250,7 @@ def test_the_page_of_quantities_names_what_a_condition_can_ask() -> None:
         condition(text)
 
 
-def test_a_log_has_a_line_of_progress_a_minute(
+def test_a_log_has_a_line_of_progress_a_minute_and_a_digest_is_on_one_line(
     monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     now = [0.0]
@@ -279,6 +265,11 @@ def test_a_log_has_a_line_of_progress_a_minute(
         bars.advance(task)
         said = capsys.readouterr().out
     assert said.splitlines() == [f"scenes {done} of 8, noted" for done in (3, 6, 7)]
+    out = io.StringIO()
+    narrow = console._TextConsole(file=out, width=60, markup=False)
+    monkeypatch.setattr(console, "console", narrow)
+    console.print_rows("title", [("a long name of a digest", "ab" * 32), ("other", "words")])
+    assert f"a long name of a digest {'ab' * 32}\n" in out.getvalue()
 
 
 def test_what_is_printed_tells_the_terminal_nothing(monkeypatch: pytest.MonkeyPatch) -> None:

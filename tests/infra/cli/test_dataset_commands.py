@@ -69,7 +69,7 @@ def test_the_report_stands_in_the_dataset(tmp_path: Path) -> None:
     assert read["rejections"][0] == ["scenes", "no_room", 2]
 
 
-def test_a_run_is_summed_up_and_the_command_that_shows_it_named(tmp_path: Path) -> None:
+def test_a_run_is_summed_up_by_its_last_numbers_and_damage_is_named(tmp_path: Path) -> None:
     write_run(tmp_path / "my run")
     printed = expect_output("inspect", tmp_path / "my run")
     assert f"tensorboard --logdir '{tmp_path}/my run'" in printed and "steps planned" in printed
@@ -81,6 +81,33 @@ def test_a_run_is_summed_up_and_the_command_that_shows_it_named(tmp_path: Path) 
     assert f"{resume} --data as before." in printed
     (tmp_path / "my run/summary.json").write_text("{}")
     assert "To resume" not in expect_output("inspect", tmp_path / "my run")
+    with pytest.raises(TrilightError, match="no run here; expected a folder that `trilight train`"):
+        run_facts(tmp_path)
+    write_run(tmp_path / "run")
+    assert is_run(tmp_path / "run") and not is_run(tmp_path)
+    facts = {
+        "run": "tiny",
+        "steps": 12,
+        "steps_planned": 12,
+        "finished": False,
+        "spikes": 1,
+        "training_loss": 1 / 12,
+        "validation_log_l1": 0.1,
+        "validation_psnr_log_db_median": 20.0,
+        "views_per_s": 3.0,
+    }
+    assert run_facts(tmp_path / "run") == facts
+    metrics = tmp_path / "run/metrics.jsonl"
+    with metrics.open("a") as log:
+        log.write('{"step": 12, "loss": null, "validation": {"log_l1": NaN}}\n')
+    (tmp_path / "run/summary.json").write_text("{}")
+    assert run_facts(tmp_path / "run") == facts | {"finished": True}
+    metrics.write_text("")
+    assert run_facts(tmp_path / "run")["steps"] == 0
+    for damaged in ("{\n", "[]\n", '{"loss": 1}\n', "3\n"):
+        metrics.write_text(damaged)
+        with pytest.raises(TrilightError, match="is not readable .* Restore it from a copy"):
+            run_facts(tmp_path / "run")
 
 
 def test_a_dataset_that_is_read_only_stays_as_it_is(
@@ -155,10 +182,8 @@ def test_merge_select_and_reshard(tmp_path: Path) -> None:
     assert "0 of 12 scenes" in expect_output(
         "shards", "list", tmp_path / "ab", "--where", "max(coverage) > 2"
     )
-    size = ("--scenes-per-shard", "5", "--json")
-    outcome = json.loads(
-        expect_output("shards", "reshard", tmp_path / "ab", "--out", tmp_path / "d", *size)
-    )
+    size = ("--scenes-per-shard", "5")
+    outcome = expect_json("shards", "reshard", tmp_path / "ab", "--out", tmp_path / "d", *size)
     assert outcome["scenes_by_split"] == {"test": 4, "train": 8}
     assert outcome["dataset_digest"] == open_dataset(str(tmp_path / "d")).digest
     out = ("--out", tmp_path / "e")
@@ -166,11 +191,7 @@ def test_merge_select_and_reshard(tmp_path: Path) -> None:
     lacking = "expected --where, --split, --template or --min-noise-floor"
     assert lacking in expect_mistake("shards", "select", a, *out)
     assert not (tmp_path / "e").exists()
-
-
-def test_a_bad_derived_shard_is_made_of_its_sources_again(tmp_path: Path) -> None:
-    a, b = finished(tmp_path / "a", scenes(0)), finished(tmp_path / "b", scenes(1), seed=1)
-    expect_output("shards", "merge", a, b, "--out", tmp_path / "ab")
+    # a bad derived shard is made of its sources again
     (tmp_path / "ab" / "train-000001.tar").unlink()
     found = trilight(["verify", str(tmp_path / "ab")])
     assert found.exit_code == 1
@@ -248,12 +269,10 @@ def test_status_says_how_far_and_what_next(tmp_path: Path) -> None:
     publication = begin_tiny(tmp_path, 12)
     make_tiny_shard(publication, 0)
     log_scene(publication.folder, "x", 0, seconds=1800.0, cores=2, num_rejected=0)
-    shown = trilight(["status", str(tmp_path)], env={"COLUMNS": "200"})
-    assert shown.exit_code == 0, shown.output
+    shown = expect_output("status", tmp_path, **WIDE)
     for text in ("1 of 3", "4 of 12", "no_camera", "1.00 core-hours, 0.04 USD", "--scenes 12"):
-        assert text in shown.output
-    told = trilight(["status", str(tmp_path), "--json", "--price", "0.5"])
-    row = json.loads(told.output)
+        assert text in shown
+    row = expect_json("status", tmp_path, "--price", "0.5")
     assert (row["shards_done"], row["scenes_planned"], row["finished"]) == (1, 12, False)
     assert row["cost_usd"] == 0.5
     announce_objects(publication.folder, 7)
@@ -291,38 +310,6 @@ def test_objects_of_one_split_limit_the_scenes_to_that_split() -> None:
     assert generate_from_meshes([training], Path("meshes"), ())[-2:] == ["--scenes", "8"]
     words = generate_from_meshes([testing], Path("meshes"), ())
     assert words[-2:] == ["--set", "splits.one_split=true"]
-
-
-def test_the_facts_are_the_last_figures_that_are_numbers_and_damage_is_named(
-    tmp_path: Path,
-) -> None:
-    with pytest.raises(TrilightError, match="no run here; expected a folder that `trilight train`"):
-        run_facts(tmp_path)
-    write_run(tmp_path / "run")
-    assert is_run(tmp_path / "run") and not is_run(tmp_path)
-    facts = {
-        "run": "tiny",
-        "steps": 12,
-        "steps_planned": 12,
-        "finished": False,
-        "spikes": 1,
-        "training_loss": 1 / 12,
-        "validation_log_l1": 0.1,
-        "validation_psnr_log_db_median": 20.0,
-        "views_per_s": 3.0,
-    }
-    assert run_facts(tmp_path / "run") == facts
-    metrics = tmp_path / "run/metrics.jsonl"
-    with metrics.open("a") as log:
-        log.write('{"step": 12, "loss": null, "validation": {"log_l1": NaN}}\n')
-    (tmp_path / "run/summary.json").write_text("{}")
-    assert run_facts(tmp_path / "run") == facts | {"finished": True}
-    metrics.write_text("")
-    assert run_facts(tmp_path / "run")["steps"] == 0
-    for damaged in ("{\n", "[]\n", '{"loss": 1}\n', "3\n"):
-        metrics.write_text(damaged)
-        with pytest.raises(TrilightError, match="is not readable .* Restore it from a copy"):
-            run_facts(tmp_path / "run")
 
 
 def loaded(path: Path, key: str = "") -> Scene:
@@ -367,7 +354,9 @@ def test_a_strangers_stage_within_a_budget(tmp_path: Path, monkeypatch: pytest.M
     loaded(tmp_path / "few.safetensors").check()
 
 
-def test_mistakes(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_mistakes_and_a_crash_in_native_code_are_one_line(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     for name in ("a.txt", "empty.h5"):
         (tmp_path / name).touch()
     (tmp_path / "a.usda").write_text("#usda 1.0\n")
@@ -389,11 +378,6 @@ def test_mistakes(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
         with case(source):
             assert message in expect_mistake("convert", source, target)
         assert set(tmp_path.iterdir()) == before, source
-
-
-def test_a_crash_in_native_code_is_one_line(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
     stage = write_stage(tmp_path)
     use_processes(monkeypatch)
     monkeypatch.setenv("TRILIGHT_CONFINE", "off")  # a confined child reads no function of tests
@@ -402,17 +386,14 @@ def test_a_crash_in_native_code_is_one_line(
     assert "stage.usda: could not be read (crashed_signal_11" in told
 
 
-@pytest.fixture
-def dataset(tmp_path: Path) -> Path:
+def test_passes_are_of_the_views_that_are_named_and_take_a_gpu_that_passes_the_probe(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Of a dataset, of one scene of it, and of the file of a scene; what is not there is named."""
+    dataset, out = tmp_path / "data", tmp_path / "out"
     scenes = {"train-000000.tar": [0, 1], "test-000001.tar": [2]}
     shards = {name: [sample(i, furnished(["a"])) for i in rows] for name, rows in scenes.items()}
-    write_dataset(tmp_path / "data", shards)
-    return tmp_path / "data"
-
-
-def test_passes_are_of_the_views_that_are_named(dataset: Path, tmp_path: Path) -> None:
-    """Of a dataset, of one scene of it, and of the file of a scene; what is not there is named."""
-    out = tmp_path / "out"
+    write_dataset(dataset, shards)
     words = ("--passes", "normal,depth", "--passes", "object", "--device", "cpu", "--out", out)
     found = expect_json("passes", dataset, *words)
     assert found["passes"] == ["object", "depth_axis_m", "shading_normal"]
@@ -444,29 +425,23 @@ def test_passes_are_of_the_views_that_are_named(dataset: Path, tmp_path: Path) -
         assert message in expect_mistake(
             "passes", dataset, option, value, "--out", tmp_path / "none"
         )
-    assert not (tmp_path / "none").exists()
-
-
-def test_passes_take_a_gpu_that_passes_the_probe(
-    dataset: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    """Here LLVM stands for it; without one `gpu` is refused, and a failed probe is a note."""
+    # here LLVM stands for a GPU; without one `gpu` is refused, and a failed probe is a note
     monkeypatch.setenv("CUDA_VISIBLE_DEVICES", "")
-    words = ("passes", dataset, "--scene", "1", "--view", "1", "--passes", "object")
-    told = expect_mistake(*words, "--device", "gpu", "--out", tmp_path / "none")
+    on_gpu = ("passes", dataset, "--scene", "1", "--view", "1", "--passes", "object")
+    told = expect_mistake(*on_gpu, "--device", "gpu", "--out", tmp_path / "none")
     assert "--device is gpu, and no NVIDIA GPU is visible here" in told
     assert not (tmp_path / "none").exists()
     traced = []
-    for found in ((choose_variant("cpu"), ""), (None, "the GPU renders no right picture")):
-        monkeypatch.setattr(passes_command, "choose_gpu", lambda *_, device, found=found: found)
+    for probed in ((choose_variant("cpu"), ""), (None, "the GPU renders no right picture")):
+        monkeypatch.setattr(passes_command, "choose_gpu", lambda *_, device, found=probed: found)
         with monkeypatch.context() as patched:
             patched.setattr(passes_command, "Surfaces", lambda scene: traced.append(scene))
-            notes = expect_json(*words, "--out", tmp_path / "out")["notes"]
-        assert ("see trilight doctor" in str(notes)) == bool(found[1])
-        assert len(traced) == bool(found[1])
+            notes = expect_json(*on_gpu, "--out", tmp_path / "out")["notes"]
+        assert ("see trilight doctor" in str(notes)) == bool(probed[1])
+        assert len(traced) == bool(probed[1])
 
 
-def test_a_size_is_described() -> None:
+def test_a_size_is_described_and_a_checkpoint_published_too(tmp_path: Path) -> None:
     text = trilight(["model", "base"]).stdout
     for word in ("194.96 M", "692.7 GFLOP", "memory, bfloat16", "cross-attention"):
         assert word in text
@@ -475,9 +450,6 @@ def test_a_size_is_described() -> None:
     assert found["workload"] == {"resolution": 512, "triangles": 1536, "views": 4}
     assert found["config"]["window_bundles"] == 8
     assert found["weight_bytes"]["bfloat16"] < 0.51 * found["weight_bytes"]["float32"]
-
-
-def test_a_checkpoint_is_described_and_published(tmp_path: Path) -> None:
     model = awake(publishable("swin"), torch.float32)
     path = tmp_path / "model.safetensors"
     path.write_bytes(encode_weights(model))

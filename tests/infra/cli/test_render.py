@@ -133,7 +133,9 @@ def test_every_form_of_a_scene_gives_one_picture_by_both_engines(
     assert traced[0].shape == (16, 16, 3) and traced[0].mean() > 0.01
 
 
-def test_a_picture_says_how_it_was_made(source: Path, network: Path, tmp_path: Path) -> None:
+def test_pictures_by_both_engines_say_how_they_were_made_and_stand_side_by_side(
+    source: Path, network: Path, tmp_path: Path
+) -> None:
     out = tmp_path / "x.exr"
     both = ("--engine", "both", "--checkpoint", network, "--seed", str(1 << 40))
     outcome = render(source, "--out", out, *both)
@@ -161,25 +163,18 @@ def test_a_picture_says_how_it_was_made(source: Path, network: Path, tmp_path: P
     first = {name: path.read_bytes() for name, path in files.items()}
     render(source, "--out", out, *both)
     assert {name: path.read_bytes() for name, path in files.items()} == first
-
-
-def test_both_engines_stand_side_by_side(network: Path, source: Path, tmp_path: Path) -> None:
-    out, arguments = tmp_path / "x.exr", ("--engine", "both", "--checkpoint", network)
-    found = render(source, "--out", out, *arguments)
-    traced, drawn = (
-        decode_exr((tmp_path / f"x.{name}.exr").read_bytes()) for name in ("mitsuba", "neural")
-    )
+    by_path, by_network = (decode_exr(data) for data in first.values())
     assert not out.exists()
-    assert found["psnr_log_db"] == pytest.approx(psnr_log_db(drawn, traced), abs=1e-3)
+    assert outcome["psnr_log_db"] == pytest.approx(psnr_log_db(by_network, by_path), abs=1e-3)
     sheet = shown(tmp_path / "x.png")
     assert sheet.shape == (256 + 24, 3 * 256 + 2 * 8, 3)
     left, middle, right = (sheet[24::16, at : at + 256 : 16] for at in (0, 264, 528))
-    np.testing.assert_array_equal(left, preview_srgb8(traced))
-    np.testing.assert_array_equal(middle, preview_srgb8(drawn))
-    np.testing.assert_array_equal(right, error_picture(drawn, traced))
-    said = printed(source, "--out", out, *arguments, *SMALL, "--exposure", "-2")
+    np.testing.assert_array_equal(left, preview_srgb8(by_path))
+    np.testing.assert_array_equal(middle, preview_srgb8(by_network))
+    np.testing.assert_array_equal(right, error_picture(by_network, by_path))
+    said = printed(source, "--out", out, *both, *SMALL, "--exposure", "-2")
     darker = shown(tmp_path / "x.png")
-    np.testing.assert_array_equal(darker[24::16, :256:16], preview_srgb8(traced / 4))
+    np.testing.assert_array_equal(darker[24::16, :256:16], preview_srgb8(by_path / 4))
     np.testing.assert_array_equal(darker[24:, 528:], sheet[24:, 528:])  # an error stays one
     for text in ("agreement", "samples per pixel", "model.safetensors; passes: 1", "x.png"):
         assert text in said
@@ -270,7 +265,9 @@ def test_a_stage_that_moves_is_drawn_frame_by_frame_by_both_engines(
         assert text in said
 
 
-def test_a_target_governs_and_is_the_floor_that_is_said(source: Path, tmp_path: Path) -> None:
+def test_a_target_governs_and_its_floor_and_what_is_probable_are_said(
+    source: Path, tmp_path: Path
+) -> None:
     out = tmp_path / "x.exr"
     words = (source, "--out", out, "--resolution", "16", "--noise-floor-linear", "5")
     said = printed(*words, "--max-spp", "64")
@@ -281,11 +278,7 @@ def test_a_target_governs_and_is_the_floor_that_is_said(source: Path, tmp_path: 
     both = printed(*words, "--noise-floor-objects", "95", "--max-spp", "8")
     assert "clamped to [0, 1]; reached 5 dB)" in both
     assert "geometry is seen; the cap came before 95 dB)" in both
-
-
-def test_a_promise_and_what_is_probable_are_said(source: Path, tmp_path: Path) -> None:
-    """At a width that is calibrated; elsewhere the bound is named."""
-    out = tmp_path / "x.exr"
+    # at a width that is calibrated; elsewhere the bound is named
     words = (source, "--out", out, "--noise-floor", "5", "--max-spp", "128")
     assert "probably" not in printed(*words, "--resolution", "64", "--stated-error", "bound")
     said = printed(*words, "--resolution", "64")
@@ -331,7 +324,9 @@ def test_parts_stand_as_layers_in_the_file_of_the_picture(source: Path, tmp_path
         assert shot["diffuse_indirect.noise_floor_db"] == 100.0
 
 
-def test_a_preview_says_that_its_error_is_unknown(source: Path, tmp_path: Path) -> None:
+def test_a_preview_says_that_its_error_is_unknown_and_what_is_chosen_is_recorded(
+    source: Path, tmp_path: Path
+) -> None:
     out = tmp_path / "x.exr"
     words = (source, "--out", out, "--resolution", "16", "--spp", "3")
     said = printed(*words)
@@ -343,12 +338,8 @@ def test_a_preview_says_that_its_error_is_unknown(source: Path, tmp_path: Path) 
     assert not [name for name in found if "noise_floor" in name]
     assert expect_json("render", *words)["spp"] == 3
     assert "3, not denoised" in printed(*words, "--denoiser", "off")
-
-
-def test_what_is_chosen_is_said_made_and_recorded(source: Path, tmp_path: Path) -> None:
-    out = tmp_path / "x.exr"
-    words = (source, "--out", out, "--resolution", "32")
-    said = printed(*words, "--error", "20")
+    asked = (source, "--out", out, "--resolution", "32")
+    said = printed(*asked, "--error", "20")
     assert "--error 20: chosen: " in said and "a pixel, filter fast; expected" in said
     assert f"dB in the median of {shipped_table().scenes} scenes" in said
     assert "stated error unknown: a preview measures none" in said
@@ -359,13 +350,13 @@ def test_what_is_chosen_is_said_made_and_recorded(source: Path, tmp_path: Path) 
     assert json.loads(recorded["settings"])["spp"] == recorded["spp"]
     for option, value in (("--seconds", "1e-9"), ("--seconds", "0.05"), ("--error", "0")):
         with case(f"{option} {value}"):
-            found = expect_json("render", *words, option, value)
+            found = expect_json("render", *asked, option, value)
             assert found["chosen_for"] == f"{option} {value}".replace("1e-9", "1e-09")
             assert found["choice"].startswith(found["chosen_for"])
             assert ("nothing is as quick" in found["choice"]) == (value == "1e-9")
             assert found["picture_seconds"] > 0 and found["expected_seconds"] > 0
             assert "noise_floor_db" not in found
-    orbit = (source, "--out", tmp_path / "turn", "--orbit", "2", *words[3:], "--seconds", "1e-9")
+    orbit = (source, "--out", tmp_path / "turn", "--orbit", "2", *asked[3:], "--seconds", "1e-9")
     for kept in (False, True):
         for picture in expect_json("render", *orbit)["pictures"]:
             assert (picture["kept"], picture["picture_seconds"] is None) == (kept, kept)

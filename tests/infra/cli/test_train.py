@@ -216,7 +216,7 @@ def test_a_preset_like_another_is_that_other() -> None:
             assert merge_overrides(other, BaseSettings(), record, {}) == {}
 
 
-def test_a_dataset_is_followed_and_options_count_more(tmp_path: Path) -> None:
+def test_a_dataset_and_a_run_are_followed_and_options_count_more(tmp_path: Path) -> None:
     publication = begin_tiny(tmp_path / "set", 12)
     record = read_manifest(publication.folder.manifest).settings
     shared = BaseSettings(
@@ -231,9 +231,18 @@ def test_a_dataset_is_followed_and_options_count_more(tmp_path: Path) -> None:
     settings = preset_settings(FAR, changes=changes)
     assert (settings.seed, settings.renders.resolution, settings.renders.max_spp) == (1, 32, 128)
     assert settings.scenes.num_views == record["scenes"]["num_views"]
+    # a run as far as the data, which are not there: the settings were checked before
+    of_run: dict[str, Any] = settings_record(training_preset("smoke")) | {"num_steps": 7}
+    (tmp_path / "settings.json").write_text(json.dumps({"settings": of_run}))
+    words = ["train", "smoke", "--like", str(tmp_path), "--data", str(tmp_path / "no")]
+    with pytest.raises(TrilightError, match="warmup_steps is 50"):
+        apply_overrides(training_preset("smoke"), {"num_steps": 7})
+    assert "warmup_steps is 50" in trilight(words).mistake
+    ended = trilight([*words, "--set", "warmup_steps=2"])
+    assert "Run smoke: 7 steps" in ended.stdout
 
 
-def test_a_floor_that_is_asked_for_replaces_those_of_a_file(tmp_path: Path) -> None:
+def test_floors_replace_those_of_a_file_and_licences_stand_beside_its_own(tmp_path: Path) -> None:
     file = _file(tmp_path, "renders: {noise_floor_db: 44, noise_floor_objects_db: 43}\n")
     order = with_base_settings(
         GenerateOptions(noise_floor_linear_db=36.0), BaseSettings(settings=file)
@@ -246,9 +255,34 @@ def test_a_floor_that_is_asked_for_replaces_those_of_a_file(tmp_path: Path) -> N
         "psnr_log_db": 44.0,
         "object_psnr_log_db": 43.0,
     }
+    order = GenerateOptions(allow_licences=("CC-BY-NC-4.0",))
+    for text, others in (
+        ("seed: 1\n", preset_settings("smoke").allowed_licences),
+        ("allowed_licences: [MIT]\n", ("MIT",)),
+    ):
+        found = with_base_settings(order, BaseSettings(settings=_file(tmp_path, text)))
+        settings = preset_settings(
+            "smoke", allow_licences=found.allow_licences, changes=found.changes
+        )
+        assert settings.allowed_licences == tuple(sorted({*others, "CC-BY-NC-4.0"}))
 
 
-def test_a_file_says_what_set_would(tmp_path: Path) -> None:
+WRONG: dict[str, tuple[str, str]] = {
+    "seed: 1\nseed: 2\n": ("line 2", "seed is given twice"),
+    "- seed\n": ("line 1", "expected names with values"),
+    "? [a]\n: 1\n": ("line 1", "expected the name of a setting"),
+    "a: [{b: 1, b: 2}]\n": ("line 1", "a name is given twice"),
+    "seed: 1\nrenders:\n  resolution: wide\n": ("line 3", "'renders.resolution' is 'wide'"),
+    "seeed: 1\n": ("line 1", "did you mean seed?"),
+    "a: &a [1, 1]\nb: [*a, *a]\n": ("line 2", "an alias; expected the value itself"),
+    "seed: &a [*a]\n": ("line 1", "an alias"),
+    f"seed: {'9' * 10_000}\n": ("line 1", "seed: 9999"),
+}
+
+
+def test_a_file_says_what_set_would_and_what_is_wrong_is_named_with_its_line(
+    tmp_path: Path,
+) -> None:
     """Plain words are JSON or words, and quoted ones texts: YAML's own rules read 1e-3 as one."""
     stated = read_settings_file(str(Path(__file__).parent / "shared.yaml"))
     found = {name: value for name, (value, _) in stated.items()}
@@ -267,22 +301,6 @@ def test_a_file_says_what_set_would(tmp_path: Path) -> None:
     base = BaseSettings(settings=_file(tmp_path, "model: {width: 60}\nloss.perceptual: none\n"))
     changes = merge_overrides(training_preset("smoke"), base, {}, {"model": "tiny"})
     assert changes == {"loss.perceptual": "none", "model": "tiny"}
-
-
-WRONG: dict[str, tuple[str, str]] = {
-    "seed: 1\nseed: 2\n": ("line 2", "seed is given twice"),
-    "- seed\n": ("line 1", "expected names with values"),
-    "? [a]\n: 1\n": ("line 1", "expected the name of a setting"),
-    "a: [{b: 1, b: 2}]\n": ("line 1", "a name is given twice"),
-    "seed: 1\nrenders:\n  resolution: wide\n": ("line 3", "'renders.resolution' is 'wide'"),
-    "seeed: 1\n": ("line 1", "did you mean seed?"),
-    "a: &a [1, 1]\nb: [*a, *a]\n": ("line 2", "an alias; expected the value itself"),
-    "seed: &a [*a]\n": ("line 1", "an alias"),
-    f"seed: {'9' * 10_000}\n": ("line 1", "seed: 9999"),
-}
-
-
-def test_what_is_wrong_in_a_file_is_named_with_its_line(tmp_path: Path) -> None:
     for command in ["generate", "plan"]:
         for text in WRONG:
             with case((command, text)):
@@ -299,31 +317,6 @@ def test_what_is_wrong_in_a_file_is_named_with_its_line(tmp_path: Path) -> None:
     for option in ("--settings", "--like"):
         told = trilight(["train", "smoke", option, "nowhere"]).mistake
         assert told.startswith(f"{option} nowhere: ")
-
-
-def test_a_run_is_followed_on_the_command_line(tmp_path: Path) -> None:
-    """As far as the data, which are not there: the settings were checked before."""
-    record: dict[str, Any] = settings_record(training_preset("smoke")) | {"num_steps": 7}
-    (tmp_path / "settings.json").write_text(json.dumps({"settings": record}))
-    words = ["train", "smoke", "--like", str(tmp_path), "--data", str(tmp_path / "no")]
-    with pytest.raises(TrilightError, match="warmup_steps is 50"):
-        apply_overrides(training_preset("smoke"), {"num_steps": 7})
-    assert "warmup_steps is 50" in trilight(words).mistake
-    ended = trilight([*words, "--set", "warmup_steps=2"])
-    assert "Run smoke: 7 steps" in ended.stdout
-
-
-def test_licences_are_allowed_beside_those_of_a_file(tmp_path: Path) -> None:
-    order = GenerateOptions(allow_licences=("CC-BY-NC-4.0",))
-    for text, others in (
-        ("seed: 1\n", preset_settings("smoke").allowed_licences),
-        ("allowed_licences: [MIT]\n", ("MIT",)),
-    ):
-        found = with_base_settings(order, BaseSettings(settings=_file(tmp_path, text)))
-        settings = preset_settings(
-            "smoke", allow_licences=found.allow_licences, changes=found.changes
-        )
-        assert settings.allowed_licences == tuple(sorted({*others, "CC-BY-NC-4.0"}))
 
 
 def test_a_finished_run_names_what_evaluates_it(capsys: pytest.CaptureFixture[str]) -> None:

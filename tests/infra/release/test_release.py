@@ -5,7 +5,6 @@ import hashlib
 import json
 import os
 import sys
-from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -138,19 +137,10 @@ for token, words in json.loads(sys.argv[1]):
     ended = trilight(["push", *words])
     print(json.dumps([ended.exit_code, ended.stdout, ended.stderr, os.listdir(sys.argv[2])]))
 """
+"""Pushes with tokens, in a process of its own: the package reads where the hub is at import.
 
-
-def pushed(
-    asked: Sequence[tuple[str, list[str]]], settings: Mapping[str, str], there: Path
-) -> list[tuple[int, str, str, list[str]]]:
-    """Push with tokens in a process of its own: the package reads where the hub is at import.
-
-    Returns:
-        The exit status, stdout and stderr of each push, and what the hub holds after it.
-    """
-    command = [sys.executable, "-c", PUSHES, json.dumps(asked), str(there)]
-    said = run_program(command, env=settings).stdout
-    return [tuple(json.loads(line)) for line in said.splitlines()]
+It prints the exit status, stdout and stderr of each push, and what the hub holds after it.
+"""
 
 
 def test_the_hub_gets_every_file_and_reads_as_it_was(dataset: Dataset, tmp_path: Path) -> None:
@@ -159,7 +149,13 @@ def test_the_hub_gets_every_file_and_reads_as_it_was(dataset: Dataset, tmp_path:
     with running(_Hub, root=there, token=TOKEN, made=made) as url:
         words = [str(dataset.folder.root), "ada/set", "--json"]
         asked = [("hf_other", words), (TOKEN, [*words, "--private"]), (TOKEN, words)]
-        refused, public, result = pushed(asked, settings_of(url, TOKEN, tmp_path / "home"), there)
+        # it uploads there, and touches nothing of the user's
+        kept = {name: value for name, value in os.environ.items() if not name.startswith("HF_")}
+        quiet = {"HF_HUB_DISABLE_XET": "1", "HF_HUB_DISABLE_PROGRESS_BARS": "1"}
+        hub = {"HF_ENDPOINT": url, "HF_TOKEN": TOKEN, "HF_HOME": str(tmp_path / "home")}
+        command = [sys.executable, "-c", PUSHES, json.dumps(asked), str(there)]
+        ended = run_program(command, env={**kept, **quiet, **hub}).stdout.splitlines()
+    refused, public, result = map(json.loads, ended)
     assert refused[0] == 1 and "set HF_TOKEN" in refused[1] + refused[2]
     assert public[0] == 1 and "already and public" in public[1] + public[2]
     assert refused[3] == public[3] == [], "a refused push has sent nothing"
@@ -176,7 +172,7 @@ def test_the_hub_gets_every_file_and_reads_as_it_was(dataset: Dataset, tmp_path:
     assert not verify_dataset(there).problems
 
 
-def test_what_kind_a_folder_is(dataset: Dataset, tmp_path: Path) -> None:
+def test_what_kind_a_folder_is_and_what_sends_nothing(dataset: Dataset, tmp_path: Path) -> None:
     assert kind_of(dataset.folder.root) == "dataset"
     for name, kind in (("model.safetensors", "model"), ("index.html", "space")):
         place = tmp_path / kind
@@ -185,9 +181,11 @@ def test_what_kind_a_folder_is(dataset: Dataset, tmp_path: Path) -> None:
         assert kind_of(place) == kind
     with pytest.raises(TrilightError, match="expected a folder of this machine"):
         kind_of(tmp_path / "absent")
-
-
-def test_nothing_is_sent_that_nobody_could_use(dataset: Dataset, tmp_path: Path) -> None:
+    words = ["push", str(dataset.folder.root), "ada/my_set-1.0"]
+    said = expect_output(*words, "--private", "--dry-run")
+    assert "Would be uploaded" in said
+    assert f"Next: trilight {' '.join(words)} --private" in said
+    # nothing is sent that nobody could use
     root = dataset.folder.root
     for name in ("set", "a/b/c", "ada/my set", "ada/-set", "a--b/set", "ada/set.git"):
         with pytest.raises(TrilightError, match="expected USER/NAME"):
@@ -217,13 +215,6 @@ def test_the_limits_of_the_hub(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) 
             patched.setattr(pushing, limit, value)
             with pytest.raises(TrilightError, match=message):
                 require_within_limits(tmp_path)
-
-
-def test_a_dry_run_sends_nothing(dataset: Dataset) -> None:
-    words = ["push", str(dataset.folder.root), "ada/my_set-1.0"]
-    said = expect_output(*words, "--private", "--dry-run")
-    assert "Would be uploaded" in said
-    assert f"Next: trilight {' '.join(words)} --private" in said
 
 
 LARGE = (".tar", ".safetensors")
@@ -299,10 +290,3 @@ class _Hub(Handler):
             place = self.root / value["path"]
             place.parent.mkdir(parents=True, exist_ok=True)
             place.write_bytes(data)
-
-
-def settings_of(url: str, token: str, home: Path) -> dict[str, str]:
-    """Return the environment of a process that uploads there, and touches nothing of the user's."""
-    kept = {name: value for name, value in os.environ.items() if not name.startswith("HF_")}
-    quiet = {"HF_HUB_DISABLE_XET": "1", "HF_HUB_DISABLE_PROGRESS_BARS": "1"}
-    return {**kept, **quiet, "HF_ENDPOINT": url, "HF_TOKEN": token, "HF_HOME": str(home)}

@@ -49,13 +49,6 @@ from train.settings import TrainSettings
 SLEEP = [sys.executable, "-c", "import time; time.sleep(120)"]
 
 
-@pytest.fixture
-def cache(tmp_path: Path) -> Path:
-    """The file with the mark of what was started, in the cache of `checkout`."""
-    (tmp_path / "cache" / "serve").mkdir(parents=True)
-    return tmp_path / "cache" / "serve" / "mark"
-
-
 def _until_seen(number: int) -> None:
     """Wait: a process that has just begun shows no environment for an instant."""
     deadline = time.monotonic() + 10
@@ -63,8 +56,12 @@ def _until_seen(number: int) -> None:
         time.sleep(0.01)
 
 
-def test_stop_ends_what_was_started_and_no_stranger(cache: Path) -> None:
-    cache.write_text("ours")
+def test_stop_ends_what_was_started_no_stranger_and_leaves_it_to_a_starter_to_tell(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    mark_of_ours = tmp_path / "cache" / "serve" / "mark"  # in the cache of `checkout`
+    mark_of_ours.parent.mkdir(parents=True)
+    mark_of_ours.write_text("ours")
     marks = ("ours", "ours-too", "other")
     processes = [
         subprocess.Popen(SLEEP, env={**os.environ, "TRILIGHT_SERVED": mark}, start_new_session=True)
@@ -82,14 +79,9 @@ def test_stop_ends_what_was_started_and_no_stranger(cache: Path) -> None:
         for process in processes:
             process.kill()
             process.wait()
-
-
-def test_stop_leaves_it_to_the_starter_to_tell_what_may_save(
-    cache: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    """A second SIGTERM would end training before it has saved; who does not end is killed."""
+    # A second SIGTERM would end training before it has saved; who does not end is killed.
     monkeypatch.setattr(local, "_END_S", 0.5)
-    cache.write_text("ours")
+    mark_of_ours.write_text("ours")
     environment = {**os.environ, "TRILIGHT_SERVED": "ours", STOPPED_BY_PARENT: "1"}
     with subprocess.Popen(SLEEP, env=environment, start_new_session=True) as process:
         _until_seen(1)
@@ -97,7 +89,7 @@ def test_stop_leaves_it_to_the_starter_to_tell_what_may_save(
         assert process.wait(30) == -signal.SIGKILL
 
 
-def test_a_port_of_somebody_else_is_refused(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_taken_port_and_wrong_variables_are_refused(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(local.shutil, "which", lambda name: name)
     monkeypatch.setattr(local, "_launch", lambda *arguments: pytest.fail("launched"))
     monkeypatch.setattr(local, "_RELEASE_S", 0.2)  # this stranger never releases the port
@@ -105,9 +97,19 @@ def test_a_port_of_somebody_else_is_refused(monkeypatch: pytest.MonkeyPatch) -> 
         port = stranger.getsockname()[1]
         with pytest.raises(TrilightError, match=rf"127.0.0.1:{port} cannot.*Set TRILIGHT_PORT"):
             start(host="127.0.0.1", port=port, workers=1)
+    for variable, value in (
+        ("TRILIGHT_PORT", "x"), ("TRILIGHT_PORT", "65536"), ("TRILIGHT_HOST", "::1"),
+        ("TRILIGHT_WORKERS", "0"),
+    ):  # fmt: skip
+        with case((variable, value)), monkeypatch.context() as patch:
+            patch.setenv(variable, value)
+            with pytest.raises(SystemExit, match=rf"{variable} is '{value}'; expected"):
+                local.main(["start"])
 
 
-def test_an_answer_counts_only_while_our_server_lives(tmp_path: Path) -> None:
+def test_an_answer_counts_only_while_our_server_lives_and_a_slow_one_is_waited_for(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     """A server that cannot bind ends while a stranger answers for it."""
 
     class Healthy(http_server.Handler):
@@ -120,11 +122,6 @@ def test_an_answer_counts_only_while_our_server_lives(tmp_path: Path) -> None:
         pytest.raises(TrilightError, match="did not start: it ended"),
     ):
         wait_until_healthy(f"{url}/api", ends, tmp_path / "log")
-
-
-def test_a_slow_server_is_waited_for_with_signs_of_life(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
     monkeypatch.setattr(prefect_server, "_START_UP_S", 1.0)
     monkeypatch.setattr(prefect_server, "_SIGN_OF_LIFE_S", 0.3)
     said = list[str]()
@@ -136,19 +133,7 @@ def test_a_slow_server_is_waited_for_with_signs_of_life(
     assert said and "still starting" in said[0]
 
 
-def test_wrong_variables_are_named(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(local.shutil, "which", lambda name: name)
-    for variable, value in (
-        ("TRILIGHT_PORT", "x"), ("TRILIGHT_PORT", "65536"), ("TRILIGHT_HOST", "::1"),
-        ("TRILIGHT_WORKERS", "0"),
-    ):  # fmt: skip
-        with case((variable, value)), monkeypatch.context() as patch:
-            patch.setenv(variable, value)
-            with pytest.raises(SystemExit, match=rf"{variable} is '{value}'; expected"):
-                local.main(["start"])
-
-
-def test_workers_share_the_machine(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_workers_share_the_machine_and_its_cards(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv("TRILIGHT_CORES", "9")
     monkeypatch.setenv("CUDA_VISIBLE_DEVICES", "0,1,2")
     assert local._worker_environment(0, 1) == {}
@@ -159,11 +144,6 @@ def test_workers_share_the_machine(monkeypatch: pytest.MonkeyPatch) -> None:
     assert four == ["0", "1", "2", "0"]
     monkeypatch.setenv("CUDA_VISIBLE_DEVICES", "")
     assert local._worker_environment(11, 12) == {"TRILIGHT_CORES": "1"}
-
-
-def test_cards_are_those_of_this_machine_or_of_all_workers(
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:
     monkeypatch.setenv("CUDA_VISIBLE_DEVICES", "0,1,2")
     monkeypatch.delenv("TRILIGHT_CARDS", raising=False)
     assert limits() == {DISK_LIMIT: 2, GPU_LIMIT: 3}
@@ -196,7 +176,7 @@ def _mode(path: Path) -> int:
     return stat.S_IMODE(path.stat().st_mode)
 
 
-def test_each_start_has_a_password_of_its_own_in_a_private_file(checkout: Path) -> None:
+def test_each_start_has_a_private_password_and_a_users_file_is_kept(checkout: Path) -> None:
     first, second = grant(URL), grant(URL)
     assert first[PASSWORDS[0]] == first[PASSWORDS[1]] != second[PASSWORDS[0]]
     assert len(second[PASSWORDS[0]]) > 32
@@ -208,6 +188,12 @@ def test_each_start_has_a_password_of_its_own_in_a_private_file(checkout: Path) 
     revoke()
     assert list(checkout.iterdir()) == [] and not settings_file().exists()
     revoke()
+    (checkout / "prefect.toml").write_text("[api]\n")
+    with pytest.raises(TrilightError, match=r"prefect.toml is a file of your own; expected none"):
+        grant(URL)
+    revoke()
+    assert (checkout / "prefect.toml").read_text() == "[api]\n"
+    assert not settings_file().exists()
 
 
 def test_prefect_reads_it_from_the_checkout_and_nothing_needs_to_be_exported(
@@ -246,15 +232,6 @@ def test_a_second_server_elsewhere_takes_no_command_away(
     assert (checkout / "prefect.toml").read_text() == before
 
 
-def test_a_file_of_the_users_own_is_kept(checkout: Path) -> None:
-    (checkout / "prefect.toml").write_text("[api]\n")
-    with pytest.raises(TrilightError, match=r"prefect.toml is a file of your own; expected none"):
-        grant(URL)
-    revoke()
-    assert (checkout / "prefect.toml").read_text() == "[api]\n"
-    assert not settings_file().exists()
-
-
 def test_the_password_is_no_argument_and_is_not_said(
     monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
@@ -285,16 +262,24 @@ def _parameters(**given: Any) -> dict[str, Any]:
     return {**plain, "data": ["a"], "changes": None, **given}
 
 
-def test_training_is_launched_by_torchrun_where_there_are_several_processes() -> None:
+def test_a_command_has_every_option_and_torchrun_for_several_processes(tmp_path: Path) -> None:
     one = TrainOptions(data=("a", "b"), resume=True, steps=5).command()
     assert one[1:] == ("-m trilight train smoke --data a --data b --resume --steps 5").split()
     two = TrainOptions(processes=2).command()
     assert two[1:5] == ["-m", "torch.distributed.run", "--standalone", "--nproc-per-node=2"]
     with pytest.raises(TrilightError, match="processes is 0"):
         TrainOptions(processes=0)
+    # it comes as far as the data, which is not there: after its options and the run's settings
+    order = TrainOptions(
+        run="finetune", data=(str(tmp_path / "none"),), out=str(tmp_path / "run"), steps=9000,
+        begin_with="runs/x", lpips="hub", changes={"loss.perceptual": "none"},
+    )  # fmt: skip
+    python, *words = order.command()
+    assert (python, words[:2]) == (sys.executable, ["-m", "trilight"])
+    assert str(tmp_path / "none") in trilight(words[2:]).mistake
 
 
-def test_the_form_has_every_run_and_every_setting() -> None:
+def test_the_form_has_every_run_and_setting_and_a_wrong_one_is_refused_before_a_run() -> None:
     schema = train_model.parameters.model_dump()
     assert schema["properties"]["run"]["enum"] == ["tiny", *TRAINING_PRESETS]
     groups = schema["definitions"]
@@ -304,9 +289,6 @@ def test_the_form_has_every_run_and_every_setting() -> None:
     assert groups["LossSettingsChanges"]["properties"]["perceptual"]["anyOf"][0]["enum"] == [
         "lpips", "ms_ssim", "none",
     ]  # fmt: skip
-
-
-def test_a_wrong_form_is_refused_before_a_run_exists() -> None:
     wrong: list[tuple[dict[str, Any], str]] = [
         ({"run": "pretain"}, "run"),
         ({"changes": {"warm_up": 3}}, "changes.warm_up"),
@@ -316,10 +298,7 @@ def test_a_wrong_form_is_refused_before_a_run_exists() -> None:
     for parameters, message in wrong:
         with case(parameters), pytest.raises(ParameterTypeError, match=message):
             train_model.validate_parameters(parameters)
-
-
-def test_laws_between_settings_are_checked_before_the_command() -> None:
-    """No schema can say them; the order is made in the flow's first moment."""
+    # no schema can say them; the order is made in the flow's first moment
     changes = RunChanges(**{"warmup_steps": 50})
     with pytest.raises(TrilightError, match="warmup_steps is 50; expected 0 to 49"):
         train_options(_parameters(steps=50, changes=changes))
@@ -343,14 +322,3 @@ def test_a_second_stage_begins_with_the_first() -> None:
             assert " ".join(command[4:]) == "smoke --data a --resume --change learning_rate=1e-05"
             again = TrainOptions(run=run, resume=True).command()
             assert "--resume" in again and "--from" not in again
-
-
-def test_the_command_line_takes_every_option_of_the_command(tmp_path: Path) -> None:
-    """It comes as far as the data, which is not there: after its options and the run's settings."""
-    order = TrainOptions(
-        run="finetune", data=(str(tmp_path / "none"),), out=str(tmp_path / "run"), steps=9000,
-        begin_with="runs/x", lpips="hub", changes={"loss.perceptual": "none"},
-    )  # fmt: skip
-    python, *words = order.command()
-    assert (python, words[:2]) == (sys.executable, ["-m", "trilight"])
-    assert str(tmp_path / "none") in trilight(words[2:]).mistake

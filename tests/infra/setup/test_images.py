@@ -85,11 +85,6 @@ def test_every_container_has_a_home_that_it_may_write(services: Any) -> None:
         assert service["environment"]["HOME"] == "/tmp", name
 
 
-def _deploying() -> dict[str, Any]:
-    (job,) = (part for name, _, part in containers() if name == "trilight-deploy")
-    return job
-
-
 def test_nobody_can_start_a_server_without_a_password_or_a_pool_that_offers_commands(
     services: Any,
 ) -> None:
@@ -102,9 +97,13 @@ def test_nobody_can_start_a_server_without_a_password_or_a_pool_that_offers_comm
             assert command[:3] == ["python", "-m", "pipeline.flows.guarded_server"], name
         if "worker" in name:
             assert "--no-create-pool-if-not-found" in command and "--type" not in command, name
-    for words in (services["deploy"]["command"].split(), _deploying()["command"]):
+    (deploying,) = (part for name, _, part in containers() if name == "trilight-deploy")
+    for words in (services["deploy"]["command"].split(), deploying["command"]):
         assert words[:3] == ["python", "-m", deployments.__name__]
         assert len(words) == 5 and words[4].endswith(".json")  # the pool's own template
+    # what makes the limits is told how many cards there are: where they are made, there is none
+    assert "TRILIGHT_CARDS" in services["deploy"]["environment"]
+    assert "TRILIGHT_CARDS" in {row["name"] for row in deploying["env"]}
 
 
 def test_no_password_stands_in_a_file_and_every_port_is_on_loopback(services: Any) -> None:
@@ -143,7 +142,7 @@ def test_images_can_write_buckets_and_locks_hold_each_other(services: Any) -> No
     assert source["secretRef"]["name"] == "trilight-bucket"
 
 
-def test_flows_write_to_volumes_whatever_their_form_says() -> None:
+def test_deployments_name_flows_that_are_there_and_write_to_volumes() -> None:
     """`out` is data/BUILD by default, below the checkout, which belongs to root in the images."""
     assert DatasetInRuns().place.startswith("data/")
     for path in IMAGES.glob("*.Dockerfile"):
@@ -159,12 +158,13 @@ def test_flows_write_to_volumes_whatever_their_form_says() -> None:
     assert {volume.partition(":")[2] for volume in docker["volumes"]} == {"/data", "/cache"}
     mounts = {mount["mountPath"] for mount in containers()[-1][2]["volumeMounts"]}
     assert mounts == {"/data", "/cache", "/tmp"}
-
-
-def test_what_makes_the_limits_is_told_how_many_cards_there_are(services: Any) -> None:
-    """Where they are made, there is no card."""
-    assert "TRILIGHT_CARDS" in services["deploy"]["environment"]
-    assert "TRILIGHT_CARDS" in {row["name"] for row in _deploying()["env"]}
+    found = deployments.read_deployments()
+    assert len(found) == 13  # four flows in three ways, and one beside a scheduler
+    assert {row["name"] for row in found} == {"local", "docker", "kubernetes"}
+    for row in found:
+        path, function = row["entrypoint"].split(":")
+        assert f"def {function}(" in (ROOT / path).read_text()
+        assert row["work_pool"] == {"name": row["name"]}
 
 
 def test_the_worker_keeps_to_its_namespace_and_jobs_name_the_secret(
@@ -185,16 +185,6 @@ def test_the_worker_keeps_to_its_namespace_and_jobs_name_the_secret(
         "name": read.worker.api_auth_string_secret_name,
         "key": read.worker.api_auth_string_secret_key,
     }
-
-
-def test_deployments_name_flows_that_are_there() -> None:
-    found = deployments.read_deployments()
-    assert len(found) == 13  # four flows in three ways, and one beside a scheduler
-    assert {row["name"] for row in found} == {"local", "docker", "kubernetes"}
-    for row in found:
-        path, function = row["entrypoint"].split(":")
-        assert f"def {function}(" in (ROOT / path).read_text()
-        assert row["work_pool"] == {"name": row["name"]}
 
 
 def test_the_array_job_is_a_shell_script(tmp_path: Path) -> None:
@@ -220,7 +210,7 @@ def _read_lock(path: Path) -> dict[str, set[str]]:
     return packages
 
 
-def test_every_package_of_a_lock_has_a_version_and_a_digest() -> None:
+def test_packages_of_locks_have_one_version_and_digest() -> None:
     assert LOCKS
     for path in LOCKS:
         with case(path.name):
@@ -228,19 +218,10 @@ def test_every_package_of_a_lock_has_a_version_and_a_digest() -> None:
                 assert re.fullmatch(r"[a-z0-9.-]+==[0-9a-z.]+", pin), pin
                 assert digests and all(re.fullmatch("[0-9a-f]{64}", digest) for digest in digests)
             assert "://" not in path.read_text()
-
-
-def test_locks_that_share_a_package_share_its_version_and_its_digests() -> None:
     seen: dict[str, set[str]] = {}
     for path in LOCKS:
         for pin, digests in _read_lock(path).items():
             assert seen.setdefault(pin, digests) == digests, f"{path.name}: {pin}"
-
-
-def test_files_of_others_are_those_that_their_digests_name() -> None:
-    rows = (ROOT / "requirements/vendored.sha256").read_text().splitlines()
-    for digest, name in [line.split() for line in rows if not line.startswith("#")]:
-        assert hashlib.sha256((ROOT / name).read_bytes()).hexdigest() == digest, name
 
 
 def test_a_lock_has_what_its_packages_ask_for_on_every_python() -> None:
@@ -264,7 +245,7 @@ def test_a_lock_has_what_its_packages_ask_for_on_every_python() -> None:
                     assert canonicalize_name(asked.name) in names, f"{found.name}: {line}"
 
 
-def test_nothing_installs_a_lock_but_the_script_that_demands_digests() -> None:
+def test_nothing_is_installed_or_taken_from_others_but_by_its_digest() -> None:
     script = (ROOT / "infra/setup/install.sh").read_text()
     demands = r"--require-hashes --no-build-isolation --no-deps \\\n\s+--only-binary :all:"
     assert len(re.findall(demands, script)) == len(re.findall("pip install", script)) == 2
@@ -274,6 +255,9 @@ def test_nothing_installs_a_lock_but_the_script_that_demands_digests() -> None:
         assert not re.search(r"pip install[^\n]*(--requirement|-r )", text), path.name
         for line in re.findall(r"pip install[^\n]*", text):
             assert "--no-deps --no-build-isolation --editable ." in line, path.name
+    rows = (ROOT / "requirements/vendored.sha256").read_text().splitlines()
+    for digest, name in [line.split() for line in rows if not line.startswith("#")]:
+        assert hashlib.sha256((ROOT / name).read_bytes()).hexdigest() == digest, name
 
 
 USER = {"runAsNonRoot": True, "runAsUser": 10001, "seccompProfile": {"type": "RuntimeDefault"}}
@@ -289,7 +273,7 @@ def of_kind(kind: str) -> list[dict[str, Any]]:
     return [row for row in documents() if row["kind"] == kind]
 
 
-def test_containers_of_manifests_are_confined() -> None:
+def test_containers_and_services_are_confined_and_the_namespace_is_closed(services: Any) -> None:
     serving = {row["metadata"]["name"] for row in of_kind("Deployment")}
     for name, pod, container in containers():
         with case(name):
@@ -300,9 +284,12 @@ def test_containers_of_manifests_are_confined() -> None:
             for kind in ("requests", "limits"):
                 assert set(container["resources"][kind]) >= {"cpu", "memory"}, kind
             assert "livenessProbe" in container or name not in serving
-
-
-def test_the_namespace_is_bounded_and_closed() -> None:
+    for name, service in services.items():
+        with case(name):
+            assert service["cap_drop"] == ["ALL"] and service["read_only"]
+            assert service["security_opt"] == ["no-new-privileges:true"]
+            assert not {"privileged", "network_mode", "pid"} & set(service)
+            assert not any("docker.sock" in volume for volume in service.get("volumes", ()))
     (quota,) = (row["spec"]["hard"] for row in of_kind("ResourceQuota"))
     assert {"limits.cpu", "limits.memory", "pods"} <= set(quota)
     policies = [row["spec"] for row in of_kind("NetworkPolicy")]
@@ -310,15 +297,6 @@ def test_the_namespace_is_bounded_and_closed() -> None:
     for policy in policies:
         for rule in (*policy.get("ingress", ()), *policy.get("egress", ())):
             assert rule.get("ports"), "a rule of the network names its ports"
-
-
-def test_services_are_confined(services: Any) -> None:
-    for name, service in services.items():
-        with case(name):
-            assert service["cap_drop"] == ["ALL"] and service["read_only"]
-            assert service["security_opt"] == ["no-new-privileges:true"]
-            assert not {"privileged", "network_mode", "pid"} & set(service)
-            assert not any("docker.sock" in volume for volume in service.get("volumes", ()))
 
 
 def test_images_of_others_have_a_digest(services: Any) -> None:

@@ -29,7 +29,7 @@ def tree(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return folder
 
 
-def test_imports_get_the_prefix_and_nothing_else_does() -> None:
+def test_imports_get_the_prefix_or_are_refused_and_nothing_else_does() -> None:
     for source, expected in [
         ("from storage.errors import Rejected", "from trilight.storage.errors import Rejected"),
         ("if x:\n    from train import run", "if x:\n    from trilight.train import run"),
@@ -42,9 +42,6 @@ def test_imports_get_the_prefix_and_nothing_else_does() -> None:
     ]:  # fmt: skip
         with case(source):
             assert with_prefix(source) == expected
-
-
-def test_an_import_that_binds_a_package_of_ours_is_refused() -> None:
     for source in ["import storage", "import os, model.config"]:
         with case(source), pytest.raises(SyntaxError, match="cannot get a prefix; use from"):
             with_prefix(source)
@@ -73,16 +70,13 @@ def _imported(module: ast.Module) -> set[str]:
     return {name.partition(".")[0] for name in names}
 
 
-def test_lines_keep_their_numbers(tree: Path) -> None:
+def test_all_files_of_the_checkout_are_in_the_tree_with_their_lines(tree: Path) -> None:
     for package in (*PACKAGES, FACE):
         for path in (ROOT / package).rglob("*.py"):
             if any(path.is_relative_to(ROOT / name) for name in CHECKOUT_ONLY):
                 continue
             beside = tree / ("" if package == FACE else FACE) / path.relative_to(ROOT)
             assert beside.read_text().count("\n") == path.read_text().count("\n"), path
-
-
-def test_all_files_of_the_checkout_are_in_the_tree(tree: Path) -> None:
     listed = ["git", "ls-files", "--cached", "--others", "--exclude-standard", *PACKAGES, FACE]
     for name in run_program(listed).stdout.splitlines():
         copied = tree / ("" if name.startswith(f"{FACE}/") else FACE) / name

@@ -151,38 +151,32 @@ if [ -n "$FAKE_REFUSES" ]; then echo "AlreadyExists" >&2; exit 1; fi
 """
 
 
-@pytest.fixture
-def tools(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
-    """A folder with a tool that writes down what it is asked, and a bucket without a dataset."""
+def test_the_printed_commands_do_what_submitting_does(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """By a tool that writes down what it is asked, and a bucket without a dataset."""
     (tmp_path / "bin").mkdir()
     (tmp_path / "bin" / "kubectl").write_text(FAKE)
     (tmp_path / "bin" / "kubectl").chmod(0o755)
     monkeypatch.setenv("PATH", f"{tmp_path / 'bin'}:{os.environ['PATH']}")
-    monkeypatch.setenv("FAKE_ASKED", str(tmp_path / "asked"))
+    asked = tmp_path / "asked"
+    monkeypatch.setenv("FAKE_ASKED", str(asked))
     monkeypatch.setattr(arrays, "_is_begun", lambda place: False)
     monkeypatch.setenv("TRILIGHT_IMAGE", "registry.example/trilight:1")
     monkeypatch.chdir(tmp_path)
-    return tmp_path
-
-
-def test_the_printed_commands_do_what_submitting_does(tools: Path) -> None:
     words = ["submit", "kubernetes", "smoke", "--out", "s3://sets/mine", "--files", "my jobs"]
     said = expect_json(*words, "--dry-run")
-    assert said["array"] == "0-5" and not said["submitted"] and not (tools / "asked").exists()
-    assert all((tools / file).is_file() for file in said["files"])
+    assert said["array"] == "0-5" and not said["submitted"] and not asked.exists()
+    assert all((tmp_path / file).is_file() for file in said["files"])
     printed = trilight([*words, "--dry-run"]).stdout.splitlines()
     commands = [line for line in printed if line.startswith("kubectl ")]
     assert len(commands) == len(said["commands"])
     subprocess.run(["bash", "-ec", "\n".join(commands)], check=True)
-    asked = (tools / "asked").read_text()
-    (tools / "asked").unlink()
+    by_hand = asked.read_text()
+    asked.unlink()
     done = trilight(words)
     assert done.exit_code == 0 and "trilight status s3://sets/mine" in done.stdout
-    assert (tools / "asked").read_text() == asked
-
-
-def test_refusals(tools: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    words = ["submit", "kubernetes", "smoke", "--out", "s3://sets/mine"]
+    assert asked.read_text() == by_hand
     monkeypatch.setenv("FAKE_REFUSES", "1")
     assert "kubectl refused (AlreadyExists)" in trilight(words).mistake
     monkeypatch.setenv("PATH", "/nowhere")
@@ -210,11 +204,11 @@ def seen(state: State, **tables: dict[str, str]) -> tuple[State, float, dict[str
     return state, 50.0, tables
 
 
-@pytest.fixture
-def asked(monkeypatch: pytest.MonkeyPatch) -> mock.Mock:
-    """What asks for a run of the deployment that has the name of its flow."""
-    create = mock.Mock(return_value=RUN)
-    client = SimpleNamespace(create_flow_run_from_deployment=create)
+def test_a_run_is_watched_to_its_end_or_given_and_one_that_crashed_is_a_mistake(
+    monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
+    asked = mock.Mock(return_value=RUN)  # for a run of the deployment that has its flow's name
+    client = SimpleNamespace(create_flow_run_from_deployment=asked)
 
     def find(client: Any, flow: str, name: str | None) -> SimpleNamespace:
         return SimpleNamespace(id=flow, name=name or "local", work_pool_name="local")
@@ -223,12 +217,6 @@ def asked(monkeypatch: pytest.MonkeyPatch) -> mock.Mock:
     monkeypatch.setattr(submission, "find_deployment", find)
     monkeypatch.setattr(submission, "page_of", lambda client, run: "http://page")
     monkeypatch.setattr(submission, "workers_online", lambda client, pool: 1)
-    return create
-
-
-def test_a_run_is_watched_to_its_end_and_one_that_crashed_is_a_mistake_with_its_reason(
-    asked: mock.Mock, monkeypatch: pytest.MonkeyPatch, tmp_path: Path
-) -> None:
     looks = [seen(Pending()), seen(Running()), seen(Running())]
     looks.append(seen(Completed(), summary={"scenes": "2"}))
     monkeypatch.setattr(submission, "poll_run", lambda client, run: iter(looks))
@@ -244,9 +232,7 @@ def test_a_run_is_watched_to_its_end_and_one_that_crashed_is_a_mistake_with_its_
     monkeypatch.setattr(submission, "poll_run", lambda client, run: iter([ended]))
     failed = trilight(words)
     assert "ended as Crashed: it was killed. Its log is at http://page" in failed.stderr
-
-
-def test_who_does_not_watch_gets_the_run(asked: mock.Mock) -> None:
+    asked.reset_mock()
     words = ["submit", "generate-scenes", "smoke", "--no-watch", "--deployment", "cluster"]
     assert json.loads(trilight([*words, "--json"]).stdout) == {
         "flow_run": str(RUN.id), "deployment": "generate-scenes/cluster",

@@ -134,7 +134,7 @@ def test_who_asks_for_another_gives_up_the_one_at_hand() -> None:
     easel.cancel_all()
 
 
-def test_a_failure_is_a_sentence_and_the_next_picture_comes() -> None:
+def test_a_failure_is_a_sentence_and_the_end_waits_for_the_picture_at_hand() -> None:
     easel = queue_of({"bad": GreyRenderer(-1), "good": GreyRenderer(0.5)})
     assert over(easel, easel.submit(wanted("bad"))).error == "ZeroDivisionError: of a library"
     broken = {"materials": {"0": {"diffuse": [0.9, 0.9, 0.9]}}}
@@ -144,9 +144,6 @@ def test_a_failure_is_a_sentence_and_the_next_picture_comes() -> None:
     with pytest.raises(TrilightError, match="not kept"):
         easel.job("999")
     easel.cancel_all()
-
-
-def test_the_end_waits_for_the_picture_at_hand() -> None:
     room = room_of({"traced": GreyRenderer(0.1, waits=True)})
     until_begun(room.queue, room.queue.submit(wanted()))
     room.close()
@@ -227,7 +224,7 @@ def test_a_scene_is_saved_with_its_changes_and_nothing_is_written_here() -> None
     assert textured._is_offered(".usdz") and not textured._is_offered(".usda")
 
 
-def test_a_lamp_moves_and_shines_brighter_and_all_else_stays() -> None:
+def test_a_lamp_moves_a_material_takes_the_place_of_its_texture_and_all_else_stays() -> None:
     scene = tiny_scene()
     assert apply_edits(scene, {}) is apply_edits(scene, {"lamps": {}, "materials": {}}) is scene
     found = apply_edits(scene, {"lamps": {str(LIGHT): {"move": [0.5, 0, -1], "gain": 2}}})
@@ -238,9 +235,6 @@ def test_a_lamp_moves_and_shines_brighter_and_all_else_stays() -> None:
     np.testing.assert_array_equal(found.vertex_positions[:4], scene.vertex_positions[:4])
     assert found.materials[LIGHT, EMISSION].tolist() == [200, 200, 200]
     assert found.materials[FLOOR].tolist() == scene.materials[FLOOR].tolist()
-
-
-def test_a_material_takes_the_place_of_its_texture() -> None:
     scene = textured_scene()
     found = apply_edits(scene, {"materials": {"0": {"diffuse": [0.1, 0.2, 0.3]}}})
     assert found.materials[FLOOR, DIFFUSE] == pytest.approx([0.1, 0.2, 0.3])
@@ -307,12 +301,21 @@ def test_every_triangle_stands_in_the_group_of_its_object_and_material() -> None
     assert not plain["uv"] and not len(none), "without textures there are no coordinates"
 
 
-def test_textures_come_with_their_bottom_row_last() -> None:
+def test_textures_end_at_the_bottom_and_what_is_too_much_is_said(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
     for texture in (colour_texture(3), number_texture()):
         pixels = np.asarray(Picture.open(io.BytesIO(texture_png(texture))))
         assert pixels.shape == (*texture.texels.shape[:2], 3)
         if texture.is_srgb:
             np.testing.assert_array_equal(pixels[::-1], texture.texels)
+    monkeypatch.setattr(module, "MOST_TRIANGLES", 2)
+    with pytest.raises(TrilightError, match="3 triangles; expected at most 2"):
+        scene_bytes(tiny_scene())
+    monkeypatch.setattr(module, "MOST_TRIANGLES", 3)
+    monkeypatch.setattr(module, "MOST_GROUPS", 1)
+    with pytest.raises(TrilightError, match="2 parts"):
+        scene_bytes(tiny_scene())
 
 
 @pytest.mark.parametrize("turned", [False, True])
@@ -334,16 +337,6 @@ def test_a_sky_shines_from_where_it_does(turned: bool) -> None:
             row, column = min(int(at_v * height), height - 1), int(at_u * width) % width
             wanted = np.maximum(rotation.T @ np.array([x, y, z]), 0)
             np.testing.assert_allclose(texels[row, column, :3], wanted, atol=0.11)
-
-
-def test_what_a_browser_cannot_draw_is_said(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(module, "MOST_TRIANGLES", 2)
-    with pytest.raises(TrilightError, match="3 triangles; expected at most 2"):
-        scene_bytes(tiny_scene())
-    monkeypatch.setattr(module, "MOST_TRIANGLES", 3)
-    monkeypatch.setattr(module, "MOST_GROUPS", 1)
-    with pytest.raises(TrilightError, match="2 parts"):
-        scene_bytes(tiny_scene())
 
 
 def test_the_page_shows_the_command_of_each_way() -> None:

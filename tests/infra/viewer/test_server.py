@@ -120,15 +120,7 @@ def test_who_may_ask() -> None:
                         assert refusal(method, path, both, port=PORT, token=WORD) is not None
 
 
-def test_a_stranger_gets_one_sentence_and_no_header_that_lets_others_read(asker: Asker) -> None:
-    status, answer, headers = asker.ask("api/echo", word="guessed")
-    assert status == 403
-    assert "whole address" in answer["error"]
-    assert "api" not in str(answer)
-    assert not [name for name in headers if name.lower().startswith("access-control")]
-
-
-def test_every_answer_is_shut_in(asker: Asker) -> None:
+def test_every_answer_is_shut_in_and_a_stranger_gets_one_sentence(asker: Asker) -> None:
     for path in ("", "static/style.css", "api/echo", "api/nothing"):
         _, _, headers = asker.ask(path)
         policy = headers["Content-Security-Policy"]
@@ -137,6 +129,11 @@ def test_every_answer_is_shut_in(asker: Asker) -> None:
         assert headers["Referrer-Policy"] == "no-referrer"
         assert headers["X-Content-Type-Options"] == "nosniff"
         assert not [name for name in headers if name.lower().startswith("access-control")]
+    status, answer, headers = asker.ask("api/echo", word="guessed")
+    assert status == 403
+    assert "whole address" in answer["error"]
+    assert "api" not in str(answer)
+    assert not [name for name in headers if name.lower().startswith("access-control")]
 
 
 def test_routes_mistakes_and_bodies(asker: Asker) -> None:
@@ -346,7 +343,7 @@ def test_the_facts_of_a_dataset_name_its_preset_as_people_type_it(dataset: Datas
     room.close()
 
 
-def test_rows_are_sorted_and_come_page_by_page(dataset_asker: Asker) -> None:
+def test_rows_come_page_by_page_and_pictures_and_scenes_as_stored(dataset_asker: Asker) -> None:
     falling = dataset_asker.ask("api/rows?sort=floor&descending=1")[1]["rows"]
     assert [row["floor"] for row in falling] == sorted(30.0 + row for row in range(8))[::-1]
     rest = dataset_asker.ask("api/rows?from=6")[1]
@@ -356,9 +353,6 @@ def test_rows_are_sorted_and_come_page_by_page(dataset_asker: Asker) -> None:
         "where=max(roughness)%20<%201",
     ):  # fmt: skip
         assert dataset_asker.ask(f"api/rows?{wrong}")[0] == 422, wrong
-
-
-def test_small_pictures_are_those_of_the_dataset(dataset_asker: Asker) -> None:
     status, png, _ = dataset_asker.ask("api/thumbnail/000000006/1?px=16")
     assert status == 200
     wanted = preview_srgb8(samples()["validation-000001.tar"][1].radiance_rgb[1])
@@ -368,9 +362,6 @@ def test_small_pictures_are_those_of_the_dataset(dataset_asker: Asker) -> None:
         ("000000006/0?px=9999", 422), ("000000006/0?px=-1", 422), ("000000006", 404),
     ):  # fmt: skip
         assert dataset_asker.ask(f"api/thumbnail/{wrong}")[0] == status, wrong
-
-
-def test_a_scene_opens_as_a_page_of_its_own_with_its_target(dataset_asker: Asker) -> None:
     assert b'id="stage"' in dataset_asker.ask("scene/000000003/")[1]
     facts = dataset_asker.ask("scene/000000003/api/scene")[1]
     assert facts["target_px"] == 16 and "target" in [each["name"] for each in facts["engines"]]
@@ -443,9 +434,7 @@ def test_each_file_tells_what_it_holds_and_shows_it(folder_asker: Asker) -> None
     assert status == 422 and "notes.json: " in said["error"]
     for wrong in ("3", "-1", "x", "../0", "%D9%A3", "0/1"):
         assert folder_asker.ask(f"api/about/{wrong}")[0] == 404, wrong
-
-
-def test_a_scene_opens_as_a_page_of_its_own(folder_asker: Asker) -> None:
+    # and opens as a page of its own
     assert b'id="stage"' in folder_asker.ask("scene/0/")[1]
     facts = folder_asker.ask("scene/0/api/scene")[1]
     assert facts["name"] == NAMES[0] and facts["target_px"] == 16

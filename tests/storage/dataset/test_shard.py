@@ -82,11 +82,23 @@ def test_a_shard_cut_at_any_block_is_refused(tmp_path: Path, kept_blocks: int) -
         list(open_shard(cut))
 
 
-def test_names_without_a_suffix_and_samples_in_two_places_are_refused(tmp_path: Path) -> None:
+def test_members_without_a_suffix_twice_or_behind_their_sample_are_refused(tmp_path: Path) -> None:
     """Kinds of members, their paths and sizes are those of tests/hostile/cases.py."""
     for names in (("README",), ("0.json", "0.json"), ("0.json", "1.json", "0.exr")):
         with case(names), pytest.raises(TrilightError, match="refused|twice"):
             list(open_shard(_tar(tmp_path / "hostile.tar", [(name, b"") for name in names])))
+    members = encode_sample(textured_sample())
+    name, path = MAPS["sky"], tmp_path / "a.tar"
+    late = {suffix: data for suffix, data in members.items() if suffix != name}
+    with pytest.raises(TrilightError, match=f"member {name} occurs twice"):
+        list(open_shard(_tar(path, [(name, b"a"), (name, b"a")])))
+    own = [(f"{sample_key(0)}.{s}", d) for s, d in late.items() if not MAP_NAME.fullmatch(s)]
+    others = [(s, d) for s, d in late.items() if MAP_NAME.fullmatch(s)]
+    ((key, read),) = open_shard(_tar(path, [*others, *own, (name, members[name])]))
+    with pytest.raises(TrilightError, match="is missing; expected a member __map-"):
+        decode_scene(key, read)
+    with pytest.raises(TrilightError, match=f"sample {sample_key(0)} occurs twice"):
+        list(open_shard(_tar(path, [*others, *own[:2], (name, b"a"), *own[2:]])))
 
 
 def test_a_failed_write_leaves_what_was_there_and_leftovers_go(tmp_path: Path) -> None:
@@ -254,36 +266,16 @@ def test_every_reader_finds_the_maps(dataset: Dataset) -> None:
         opened.close()
 
 
-def test_a_map_twice_or_behind_its_sample_is_refused(tmp_path: Path) -> None:
-    members = encode_sample(textured_sample())
-    name, path = MAPS["sky"], tmp_path / "a.tar"
-    late = {suffix: data for suffix, data in members.items() if suffix != name}
-    with pytest.raises(TrilightError, match=f"member {name} occurs twice"):
-        list(open_shard(_tar(path, [(name, b"a"), (name, b"a")])))
-    own = [(f"{sample_key(0)}.{s}", d) for s, d in late.items() if not MAP_NAME.fullmatch(s)]
-    others = [(s, d) for s, d in late.items() if MAP_NAME.fullmatch(s)]
-    ((key, read),) = open_shard(_tar(path, [*others, *own, (name, members[name])]))
-    with pytest.raises(TrilightError, match="is missing; expected a member __map-"):
-        decode_scene(key, read)
-    with pytest.raises(TrilightError, match=f"sample {sample_key(0)} occurs twice"):
-        list(open_shard(_tar(path, [*others, *own[:2], (name, b"a"), *own[2:]])))
-
-
-@for_each(
-    ("pattern", "names"),
-    [
+def test_patterns_and_quoted_ones_name_shards_that_a_dataset_has() -> None:
+    for pattern, names in [
         ("a.tar", ["a.tar"]),
         ("a-{08..11}.tar", ["a-08.tar", "a-09.tar", "a-10.tar", "a-11.tar"]),
         ("{a,b}-{1..2}.tar", ["a-1.tar", "a-2.tar", "b-1.tar", "b-2.tar"]),
         ("a{,x}.tar", ["a.tar", "ax.tar"]),
         ("{7..7}", ["7"]),
-    ],
-)
-def test_patterns(pattern: str, names: list[str]) -> None:
-    assert expand_pattern(pattern) == names
-
-
-def test_quoted_patterns_name_shards_that_a_dataset_has() -> None:
+    ]:
+        with case(pattern):
+            assert expand_pattern(pattern) == names
     splits = SplitSettings(scenes_per_shard=4)
     for quoting in ("docs/how-to/train-and-evaluate.md", "infra/train_options.py"):
         (pattern,) = re.findall(r"\w+://\S+\.tar\b", (ROOT / quoting).read_text())
@@ -291,9 +283,8 @@ def test_quoted_patterns_name_shards_that_a_dataset_has() -> None:
             assert name == shard_name(int(name[-10:-4]), splits)
 
 
-@for_each(
-    ("patterns", "message"),
-    [
+def test_what_is_refused_and_roots_and_shards_are_not_mixed(tmp_path: Path) -> None:
+    for patterns, message in [
         (["pipe:touch x; echo a.tar"], "pipe: command"),
         (["http://h/a.tar::http://h/b.tar"], "chained"),
         (["http://h/{a,b::c}.tar"], "chained"),
@@ -305,12 +296,16 @@ def test_quoted_patterns_name_shards_that_a_dataset_has() -> None:
         (["{0..99999}.tar", "b.tar"], "names 100001 shards"),
         (["a.tar", "{a,b}.tar"], "named twice"),
         (["https://ada:s3cret@h/a.tar?sig=s3cret", "ftp://h?s3cret"], "'ftp'"),
-    ],
-)
-def test_what_is_refused(patterns: list[str], message: str) -> None:
-    with pytest.raises(TrilightError, match=message) as caught:
-        listed_shards(patterns)
-    assert "expected" in str(caught.value) and "s3cret" not in str(caught.value)
+    ]:
+        with case(patterns):
+            with pytest.raises(TrilightError, match=message) as caught:
+                listed_shards(patterns)
+            assert "expected" in str(caught.value) and "s3cret" not in str(caught.value)
+    for data in (["a", "b.tar"], ["a", "b"], []):
+        with pytest.raises(TrilightError, match="expected one dataset, or shards only"):
+            open_training_data(data)
+    with pytest.raises(TrilightError, match="validation split holds no scene; .*in a list"):
+        open_training_data(["train-0.tar"]).split("validation")
 
 
 def test_a_list_reads_the_same_samples(tmp_path: Path) -> None:
@@ -355,14 +350,6 @@ def test_a_folder_is_a_dataset_whatever_its_name(
     ]
     Path("{1,2}.json").touch()
     assert expand_pattern("{1,2}.json") == ["{1,2}.json"]
-
-
-def test_roots_and_shards_are_not_mixed(tmp_path: Path) -> None:
-    for data in (["a", "b.tar"], ["a", "b"], []):
-        with pytest.raises(TrilightError, match="expected one dataset, or shards only"):
-            open_training_data(data)
-    with pytest.raises(TrilightError, match="validation split holds no scene; .*in a list"):
-        open_training_data(["train-0.tar"]).split("validation")
 
 
 Members = dict[str, bytes]

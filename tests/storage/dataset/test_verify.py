@@ -20,7 +20,6 @@ from storage.errors import TrilightError, Unreadable
 from storage.records.packed_maps import map_member, pack_map
 from storage.records.sample import encode_sample, sample_key
 from storage.seeds import rng_for
-from tests.for_each import for_each
 from tests.pipeline.documents.dataset_by_hand import edit_manifest, five_scenes, write_dataset
 from tests.storage.dataset.test_shard import TRAIN, four_samples
 from tests.textured_by_hand import number_texture, sky, textured_sample
@@ -76,25 +75,19 @@ def test_a_whole_dataset_has_no_fault_and_every_shard_is_looked_at(
         assert looked == [shard.name for shard in dataset.manifest.shards]
 
 
-def test_a_manifest_that_a_maker_writes_meanwhile_is_whole(dataset: Dataset) -> None:
+def test_only_what_was_read_whole_is_called_damaged(dataset: Dataset) -> None:
+    for error, is_damage in ((RecursionError(), True), (Unreadable("no answer."), False)):
+        with pytest.raises(TrilightError) as caught, reading("set", "a.tar"):
+            raise error
+        assert ("is damaged" in str(caught.value)) == is_damage
     write_manifest(dataset.folder.manifest, dataset.manifest)  # with a seal
     dataset = open_dataset(str(dataset.folder.root))
     write_manifest(dataset.folder.manifest, dataclasses.replace(dataset.manifest, num_scenes=9))
     found = verify_dataset(dataset)
     assert (found.problems, found.manifest.num_samples) == ([], 5)
-
-
-def test_a_shard_that_grows_meanwhile_is_not_called_damaged(dataset: Dataset) -> None:
     rewrite(dataset, "train-000000.tar", lambda key, members: None, key=lambda key: f"1{key[1:]}")
     with pytest.raises(TrilightError, match=r"written while the shards .* Verify it again\."):
         verify_dataset(dataset)
-
-
-def test_only_what_was_read_is_called_damaged() -> None:
-    for error, is_damage in ((RecursionError(), True), (Unreadable("no answer."), False)):
-        with pytest.raises(TrilightError) as caught, reading("set", "a.tar"):
-            raise error
-        assert ("is damaged" in str(caught.value)) == is_damage
 
 
 def test_every_bad_sample_of_every_bad_shard_is_named(dataset: Dataset) -> None:
@@ -121,17 +114,13 @@ def test_a_key_in_two_shards_is_named(dataset: Dataset) -> None:
 
 
 @pytest.mark.parametrize("fast", [False, True])
-def test_the_lock_is_compared(dataset: Dataset, fast: bool) -> None:
+def test_the_lock_sizes_counts_and_members_are_compared(dataset: Dataset, fast: bool) -> None:
     path = dataset.folder.objects_lock
     path.write_bytes(path.read_bytes()[:-2] + b" }\n")  # the same rows in other bytes
     for fault in ("sha256 differs from the manifest", "missing"):
         found = verify_dataset(dataset.folder.root, fast=fast)
         assert found.problems == [f"objects.lock.jsonl: {fault}"] and not found.bad_shards
         path.unlink(missing_ok=True)
-
-
-@pytest.mark.parametrize("fast", [False, True])
-def test_sizes_counts_and_members_are_compared(dataset: Dataset, fast: bool) -> None:
     root = dataset.folder.root
     shards = json.loads(dataset.folder.manifest.read_text())["shards"]
     shards[0]["num_samples"] += 1
@@ -177,36 +166,29 @@ def test_every_flipped_bit_beside_the_shards_is_found(tmp_path: Path) -> None:
     assert verify_dataset(tmp_path).problems == ["README.md: missing"]
 
 
-@for_each(
-    ("fault", "lie"),
-    [
-        ("dataset_digest is 0+; its shards", lambda record: record.update(dataset_digest="0" * 64)),
-        ("settings have", lambda record: record["settings"].update(seed=999)),
-        ("totals are .*samples=7", lambda record: record["totals"].update(samples=7)),
-        ("is listed 2 times", lambda record: record["shards"].append(record["shards"][0])),
-    ],
-)
-def test_a_manifest_that_contradicts_itself_is_a_fault(
-    tmp_path: Path, fault: str, lie: Callable[[dict[str, Any]], object]
+def test_a_manifest_that_contradicts_itself_or_says_no_pictures_is_a_fault(
+    dataset: Dataset,
 ) -> None:
     """Also one of before there was a seal."""
-    path = opened(five_scenes(tmp_path)).folder.manifest
-    record = json.loads(path.read_bytes())
-    lie(record)
-    path.write_text(json.dumps(record))
-    problems = verify_dataset(tmp_path).problems
-    assert any(re.search(f"manifest.json: .*{fault}", problem) for problem in problems), problems
-
-
-@pytest.mark.parametrize("renders", [None, 3, {}])
-def test_a_manifest_that_does_not_say_what_its_pictures_are_is_a_fault(
-    dataset: Dataset, renders: object
-) -> None:
-    settings = {**dataset.manifest.settings, "renders": renders}
-    manifest = dataclasses.replace(dataset.manifest, settings=settings)
-    write_manifest(dataset.folder.manifest, manifest)
-    problems = verify_dataset(dataset.folder.root).problems
-    assert any("pictures (" in problem for problem in problems)
+    lies: dict[str, Callable[[dict[str, Any]], object]] = {
+        "dataset_digest is 0+; its shards": lambda record: record.update(dataset_digest="0" * 64),
+        "settings have": lambda record: record["settings"].update(seed=999),
+        "totals are .*samples=7": lambda record: record["totals"].update(samples=7),
+        "is listed 2 times": lambda record: record["shards"].append(record["shards"][0]),
+    }
+    path = dataset.folder.manifest
+    whole = path.read_bytes()
+    for fault, lie in lies.items():
+        record = json.loads(whole)
+        lie(record)
+        path.write_text(json.dumps(record))
+        found = verify_dataset(dataset.folder.root).problems
+        assert any(re.search(f"manifest.json: .*{fault}", problem) for problem in found), found
+    for renders in (None, 3, dict[str, Any]()):
+        settings = {**dataset.manifest.settings, "renders": renders}
+        write_manifest(path, dataclasses.replace(dataset.manifest, settings=settings))
+        found = verify_dataset(dataset.folder.root).problems
+        assert any("pictures (" in problem for problem in found), renders
 
 
 SKY, ROUGHNESS = map_member(sky().sha256), map_member(number_texture().sha256)

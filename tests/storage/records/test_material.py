@@ -25,7 +25,7 @@ from storage.records.sample import decode_sample, encode_sample
 from storage.records.scene_file import decode_arrays, encode_arrays, scene_digest
 from storage.settings.ranges import Within
 from tests.columns_kit import COAT, TINT, WAVES, declared
-from tests.for_each import for_each
+from tests.for_each import case
 from tests.scenes_by_hand import FLOOR, tiny_sample, tiny_scene
 
 
@@ -35,20 +35,18 @@ def test_the_published_columns_stand_where_files_and_kernels_expect_them() -> No
     assert material_width() == 10
 
 
-@for_each(
-    ("changes", "message"),
-    [
+def test_a_declaration_that_means_nothing_is_refused() -> None:
+    meaningless: list[tuple[dict[str, Any], str]] = [
         ({"name": "Clear coat"}, "has the name; expected lower case letters"),
         ({"width": 0}, "a width of 0; expected a whole number from 1 to 64"),
         ({"width": 2, "is_colour": True}, "a width of 2; expected 3, since it is a color"),
         ({"within": Within(0, np.inf)}, "expected one within the finite float32 numbers"),
         ({"default": 2.0}, "the default 2.0; expected a number from 0 to 1"),
         ({"within": Within(-1, 1), "is_log_encoded": True}, "since networks read its log"),
-    ],
-)
-def test_a_declaration_that_means_nothing_is_refused(changes: dict[str, Any], message: str) -> None:
-    with pytest.raises(TrilightError, match=message):
-        dataclasses.replace(COAT, **changes)
+    ]
+    for changes, message in meaningless:
+        with case(changes), pytest.raises(TrilightError, match=message):
+            dataclasses.replace(COAT, **changes)
 
 
 def test_scenes_have_every_declared_column_within_its_range() -> None:
@@ -113,16 +111,12 @@ def test_a_sample_carries_its_columns_and_an_older_one_is_completed() -> None:
         decode_sample("0", members)
 
 
-@for_each(
-    "stated", ["", '["coat"]', '[["coat", "wide"]]', '[["coat", 1], ["coat", 1]]', "[" * 9999]
-)
-def test_columns_that_a_file_states_badly_are_refused(stated: str) -> None:
+def test_columns_that_a_file_states_badly_and_other_numbers_than_they_are_refused() -> None:
     rows = np.zeros((2, 2), np.float32)
-    with declared(COAT), pytest.raises(TrilightError, match="scene: its material columns"):
-        completed_rows(rows, stated)
-
-
-def test_a_file_with_other_numbers_than_its_columns_is_refused() -> None:
+    for stated in ("", '["coat"]', '[["coat", "wide"]]', '[["coat", 1], ["coat", 1]]', "[" * 9999):
+        with case(stated), declared(COAT):
+            with pytest.raises(TrilightError, match="scene: its material columns"):
+                completed_rows(rows, stated)
     arrays = load(encode_arrays(tiny_scene()))
     arrays["materials"] = default_rows(2)[:, :9].copy()
     with pytest.raises(TrilightError, match=r"shape \(2, 9\); expected \(None, 10\)"):

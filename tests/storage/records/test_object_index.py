@@ -57,12 +57,23 @@ def test_every_row_is_found_by_its_uid(tmp_path: Path, count: int) -> None:
         assert lock.find(uid) is None
 
 
-def test_a_lock_that_is_none_is_refused(tmp_path: Path) -> None:
+def test_a_lock_that_is_none_and_an_index_that_is_cut_off_are_refused(tmp_path: Path) -> None:
     (tmp_path / "lock").write_bytes(b'{"uid": "a"}\n')
     with pytest.raises(TrilightError, match="lock: row at byte 0: title is missing"):
         LockRows(tmp_path / "lock").find("a")
     with pytest.raises(TrilightError, match="cannot be read"):
         LockRows(tmp_path / "none")
+    (row,) = _rows(1)
+    write_objects_lock(tmp_path / "lock", [row])
+    path = tmp_path / "index"
+    write_object_index(path, tmp_path / "lock", [("0" * 32, 1)], query_sha256="", num_found=1)
+    whole = path.read_bytes()
+    path.write_bytes(whole[:-24])
+    with pytest.raises(TrilightError, match="no index of objects .*delete it"):
+        ObjectIndex(path)
+    path.write_bytes(whole.replace(b'\\"format\\": 1', b'\\"format\\": 9'))
+    with pytest.raises(TrilightError, match="no index of objects .*another format"):
+        ObjectIndex(path)
 
 
 def test_columns_say_what_the_rows_say(tmp_path: Path) -> None:
@@ -99,20 +110,6 @@ def test_columns_say_what_the_rows_say(tmp_path: Path) -> None:
         assert names == [assets[row.uid][0] for row in wanted]
 
 
-def test_an_index_that_is_cut_off_says_so(tmp_path: Path) -> None:
-    (row,) = _rows(1)
-    write_objects_lock(tmp_path / "lock", [row])
-    path = tmp_path / "index"
-    write_object_index(path, tmp_path / "lock", [("0" * 32, 1)], query_sha256="", num_found=1)
-    whole = path.read_bytes()
-    path.write_bytes(whole[:-24])
-    with pytest.raises(TrilightError, match="no index of objects .*delete it"):
-        ObjectIndex(path)
-    path.write_bytes(whole.replace(b'\\"format\\": 1', b'\\"format\\": 9'))
-    with pytest.raises(TrilightError, match="no index of objects .*another format"):
-        ObjectIndex(path)
-
-
 @for_each(
     ("licence", "duties"),
     [
@@ -137,19 +134,7 @@ def test_duties_go_by_identifier_and_are_never_guessed(
     assert duties is not None or share_alike_camp(licence) == ""
 
 
-def test_what_is_allowed_by_default_is_known_and_permits_commercial_and_derived_use() -> None:
-    for licence in set(DEFAULT_ALLOWED) - {USER_PROVIDED}:
-        duties = duties_of(licence)
-        assert duties is not None and not {"non-commercial", "no-derivatives"} & set(duties)
-
-
-def test_the_union_is_in_the_order_of_the_table_and_passes_over_the_unknown() -> None:
-    found = union_of_duties(["MIT", "CC-BY-NC-4.0", USER_PROVIDED, "CC-BY-SA-4.0"])
-    assert found == tuple(duty for duty in DUTIES if duty != "no-derivatives")
-    assert union_of_duties([]) == union_of_duties(["CC0-1.0"]) == ()
-
-
-def test_camps_are_single_licences_and_two_may_not_meet() -> None:
+def test_two_camps_may_not_meet_and_unions_are_in_the_order_of_the_table() -> None:
     """Writing one in small letters makes no second licence of it."""
     assert share_alike_camp("CC-BY-SA-4.0") == share_alike_camp("cc-by-sa-4.0") != ""
     assert share_alike_camp("CC-BY-SA-4.0") != share_alike_camp("CC-BY-SA-3.0")
@@ -158,3 +143,9 @@ def test_camps_are_single_licences_and_two_may_not_meet() -> None:
     assert mixed_share_alike(["CC0-1.0", "CC-BY-SA-4.0", "cc-by-sa-4.0", "MIT"]) == []
     both = ["CC-BY-SA-4.0", "MIT", "CC-BY-SA-3.0"]
     assert mixed_share_alike(both) == ["CC-BY-SA-3.0", "CC-BY-SA-4.0"]
+    found = union_of_duties(["MIT", "CC-BY-NC-4.0", USER_PROVIDED, "CC-BY-SA-4.0"])
+    assert found == tuple(duty for duty in DUTIES if duty != "no-derivatives")
+    assert union_of_duties([]) == union_of_duties(["CC0-1.0"]) == ()
+    for licence in set(DEFAULT_ALLOWED) - {USER_PROVIDED}:
+        duties = duties_of(licence)
+        assert duties is not None and not {"non-commercial", "no-derivatives"} & set(duties)

@@ -82,7 +82,7 @@ def test_scenes_without_maps_are_what_they_were() -> None:
     assert len(load(encode_scene(tiny_scene()))) == 8
 
 
-def test_equal_content_has_equal_bytes_whatever_it_is_called() -> None:
+def test_bytes_go_by_content_alone_and_are_halves_only_where_nothing_is_lost() -> None:
     texture = colour_texture()
     other = dataclasses.replace(texture, source=number_texture().source)
     assert pack_map(texture) == pack_map(other) and texture.sha256 == other.sha256
@@ -92,8 +92,6 @@ def test_equal_content_has_equal_bytes_whatever_it_is_called() -> None:
     read_as_linear = dataclasses.replace(texture, is_srgb=False)
     assert read_as_linear.sha256 != texture.sha256
 
-
-def test_floats_are_stored_in_halves_only_where_nothing_is_lost() -> None:
     def dtype(data: bytes) -> str:
         return str(load(gzip.decompress(data))["values"].dtype)
 
@@ -271,7 +269,9 @@ def test_equal_members_give_equal_samples_with_and_without_what_is_held(
 
 
 @pytest.mark.usefixtures("held")
-def test_a_map_is_unpacked_once(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_map_is_unpacked_once_and_what_is_refused_stays_refused(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
     members, values = encode_sample(textured_sample(KEY)), packed_maps._PackedMap.values
     unpack: Any = mock.create_autospec(values, side_effect=values)
     monkeypatch.setattr(packed_maps._PackedMap, "values", unpack)
@@ -282,6 +282,14 @@ def test_a_map_is_unpacked_once(monkeypatch: pytest.MonkeyPatch) -> None:
     assert one.texels is other.texels
     with pytest.raises(ValueError, match="read-only"):
         one.texels[0] = 0
+    # neither a damaged copy of a held map, nor one under another name, nor one of another kind
+    name, of_sky = map_member(colour_texture().sha256), map_member(sky().sha256)
+    for wrong in (members[name][:-9], members[of_sky], encode_sample(textured_sample(KEY, 1))):
+        swapped = wrong if isinstance(wrong, bytes) else wrong[map_member(colour_texture(1).sha256)]
+        for _ in range(2):
+            with pytest.raises(TrilightError):
+                decode_sample(KEY, {**members, name: swapped})
+    decode_sample(KEY, members)
 
 
 def test_memory_is_bounded_and_the_oldest_goes(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -304,20 +312,6 @@ def test_memory_is_bounded_and_the_oldest_goes(monkeypatch: pytest.MonkeyPatch) 
     assert made[-2:] == [9, 9] and held.num_bytes <= 1000
 
 
-@pytest.mark.usefixtures("held")
-def test_what_is_refused_stays_refused() -> None:
-    """A damaged copy of a held map, a held map under another name, and one of another kind."""
-    members = encode_sample(textured_sample(KEY))
-    decode_sample(KEY, members)
-    name, other = map_member(colour_texture().sha256), map_member(sky().sha256)
-    for wrong in (members[name][:-9], members[other], encode_sample(textured_sample(KEY, 1))):
-        swapped = wrong if isinstance(wrong, bytes) else wrong[map_member(colour_texture(1).sha256)]
-        for _ in range(2):
-            with pytest.raises(TrilightError):
-                decode_sample(KEY, {**members, name: swapped})
-    decode_sample(KEY, members)
-
-
 def test_threads_share_it(held: HeldMaps) -> None:
     members = encode_sample(textured_sample(KEY))
     with ThreadPoolExecutor(4) as pool:
@@ -328,7 +322,7 @@ def test_threads_share_it(held: HeldMaps) -> None:
     )
 
 
-def test_what_is_known_of_a_content_stays_known() -> None:
+def test_mean_greatest_and_constant_are_those_of_the_texels_and_stay_known() -> None:
     one = colour_texture()
     digest, mean = one.sha256, one.mean
     other = with_same_content(one, source=MapSource(name="another"))
@@ -336,27 +330,27 @@ def test_what_is_known_of_a_content_stays_known() -> None:
     assert other.source.name == "another" and one.source.name != "another"
     turned = with_same_content(sky(), is_seen=True)
     assert isinstance(turned, Environment) and turned.is_seen
+    for texture in (colour_texture(), number_texture()):
+        linear = texture.linear(texture.texels).astype(np.float64)
+        assert texture.mean == pytest.approx(linear.mean(axis=(0, 1)), rel=1e-6)  # of float32
+        assert (texture.greatest == linear.max(axis=(0, 1))).all()
+        assert texture.constant is None
+    assert Texture(texels=np.full((3, 2, 1), 255, np.uint8)).constant == np.ones(1)
 
 
-def test_six_directions_stand_where_the_conventions_say() -> None:
+def test_directions_and_coloured_poles_stand_where_the_conventions_say_and_back() -> None:
     """The table of Blender: centre +X, a quarter +Y, three quarters -Y, the border -X, top +Z."""
     expected = {"+X": (0.5, 0.5), "+Y": (0.25, 0.5), "-Y": (0.75, 0.5)}
     for name, place in expected.items():
         assert latlong_uv(POLES[name]) == pytest.approx(place, abs=1e-15)
     assert latlong_uv(POLES["-X"])[0] % 1 == pytest.approx(0, abs=1e-15)
     assert latlong_uv(POLES["+Z"])[1] == 1 and latlong_uv(POLES["-Z"])[1] == 0
-
-
-def test_six_coloured_poles_shine_from_their_directions() -> None:
-    """Turning by 90 degrees or a mirror fails; `latlong_direction` draws the map by the table."""
+    # turning by 90 degrees or a mirror fails; `latlong_direction` draws the map by the table
     for rotation in (np.eye(3, dtype=np.float32), sky().rotation):
         environment = six_poles(rotation=rotation)
         for name, direction in POLES.items():
             found = environment_values(environment, rotation @ direction)
             assert found == pytest.approx(COLOURS[name])
-
-
-def test_directions_and_places_are_inverse() -> None:
     rng = np.random.default_rng(0)
     directions = rng.normal(size=(1000, 3))
     directions /= np.linalg.norm(directions, axis=1, keepdims=True)
@@ -390,7 +384,7 @@ def test_a_texture_is_the_sum_of_its_tents(texture: Texture) -> None:
         assert texture_values(texture, (u, v)) == pytest.approx(_slow(texture, u, v), abs=1e-13)
 
 
-def test_row_0_is_the_bottom_column_0_the_left_and_far_coordinates_lose_no_digits() -> None:
+def test_row_0_is_the_bottom_far_places_lose_no_digits_and_bytes_are_decoded_first() -> None:
     texture = Texture(texels=np.array([[[0], [0.25]], [[0.5], [0.75]]], np.float32))
     corners = {(0.25, 0.25): 0, (0.75, 0.25): 1, (0.25, 0.75): 2, (0.75, 0.75): 3}
     for place, value in corners.items():
@@ -401,10 +395,7 @@ def test_row_0_is_the_bottom_column_0_the_left_and_far_coordinates_lose_no_digit
     far = texture_values(colour_texture(), np.array([1023.125, -1023.875], np.float32))
     assert (far == texture_values(colour_texture(), (0.125, 0.125))).all()
     assert math.isfinite(far.sum())
-
-
-def test_eight_bits_are_decoded_before_they_are_mixed() -> None:
-    """Halfway between black and white sRGB is 0.5, and not what the code 127 stands for."""
+    # halfway between black and white sRGB is 0.5, and not what the code 127 stands for
     texels = np.array([[[0], [255]]], np.uint8)
     for is_srgb in (True, False):
         assert texture_values(Texture(texels=texels, is_srgb=is_srgb), (0.5, 0)) == 0.5
@@ -431,15 +422,6 @@ def test_a_map_goes_round_and_ends_at_the_poles() -> None:
     assert environment_values(environment, (0, 0, 1)) == pytest.approx(
         (radiance[0, 2] + radiance[0, 3]) / 2, abs=1e-8
     )
-
-
-def test_mean_greatest_and_constant() -> None:
-    for texture in (colour_texture(), number_texture()):
-        linear = texture.linear(texture.texels).astype(np.float64)
-        assert texture.mean == pytest.approx(linear.mean(axis=(0, 1)), rel=1e-6)  # of float32
-        assert (texture.greatest == linear.max(axis=(0, 1))).all()
-        assert texture.constant is None
-    assert Texture(texels=np.full((3, 2, 1), 255, np.uint8)).constant == np.ones(1)
 
 
 HEIGHT = 90

@@ -5,6 +5,7 @@ Stored ones: a file gives the numbers that are computed, for every tool.
 
 import dataclasses
 import io
+from typing import Any
 
 import numpy as np
 import OpenEXR
@@ -32,7 +33,7 @@ from storage.records.passes import (
 from storage.records.sample import Sample, decode_sample, encode_sample
 from storage.records.scene import Scene
 from tests.columns_kit import COAT, WAVES, declared
-from tests.for_each import for_each
+from tests.for_each import case, for_each
 from tests.pipeline.renders.scene_kit import join, light, material, quad, sampled_like_scene
 from tests.scenes_by_hand import FLOOR, from_above, mirrored, tiny_sample, tiny_scene
 from tests.storage.records.test_sample import faults
@@ -200,19 +201,29 @@ def test_a_single_pixel_and_a_place_far_away() -> None:
     np.testing.assert_allclose(here["position_m"] + away, far["position_m"], atol=2e-4)
 
 
-@for_each(
-    ("arguments", "complaint"),
-    [
+def test_mistakes_and_other_triangles_are_named() -> None:
+    mistakes: list[tuple[dict[str, Any], str]] = [
         ({"view": 2}, "view is 2; expected 0 to 1"),
         ({"resolution": 0}, "resolution is 0; expected a whole number from 1 to 65536"),
         ({"rays_a_side": 65}, "rays_a_side is 65; expected a whole number from 1 to 64"),
         ({"names": ["depth"]}, "there is no pass 'depth'; expected of triangle, object"),
         ({"names": ["motion_px"]}, "motion_px: no other moment is given; expected `then`"),
-    ],
-)
-def test_mistakes_are_named(arguments: dict, complaint: str) -> None:
-    with pytest.raises(TrilightError, match=complaint):
-        view_passes(tiny_scene(), **{"resolution": 4, **arguments})
+    ]
+    for arguments, complaint in mistakes:
+        with case(arguments), pytest.raises(TrilightError, match=complaint):
+            view_passes(tiny_scene(), **{"resolution": 4, **arguments})
+    scene = tiny_scene()
+    fewer = dataclasses.replace(
+        scene,
+        faces=scene.faces[:2],
+        material_index=scene.material_index[:2],
+        object_index=scene.object_index[:2],
+    )
+    with pytest.raises(TrilightError, match=r"2 triangles; expected the 3 of this one"):
+        view_passes(scene, then=fewer)
+    turned = dataclasses.replace(scene, faces=scene.faces[:, [1, 2, 0]])
+    with pytest.raises(TrilightError, match=r"faces\[0\] .* \[1, 2, 0\]; expected \[0, 1, 2\]"):
+        view_passes(scene, then=turned)
 
 
 def test_a_column_of_ones_own_is_a_pass() -> None:
@@ -229,7 +240,7 @@ def test_a_column_of_ones_own_is_a_pass() -> None:
     np.testing.assert_array_equal(seen["material_waves"], np.full((4, 4, 5), 0.5))
 
 
-def test_a_camera_and_a_floor_that_step_aside_in_closed_form() -> None:
+def test_motion_is_the_difference_of_projections_and_has_its_closed_form() -> None:
     """At fov 90 and 1 m, 16 pixels are 2 m: a step of 0.25 m to the right moves all left by 2.
 
     Points are followed by their triangles: a floor that slides by 0.5 m moves by 4.
@@ -252,9 +263,6 @@ def test_a_camera_and_a_floor_that_step_aside_in_closed_form() -> None:
     later = scene.with_cameras(up, scene.fov_deg)
     seen = view_passes(scene, resolution=4, rays_a_side=2, then=later)
     assert seen["hit"].all() and np.isnan(seen["motion_px"]).all()
-
-
-def test_it_is_the_difference_of_projections() -> None:
     scene = room(1)
     seen = view_passes(scene, resolution=24, view=0, then_view=1)
     now, then = (
@@ -262,21 +270,6 @@ def test_it_is_the_difference_of_projections() -> None:
         for view in (0, 1)
     )
     np.testing.assert_allclose(seen["motion_px"], then - now, atol=1e-6)
-
-
-def test_other_triangles_are_refused() -> None:
-    scene = tiny_scene()
-    fewer = dataclasses.replace(
-        scene,
-        faces=scene.faces[:2],
-        material_index=scene.material_index[:2],
-        object_index=scene.object_index[:2],
-    )
-    with pytest.raises(TrilightError, match=r"2 triangles; expected the 3 of this one"):
-        view_passes(scene, then=fewer)
-    turned = dataclasses.replace(scene, faces=scene.faces[:, [1, 2, 0]])
-    with pytest.raises(TrilightError, match=r"faces\[0\] .* \[1, 2, 0\]; expected \[0, 1, 2\]"):
-        view_passes(scene, then=turned)
 
 
 ALL = tuple(each.name for each in declared_passes() if each.name != MOTION)
@@ -304,7 +297,7 @@ def test_every_pass_comes_back_from_a_file(rays_a_side: int) -> None:
         np.testing.assert_array_equal(found[name], kept, err_msg=name)
 
 
-def test_a_sample_gives_the_same_numbers_stored_or_not() -> None:
+def test_stored_passes_are_those_computed_and_none_twice(monkeypatch: pytest.MonkeyPatch) -> None:
     names = ("object", "depth_axis_m", "shading_normal")
     sample = with_passes(names[:2])
     read = decode_sample(sample.key, encode_sample(sample, "compact"))
@@ -320,11 +313,6 @@ def test_a_sample_gives_the_same_numbers_stored_or_not() -> None:
     del members["1.passes.exr"]
     with pytest.raises(TrilightError, match="1.passes.exr.*missing"):
         decode_sample(sample.key, members)
-
-
-def test_stored_passes_are_not_computed_and_ids_fit_float32(
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:
     sample = with_passes(("triangle",))
     monkeypatch.setattr(passes, "MOST_IDS", 2)
     with pytest.raises(TrilightError, match="3 triangles; expected at most 2"):
@@ -360,21 +348,19 @@ def test_words_mean_passes() -> None:
         pass_names([MOTION])
 
 
-@for_each(
-    ("channels", "resolution", "message"),
-    [
+def test_other_files_are_refused() -> None:
+    for channels, resolution, message in [
         ({"A": 16, "Q.V": 16}, 16, "channels are A, Q.V; expected A"),
         ({"A": 16, "N.X": 16}, 16, "channels are A, N.X; expected A"),
         ({"Z": 16}, 16, r"channel A \(coverage\) is missing"),
         ({"A": 8}, 16, r"\[8, 8\] pixels; expected \[16, 16\]"),
-    ],
-)
-def test_other_files_are_refused(channels: dict[str, int], resolution: int, message: str) -> None:
-    planes = {name: np.zeros((side, side), np.float32) for name, side in channels.items()}
-    with pytest.raises(TrilightError, match=message):
-        decode_passes_exr(encode_channels(planes), resolution)
-    with pytest.raises(TrilightError):
-        decode_passes_exr(encode_channels(planes)[:100], resolution)
+    ]:
+        with case(channels):
+            planes = {name: np.zeros((side, side), np.float32) for name, side in channels.items()}
+            with pytest.raises(TrilightError, match=message):
+                decode_passes_exr(encode_channels(planes), resolution)
+            with pytest.raises(TrilightError):
+                decode_passes_exr(encode_channels(planes)[:100], resolution)
 
 
 def test_verify_compares_with_the_scene() -> None:
@@ -430,18 +416,15 @@ def test_one_pixel_is_that_of_the_picture_and_changes_no_table() -> None:
 
 
 def test_a_scene_without_textures_has_no_coordinates_and_a_sky_changes_no_pass() -> None:
-    plain, lit = (
+    bare, lit = (
         view_passes(scene, resolution=RESOLUTION)
         for scene in (tiny_scene(), tiny_scene(environment=sky(is_seen=True)))
     )
-    assert "uv" not in plain and plain.keys() == lit.keys()
-    for name, values in plain.items():
+    assert "uv" not in bare and bare.keys() == lit.keys()
+    for name, values in bare.items():
         np.testing.assert_array_equal(lit[name], values)
     assert np.isnan(view_passes(tiny_scene(), ["uv"], resolution=RESOLUTION)["uv"]).all()
-
-
-def test_files_of_plain_scenes_have_no_coordinates_and_no_nan() -> None:
-    """Not even at hits, where other programs would spread it; asked for, they are NaN as ever."""
+    # not even at hits, where other programs would spread it; asked for, they are NaN as ever
     names = ["uv", "shading_normal"]
     for scene, there in ((tiny_scene(), set()), (textured_scene(), {"uv"})):
         packed = passes_exr(scene, names, view=0, resolution=RESOLUTION)

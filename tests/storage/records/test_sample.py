@@ -111,19 +111,16 @@ def test_float32_pictures_of_other_tools_are_read(compression: str) -> None:
         assert (back >= 0).all()
 
 
-@for_each("value", [np.nan, np.inf, -1e-6, 65505.0])
-def test_what_a_half_float_cannot_hold_is_refused(value: float) -> None:
+def test_what_a_half_float_cannot_hold_and_a_truncated_picture_are_refused() -> None:
     picture = np.zeros((8, 8, 3), np.float32)
-    picture[3, 2, 1] = value
-    with pytest.raises(TrilightError, match=r"radiance\[3, 2, 1\]"):
-        encode_exr(picture)
-
-
-@for_each("keep", [0, 10, 300, -100])
-def test_a_truncated_picture_is_refused(keep: int) -> None:
+    for value in (np.nan, np.inf, -1e-6, 65505.0):
+        picture[3, 2, 1] = value
+        with case(value), pytest.raises(TrilightError, match=r"radiance\[3, 2, 1\]"):
+            encode_exr(picture)
     data = encode_exr(np.random.default_rng(0).random((64, 64, 3)).astype(np.float32))
-    with pytest.raises(TrilightError, match="picture"):
-        decode_exr(data[:keep])
+    for keep in (0, 10, 300, -100):
+        with case(keep), pytest.raises(TrilightError, match="picture"):
+            decode_exr(data[:keep])
 
 
 def noisy_picture(noise_db: float, resolution: int = 64) -> NDArray[np.float32]:
@@ -374,7 +371,7 @@ def _one_bit_off(sample: Sample) -> Sample:
     return dataclasses.replace(sample, radiance_rgb=pictures)
 
 
-def test_verify_demands_the_sum_of_lights() -> None:
+def test_verify_demands_the_sums_of_lights_and_of_parts() -> None:
     sample = _lit_sample()
     assert faults(sample, per_light=True) == []
     assert faults(tiny_sample()) == []  # a manifest from before there was the setting
@@ -383,6 +380,20 @@ def test_verify_demands_the_sum_of_lights() -> None:
     assert "lacks pictures by light" in faults(without, per_light=True)[0]
     (fault,) = faults(_one_bit_off(sample), per_light=True)
     assert "view 1 is not the sum of its lights in 1 pixels, first in (3, 5)" in fault
+    sample = _sample()
+    assert "parts are direct, indirect; the settings" in faults(sample)[0]
+    assert "every view expect diffuse, specular" in faults(sample, split_lobes=True)[0]
+    assert "parts are none" in faults(tiny_sample(), split=True)[0]
+    views = (sample.views[0], dataclasses.replace(sample.views[1], parts=None))
+    assert faults(dataclasses.replace(sample, views=views), split=True)
+    (fault,) = faults(_one_bit_off(sample), split=True)
+    assert "view 1 has a picture that is not the sum of its parts in 1 pixels" in fault
+    assert fault.endswith("first in (3, 5)")
+    both = _sample(lights=True)
+    assert both.parts_rgb is not None
+    wrong = {name: 2 * part for name, part in both.parts_rgb.items()}
+    found = faults(dataclasses.replace(both, parts_rgb=wrong), split=True, per_light=True)
+    assert len(found) == 2 and "a light that is not the sum" in found[0]
 
 
 FLOOR = PictureErrors(noise_floor_db=40.5, noise_floor_linear_db=30.25, object_noise_floor_db=39.0)
@@ -485,23 +496,18 @@ def test_the_stored_sum_is_exact(names: tuple[str, ...]) -> None:
             np.testing.assert_allclose(picture, exact, rtol=tolerance, atol=6e-8)
 
 
-@for_each(
-    ("names", "size", "lights", "message"),
-    [
+def test_other_parts_are_refused() -> None:
+    data = encode_parts_exr(_parts(KNOWN_PARTS[0], SIZE))
+    for names, size, lights, message in [
         (KNOWN_PARTS[1], SIZE, None, "channels are direct.B"),
         (KNOWN_PARTS[0], SIZE, 1, "channels are direct.B"),
         (KNOWN_PARTS[0], (8, 16), None, r"parts: \[16, 16\] pixels; expected \[8, 16\]"),
         (KNOWN_PARTS[0], SIZE, MAX_LIGHTS // 2 + 1, "parts: 66 pictures; expected at most 64"),
         ((ALL_LIGHT,), SIZE, MAX_LIGHTS + 1, "lights: 65 pictures; expected at most 64"),
         ((ALL_LIGHT,), (16, 24), 2, r"lights: \[16, 16\] pixels; expected \[16, 24\]"),
-    ],
-)
-def test_other_parts_are_refused(
-    names: tuple[str, ...], size: tuple[int, int], lights: int | None, message: str
-) -> None:
-    data = encode_parts_exr(_parts(KNOWN_PARTS[0], SIZE))
-    with pytest.raises(TrilightError, match=message):
-        decode_parts_exr(data, names, size, lights)
+    ]:
+        with case(names), pytest.raises(TrilightError, match=message):
+            decode_parts_exr(data, names, size, lights)
 
 
 @for_each("lights", [False, True])
@@ -524,44 +530,24 @@ def test_samples_with_parts_come_back_and_are_verified(
         decode_sample(sample.key, members)
 
 
-def test_a_sample_without_parts_and_lights_is_written_as_ever() -> None:
+def test_a_sample_without_parts_is_written_as_ever_and_a_record_of_no_parts_is_refused() -> None:
     members = encode_sample(tiny_sample())
     assert not any("parts" in suffix or "lights" in suffix for suffix in members)
     assert all("parts" not in view for view in json.loads(members["json"])["views"])
     back = decode_sample("000000000", members)
     assert back.lights_rgb is back.parts_rgb is None
     assert all(view.parts is None for view in back.views)
-
-
-@for_each(
-    "parts",
-    [{}, 3, {"direct": {}}, {"direct": vars(FLOOR), "glossy": vars(FLOOR)},
-     {"direct": vars(FLOOR), "indirect": {**vars(FLOOR), "noise_floor_db": 1e9}},
-     {"direct": vars(FLOOR), "indirect": {**vars(FLOOR), "more": 1.0}}],
-)  # fmt: skip
-def test_a_record_of_no_parts_is_refused(parts: Any) -> None:
     members = encode_sample(_sample())
     record = json.loads(members["json"])
-    record["views"][1]["parts"] = parts
-    with pytest.raises(TrilightError, match=r"views\.1\.parts"):
-        decode_scene("000000000", {**members, "json": json.dumps(record).encode()})
-
-
-def test_verify_demands_the_sum_of_parts() -> None:
-    sample = _sample()
-    assert "parts are direct, indirect; the settings" in faults(sample)[0]
-    assert "every view expect diffuse, specular" in faults(sample, split_lobes=True)[0]
-    assert "parts are none" in faults(tiny_sample(), split=True)[0]
-    views = (sample.views[0], dataclasses.replace(sample.views[1], parts=None))
-    assert faults(dataclasses.replace(sample, views=views), split=True)
-    (fault,) = faults(_one_bit_off(sample), split=True)
-    assert "view 1 has a picture that is not the sum of its parts in 1 pixels" in fault
-    assert fault.endswith("first in (3, 5)")
-    both = _sample(lights=True)
-    assert both.parts_rgb is not None
-    wrong = {name: 2 * part for name, part in both.parts_rgb.items()}
-    found = faults(dataclasses.replace(both, parts_rgb=wrong), split=True, per_light=True)
-    assert len(found) == 2 and "a light that is not the sum" in found[0]
+    no_parts: list[Any] = [
+        {}, 3, {"direct": {}}, {"direct": vars(FLOOR), "glossy": vars(FLOOR)},
+        {"direct": vars(FLOOR), "indirect": {**vars(FLOOR), "noise_floor_db": 1e9}},
+        {"direct": vars(FLOOR), "indirect": {**vars(FLOOR), "more": 1.0}},
+    ]  # fmt: skip
+    for parts in no_parts:
+        record["views"][1]["parts"] = parts
+        with case(parts), pytest.raises(TrilightError, match=r"views\.1\.parts"):
+            decode_scene("000000000", {**members, "json": json.dumps(record).encode()})
 
 
 def test_light_that_is_not_finite_is_refused_and_a_sum_beyond_half_floats_is_seen() -> None:

@@ -15,7 +15,7 @@ from safetensors.numpy import save
 
 from storage.digests import sha256_hex
 from storage.errors import TrilightError
-from storage.records.asset import Asset, decode_asset, encode_asset
+from storage.records.asset import decode_asset, encode_asset
 from storage.records.lookup import FLAT
 from storage.records.retextured import (
     NEW,
@@ -69,20 +69,6 @@ def test_another_dtype_or_shape_and_values_that_are_not_finite_are_named(field: 
     for value in (np.nan, np.inf, -np.inf) if array.dtype == np.float32 else ():
         with pytest.raises(TrilightError, match=rf"{field}\[{index[0]}.*finite"):
             _changed(field, index, value).check()
-
-
-def test_a_sky_is_light_enough_unless_it_is_black() -> None:
-    """Without an emitter, a scene is lit by its environment or not at all."""
-    plain = tiny_scene()
-    materials = plain.materials.copy()
-    materials[LIGHT, 7:] = 0
-    objects = (plain.objects[0], dataclasses.replace(plain.objects[0], name="other"))
-    dark: dict[str, Any] = {"materials": materials, "objects": objects}
-    tiny_scene(**dark, environment=sky()).check()
-    black = sky(radiance_rgb=np.zeros((1, 2, 3), np.float32))
-    with pytest.raises(TrilightError, match="expected at least one emitter"):
-        tiny_scene(**dark, environment=black).check()
-    tiny_scene(environment=black).check()
 
 
 def _index(row: int, place: int, value: int) -> Scene:
@@ -179,20 +165,31 @@ BROKEN: list[tuple[Scene, str]] = [
 ]
 
 
-def test_valid_scenes_pass() -> None:
+def test_valid_scenes_pass_and_a_sky_is_light_enough_unless_it_is_black() -> None:
     """One of them has an albedo that sums to 1 in float32."""
     third = np.float32(1 / 3)
     whole = _changed("materials", (0, slice(6)), [np.float32(1) - third] * 3 + [third] * 3)
     lit = textured_scene(environment=sky())
     for scene in (tiny_scene(), whole, lit, _below(is_seen=True), bumpy_scene()):
         scene.check()
+    # without an emitter, a scene is lit by its environment or not at all
+    plain = tiny_scene()
+    materials = plain.materials.copy()
+    materials[LIGHT, 7:] = 0
+    objects = (plain.objects[0], dataclasses.replace(plain.objects[0], name="other"))
+    dark: dict[str, Any] = {"materials": materials, "objects": objects}
+    tiny_scene(**dark, environment=sky()).check()
+    black = sky(radiance_rgb=np.zeros((1, 2, 3), np.float32))
+    with pytest.raises(TrilightError, match="expected at least one emitter"):
+        tiny_scene(**dark, environment=black).check()
+    tiny_scene(environment=black).check()
 
 
-@for_each(("scene", "message"), BROKEN)
-def test_a_broken_law_names_field_value_and_index(scene: Scene, message: str) -> None:
-    with pytest.raises(TrilightError, match=message) as caught:
-        scene.check()
-    assert str(caught.value).startswith("scene: ") and "expected" in str(caught.value)
+def test_a_broken_law_names_field_value_and_index() -> None:
+    for scene, message in BROKEN:
+        with case(message), pytest.raises(TrilightError, match=message) as caught:
+            scene.check()
+        assert str(caught.value).startswith("scene: ") and "expected" in str(caught.value)
 
 
 def test_all_maps_together_have_a_bound() -> None:
@@ -212,16 +209,13 @@ def _two(diffuse: np.ndarray, specular: np.ndarray) -> Scene:
     return textured_scene(0, *textures, material_textures=index)
 
 
-def test_albedos_are_compared_where_they_meet() -> None:
+def test_albedos_are_compared_where_they_meet_and_between_texels_of_other_sizes() -> None:
     """What one texture reflects more where another reflects less is no more than all."""
     stripes = np.array([[0.9, 0.1]])
     _two(stripes, 1 - stripes).check()
     with pytest.raises(TrilightError, match="at every texture coordinate"):
         _two(stripes, stripes / 2).check()
-
-
-def test_albedos_of_other_sizes_are_compared_between_their_texels() -> None:
-    """Slow twin: the sum on a fine grid comes near the sum that the law finds, from below."""
+    # Slow twin: the sum on a fine grid comes near the sum that the law finds, from below.
     from storage.records.lookup import texture_values
     from storage.records.scene import _greatest_sum
 
@@ -236,7 +230,7 @@ def test_albedos_of_other_sizes_are_compared_between_their_texels() -> None:
         assert (fine <= found + 1e-12).all() and (found - fine <= 2 * 16 / 1000).all()
 
 
-def test_a_scene_of_constant_textures_has_the_bytes_of_the_scene_without() -> None:
+def test_constant_textures_leave_the_bytes_of_a_scene_without_and_go_alone() -> None:
     plain = tiny_scene()
     colour = Texture(texels=np.full((5, 3, 3), plain.materials[FLOOR, :3], np.float32))
     rough = Texture(texels=np.full((1, 1, 1), plain.materials[FLOOR, 6], np.float32))
@@ -249,9 +243,6 @@ def test_a_scene_of_constant_textures_has_the_bytes_of_the_scene_without() -> No
     sample = tiny_sample()
     same = dataclasses.replace(sample, scene=constant)
     assert encode_sample(same) == encode_sample(sample)
-
-
-def test_one_constant_texture_among_others_goes_alone() -> None:
     grey = Texture(texels=np.full((2, 2, 3), 51, np.uint8))
     scene = textured_scene(0, grey, number_texture())
     left = without_constant_textures(scene)
@@ -326,7 +317,7 @@ def _metadata() -> dict[str, Any]:
     return found
 
 
-def test_round_trip_is_exact() -> None:
+def test_round_trip_is_exact_also_of_names_without_utf8_and_fields_that_are_not_known() -> None:
     odd = SceneObject(
         name='floor "ü" \n', kind="shell", licence="MIT", attribution="Ö", source_url="x"
     )
@@ -338,10 +329,7 @@ def test_round_trip_is_exact() -> None:
     assert back.objects == scene.objects
     assert back.provenance == scene.provenance
     assert encode_scene(back) == encode_scene(scene)
-
-
-def test_names_that_are_no_utf8_and_fields_that_are_not_known_change_nothing() -> None:
-    """Names of files may hold lone surrogates: they neither meet in one name nor stop a reader."""
+    # Names of files may hold lone surrogates: they neither meet in one name nor stop a reader.
     objects = (
         SceneObject(name="x\udcfe", kind="shell"),
         SceneObject(name="x\udcff", kind="emitter", uid="\udcff"),
@@ -374,9 +362,8 @@ def _with_arrays(**changes: Any) -> bytes:
     return save(arrays, {KEY: json.dumps(_metadata())})
 
 
-@for_each(
-    ("data", "message"),
-    [
+def test_arrays_and_metadata_are_exactly_those_of_a_scene() -> None:
+    for data, message in [
         (_with_arrays(faces=None), "missing or not expected: 'faces'"),
         (_with_arrays(extra=ARRAYS["fov_deg"]), "missing or not expected: 'extra'"),
         (_with_arrays(faces=ARRAYS["faces"].astype(np.int64)), "dtype int64; expected uint32"),
@@ -394,15 +381,14 @@ def _with_arrays(**changes: Any) -> bytes:
         (_stating(provenance={"template": [5]}), r"provenance.template is \[5\]; expected text"),
         (_stating(provenance={"excursion": {"axis": "x"}}), "excursion is .* expected an axis"),
         (_stating(provenance={"x": float("nan")}), "provenance is .*nan.*finite numbers"),
-    ],
-)
-def test_arrays_and_metadata_are_exactly_those_of_a_scene(data: bytes, message: str) -> None:
-    with pytest.raises(TrilightError, match=f"^a.safetensors: .*{message}") as caught:
-        decode_scene_file(data, "a.safetensors")
-    assert "\n" not in str(caught.value)
+    ]:
+        with case(data):
+            with pytest.raises(TrilightError, match=f"^a.safetensors: .*{message}") as caught:
+                decode_scene_file(data, "a.safetensors")
+            assert "\n" not in str(caught.value)
 
 
-def test_a_type_that_numpy_has_not_is_one_line() -> None:
+def test_a_type_that_numpy_has_not_and_every_flipped_byte_are_one_clear_line() -> None:
     """In the file of a scene and in a sample, where the library raises a KeyError."""
     header = json.dumps({"x": {"dtype": "BF16", "shape": [1], "data_offsets": [0, 2]}}).encode()
     data = len(header).to_bytes(8, "little") + header + bytes(2)
@@ -410,10 +396,7 @@ def test_a_type_that_numpy_has_not_is_one_line() -> None:
         decode_scene_file(data, "a")
     with pytest.raises(TrilightError, match="^safetensors: unreadable"):
         decode_arrays(data)
-
-
-def test_every_flipped_byte_is_a_scene_or_one_clear_line() -> None:
-    """No damage ends in anything but a lawful scene or a TrilightError."""
+    # no damage ends in anything but a lawful scene or a TrilightError
     data, rng = encode_scene(tiny_scene()), np.random.default_rng(0)
     refused = 0
     for at in rng.integers(0, len(data), 400):
@@ -449,8 +432,7 @@ def test_a_large_file_is_refused_before_it_is_read(tmp_path: Path) -> None:
     assert read_scene_file(path).objects == tiny_scene().objects
 
 
-@pytest.fixture
-def asset() -> Asset:
+def test_an_asset_survives_the_file_and_what_is_none_is_refused_in_one_line() -> None:
     ball = small_pool()[0].asset
     quality = dataclasses.replace(QUALITY, error_p99=1 / 3, open_edges=7)
     levels = []
@@ -458,10 +440,7 @@ def asset() -> Asset:
         record = dataclasses.replace(each.record, method="meshoptimizer", quality=quality)
         levels.append(dataclasses.replace(each, record=record))
     source = dataclasses.replace(SOURCE, num_faces_turned=3, front_share=0.1)
-    return dataclasses.replace(ball, source=source, levels=tuple(levels))
-
-
-def test_an_asset_survives_the_file(asset: Asset) -> None:
+    asset = dataclasses.replace(ball, source=source, levels=tuple(levels))
     again = decode_asset(encode_asset(asset))
     for field in ("geometry_sha256", "source_sha256", "recipe", "source"):
         assert getattr(again, field) == getattr(asset, field)
@@ -471,9 +450,6 @@ def test_an_asset_survives_the_file(asset: Asset) -> None:
         assert np.array_equal(there.positions, here.positions)
         assert np.array_equal(there.faces, here.faces)
     assert encode_asset(again) == encode_asset(asset)
-
-
-def test_what_is_no_asset_or_was_cut_off_is_refused_in_one_line(asset: Asset) -> None:
     weight = {"weight": np.zeros(3, np.float32)}
     headers = (
         "not JSON", "[]", '{"levels": [{}]}', '{"levels": [{"quality": {}}]}',

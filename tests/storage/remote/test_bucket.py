@@ -34,7 +34,7 @@ from storage.remote import url as remote_url
 from storage.remote.store import LocalStore, RemoteStore, Store
 from storage.remote.transfers import with_tries
 from tests.command_line import run_program
-from tests.for_each import for_each
+from tests.for_each import case
 from tests.http_server import Handler, running
 from tests.pipeline.generation.bucket_kit import empty_bucket
 from tests.pipeline.generation.test_dataset_writer import ENVIRONMENT, _build
@@ -133,14 +133,9 @@ def test_a_bucket_holds_the_same_dataset(
             read(f"{scheme}://{elsewhere}")
 
 
-def test_interrupted_reads_go_on(s3: Line, local: Dataset) -> None:
-    dataset = open_dataset("s3://shards/set")
-    s3.cuts = [2000, 500, 3000]
-    assert expected(dataset) == expected(local)
-    assert not s3.cuts
-
-
-def test_wrong_access_is_named_without_secrets(s3: Line, moto: int) -> None:
+def test_wrong_access_is_named_without_secrets_and_interrupted_reads_go_on(
+    s3: Line, moto: int, local: Dataset
+) -> None:
     dataset = open_dataset("s3://shards/set")
     control(moto, "reset-auth", b"0")
     try:
@@ -153,6 +148,9 @@ def test_wrong_access_is_named_without_secrets(s3: Line, moto: int) -> None:
     text = str(caught.value)
     assert "cannot be read" in text and "Check the URL and your access" in text
     assert "s3cret" not in text and os.environ["AWS_SECRET_ACCESS_KEY"] not in text
+    s3.cuts = [2000, 500, 3000]
+    assert expected(dataset) == expected(local)
+    assert not s3.cuts
 
 
 def create_once(made: Store, folder: Path) -> None:
@@ -213,22 +211,19 @@ def test_a_server_that_ignores_the_condition_is_refused_before_anything_is_begun
     assert not folder.manifest.exists()
 
 
-@for_each(
-    ("out", "message"),
-    [
-        ("s3://ada:hunter2@shards/set", "out 's3://shards/set' came with a user or password"),
-        ("s3://shards/set?key=hunter2", "out 's3://shards/set' has a query"),
-        ("https://ada:hunter2@host/set", "out 'https://host/set' has the scheme 'https'; expected"),
-        ("hf://datasets/ada/set", "has the scheme 'hf'; expected a folder, or a URL of s3 or gs"),
-        ("s3://", "names no host or bucket"),
-        ("pipe:cat", "is a pipe: command"),
-    ],
-)
-def test_places_that_cannot_be_written_are_refused_by_name(out: str, message: str) -> None:
-    with pytest.raises(TrilightError, match="^out ") as caught:
-        GenerateOptions(out=out)
-    assert message in str(caught.value)
-    assert "hunter2" not in str(caught.value)
+def test_places_that_cannot_be_written_are_refused_by_name() -> None:
+    for out, message in {
+        "s3://ada:hunter2@shards/set": "out 's3://shards/set' came with a user or password",
+        "s3://shards/set?key=hunter2": "out 's3://shards/set' has a query",
+        "https://ada:hunter2@host/set": "out 'https://host/set' has the scheme 'https'; expected",
+        "hf://datasets/ada/set": "has the scheme 'hf'; expected a folder, or a URL of s3 or gs",
+        "s3://": "names no host or bucket",
+        "pipe:cat": "is a pipe: command",
+    }.items():
+        with case(out), pytest.raises(TrilightError, match="^out ") as caught:
+            GenerateOptions(out=out)
+        assert message in str(caught.value)
+        assert "hunter2" not in str(caught.value)
 
 
 def test_a_full_disk_may_pass_whichever_way_the_bytes_go() -> None:

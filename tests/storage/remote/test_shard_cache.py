@@ -25,7 +25,7 @@ from storage.remote import transfers
 from storage.remote.shard_cache import ShardCache, shard_cache
 from storage.remote.transfers import TRIES, Pace, TransferFailed, with_tries
 from storage.remote.url import RemoteUrl, public_text, safe_text, safe_url
-from tests.for_each import for_each
+from tests.for_each import case
 from tests.http_server import Fault, Site
 from tests.storage.remote.cache_readers import BYTES, digest, fetch, read_all, read_one, remote
 from tests.storage.remote.conftest import PATH, SHARD, expected, read, until
@@ -48,7 +48,9 @@ def test_equal_names_of_different_places_do_not_meet(server: Site, cache: Path) 
     assert found == [b"a" * BYTES, b"b" * BYTES]
 
 
-def test_what_was_not_read_for_longest_goes_first(server: Site, cache: Path) -> None:
+def test_what_was_not_read_for_longest_goes_first_and_what_is_being_read_stays(
+    server: Site, cache: Path
+) -> None:
     a, b, c, d = put(server, "a.tar", "b.tar", "c.tar", "d.tar")
     store = ShardCache(cache, 3 * BYTES)
     for number, url in enumerate((a, b, c, a)):
@@ -63,10 +65,6 @@ def test_what_was_not_read_for_longest_goes_first(server: Site, cache: Path) -> 
     assert [server.gets()[f"/{name}.tar"] for name in "abc"] == [1, 1, 1]
     fetch(store, b)
     assert server.gets()["/b.tar"] == 2
-
-
-def test_what_is_being_read_stays(server: Site, cache: Path) -> None:
-    a, b, c = put(server, "a.tar", "b.tar", "c.tar")
     store = ShardCache(cache, BYTES)
     with store.open(a, num_bytes=BYTES, sha256=digest("a")) as stream:
         fetch(store, b)
@@ -98,7 +96,9 @@ def test_without_a_hash_a_query_may_tell_two_files_apart(server: Site, cache: Pa
     assert all(set(path.name) <= set("0123456789abcdef-") for path in cache.iterdir())
 
 
-def test_threads_fetch_a_shard_once(server: Site, cache: Path) -> None:
+def test_threads_fetch_a_shard_once_and_processes_share_a_cache_that_is_too_small(
+    server: Site, cache: Path
+) -> None:
     (url,) = put(server, "a.tar")
     server.faults["/a.tar"] = [Fault(stall_after=10)]  # so that all are waiting together
     store = ShardCache(cache, 10**6)
@@ -106,10 +106,7 @@ def test_threads_fetch_a_shard_once(server: Site, cache: Path) -> None:
         found = list(pool.map(lambda _: fetch(store, url), range(8)))
     assert found == [b"a" * BYTES] * 8
     assert server.ranges_of("/a.tar") == ["", "bytes=10-"]
-
-
-def test_processes_share_a_cache_that_is_too_small(server: Site, cache: Path) -> None:
-    """Every read is right while the others evict; afterwards the cache keeps its bound."""
+    # every read is right while the others evict; afterwards the cache keeps its bound
     names = [f"{letter}.tar" for letter in "abcdef"]
     put(server, *names)
     with multiprocessing.get_context("forkserver").Pool(2) as children:
@@ -176,16 +173,6 @@ def test_a_wrong_size_and_a_place_that_cannot_be_written_are_named(
         read(server.url)
 
 
-def test_a_dataset_is_the_same_through_a_server(server: Site, local: Dataset) -> None:
-    remote = open_dataset(f"{server.url}/")
-    assert remote.manifest == local.manifest
-    assert remote.objects_lock() == local.objects_lock()
-    assert remote.failures() == local.failures()
-    assert read(server.url) == expected(local)
-    with pytest.raises(TrilightError, match="is on a server; expected a local folder"):
-        _ = remote.folder
-
-
 OUTLIVED = {
     "statuses": [Fault(status=500), Fault(status=503), Fault(status=429)],
     "cut": [Fault(cut_after=0), Fault(cut_after=5000), Fault(cut_after=1)],
@@ -217,13 +204,22 @@ def test_what_passes_by_itself_is_outlived(
     assert kept.read_bytes() == (local.folder.root / SHARD).read_bytes()
 
 
-def test_a_transfer_goes_on_where_it_broke(server: Site, local: Dataset) -> None:
+def test_a_dataset_is_the_same_through_a_server_and_goes_on_where_it_broke(
+    server: Site, local: Dataset
+) -> None:
     size = local.shards_of("train")[0].num_bytes
     server.faults[PATH] = [Fault(cut_after=size // 2), Fault(cut_after=size // 4)]
     read(server.url)
     assert server.ranges_of(PATH) == ["", f"bytes={size // 2}-", f"bytes={size // 2 + size // 4}-"]
     beside = (local.folder.root / "manifest.json").stat().st_size
     assert server.sent == size + beside, "no byte of the shard came twice"
+    remote = open_dataset(f"{server.url}/")
+    assert remote.manifest == local.manifest
+    assert remote.objects_lock() == local.objects_lock()
+    assert remote.failures() == local.failures()
+    assert read(server.url) == expected(local)
+    with pytest.raises(TrilightError, match="is on a server; expected a local folder"):
+        _ = remote.folder
 
 
 @pytest.mark.parametrize(
@@ -310,29 +306,26 @@ def patience(monkeypatch: pytest.MonkeyPatch, **limits: float) -> None:
         monkeypatch.setattr(transfers, name.upper(), value)
 
 
-def test_a_server_that_trickles_is_left(
-    server: Site, cache: Path, monkeypatch: pytest.MonkeyPatch
+def test_a_server_that_stalls_after_a_few_bytes_or_trickles_is_left(
+    server: Site, local: Dataset, cache: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """One byte every 20 ms is never silent, and moves on at every look."""
+    """Each answer moves on by 100 bytes: that is no reason to count the tries anew.
+
+    One byte every 20 ms is never silent, and moves on at every look.
+    """
+    server.always[PATH] = Fault(stall_after=100)
+    assert local.shards_of("train")[0].num_bytes > 100 * TRIES
+    with pytest.raises(TrilightError, match=r"cannot be read \(no answer in time\)"):
+        read(server.url)
+    assert server.gets()[PATH] == TRIES
     patience(monkeypatch, window_s=0.5, least_bytes_per_s=1000.0)
     server.always[PATH] = Fault(trickle=(1, 0.02))
     begun_s = time.monotonic()
     with pytest.raises(TrilightError, match=r"too slow, \d+ bytes in .* at least 1000 a second"):
         read(server.url)
     assert time.monotonic() - begun_s < 30, "of a file that would take minutes"
-    assert server.gets()[PATH] == 1
+    assert server.gets()[PATH] == TRIES + 1
     assert not list(cache.iterdir())
-
-
-def test_a_server_that_stalls_after_a_few_bytes_is_left(
-    server: Site, local: Dataset, cache: Path
-) -> None:
-    """Each answer moves on by 100 bytes: that is no reason to count the tries anew."""
-    server.always[PATH] = Fault(stall_after=100)
-    assert local.shards_of("train")[0].num_bytes > 100 * TRIES
-    with pytest.raises(TrilightError, match=r"cannot be read \(no answer in time\)"):
-        read(server.url)
-    assert server.gets()[PATH] == TRIES
 
 
 def test_a_slow_steady_link_is_waited_for(
@@ -398,32 +391,44 @@ def test_a_server_that_is_away_for_a_moment_is_waited_for(cache: Path) -> None:
     assert with_tries(read_once) == "read"
 
 
-@for_each(
-    ("url", "shown"),
-    [
-        ("https://host/a/b.glb", "https://host/a/b.glb"),
-        ("http://[::1]:8000/a", "http://[::1]:8000/a"),
-        ("https://ada:s3@cret@host/a", "https://host/a"),
-        ("https://host/a?token=s3cret", "https://host/a"),
-        ("https://host/a#s3cret", "https://host/a"),
-        ("https://ada:s3cret/x@host/a", "https://..."),
-        ("https://ada:s3cret?x@host/a", "https://..."),
-        ("https://ada:s3cret\\x@host/a", "https://..."),
-        ("s3://key:s3cret@bucket/a", "s3://bucket/a"),
-        ("https://host/pkg@1.0/a", "https://host/pkg@1.0/a"),
-        ("https://[broken/a?s3cret", "https://[broken/a"),
-        ("/home folder/a?b", "/home folder/a?b"),
-        ("", ""),
-    ],
-)
-def test_urls(url: str, shown: str) -> None:
-    assert safe_url(url) == shown
-    assert safe_url(shown) == shown
+SHOWN = {
+    "https://host/a/b.glb": "https://host/a/b.glb",
+    "http://[::1]:8000/a": "http://[::1]:8000/a",
+    "https://ada:s3@cret@host/a": "https://host/a",
+    "https://host/a?token=s3cret": "https://host/a",
+    "https://host/a#s3cret": "https://host/a",
+    "https://ada:s3cret/x@host/a": "https://...",
+    "https://ada:s3cret?x@host/a": "https://...",
+    "https://ada:s3cret\\x@host/a": "https://...",
+    "s3://key:s3cret@bucket/a": "s3://bucket/a",
+    "https://host/pkg@1.0/a": "https://host/pkg@1.0/a",
+    "https://[broken/a?s3cret": "https://[broken/a",
+    "/home folder/a?b": "/home folder/a?b",
+    "": "",
+}
+PUBLISHED = {
+    "https://ada:s3cret@host/a?id=7#top": "https://host/a?id=7#top",
+    "see https://ada:s3cret@host/a, and more": "see https://host/a, and more",
+    "https://host/a?X-Amz-Signature=s3cret&id=7": "https://host/a",
+    "https://host/a?id=7&sig=s3cret": "https://host/a",
+    "https://host/a#access_token=s3cret": "https://host/a",
+    "https://ada:s3cret?x@host/a": "https://...",
+    "Ada Lovelace": "Ada Lovelace",
+}
 
 
-@for_each(
-    "text",
-    [
+def test_what_is_shown_or_published_of_a_url_opens_nothing() -> None:
+    for url, shown in SHOWN.items():
+        with case(url):
+            assert safe_url(url) == shown
+            assert safe_url(shown) == shown
+    for text, published in PUBLISHED.items():
+        with case(text):
+            assert public_text(text) == published
+
+
+def test_messages_lose_their_secrets() -> None:
+    for text in (
         "404, message='Not Found', url='https://ada:s3cret@host/a?sig=s3cret'",
         'cannot open "https://ada:s3cret@host/a", giving up',
         "two: https://a:s3cret@b/c and s3://d:s3cret@e/f?s3cret",
@@ -432,26 +437,9 @@ def test_urls(url: str, shown: str) -> None:
         "password = s3cret",
         "AccessKeyId is AKIAs3crets3cret, refused",
         "hf_s3crets3crets3crets3cret is not valid",
-    ],
-)
-def test_messages_lose_their_secrets(text: str) -> None:
-    shown = safe_text(text)
-    assert "s3cret" not in shown and "ada" not in shown
+    ):
+        with case(text):
+            shown = safe_text(text)
+            assert "s3cret" not in shown and "ada" not in shown
     for plain in ("Connection reset by peer", "expected 12 bytes, got 7", "https://host/a: gone"):
         assert safe_text(plain) == plain
-
-
-@for_each(
-    ("text", "published"),
-    [
-        ("https://ada:s3cret@host/a?id=7#top", "https://host/a?id=7#top"),
-        ("see https://ada:s3cret@host/a, and more", "see https://host/a, and more"),
-        ("https://host/a?X-Amz-Signature=s3cret&id=7", "https://host/a"),
-        ("https://host/a?id=7&sig=s3cret", "https://host/a"),
-        ("https://host/a#access_token=s3cret", "https://host/a"),
-        ("https://ada:s3cret?x@host/a", "https://..."),
-        ("Ada Lovelace", "Ada Lovelace"),
-    ],
-)
-def test_what_is_published_opens_nothing(text: str, published: str) -> None:
-    assert public_text(text) == published

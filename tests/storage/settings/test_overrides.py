@@ -20,7 +20,7 @@ from storage.settings.described import checked
 from storage.settings.fields import array_scalar, describe_fields
 from storage.settings.overrides import apply_overrides
 from storage.settings.ranges import EXECUTION, Within
-from tests.for_each import for_each
+from tests.for_each import case, for_each
 
 
 @checked()
@@ -121,7 +121,7 @@ def test_several_changes_are_one_after_the_other(changes: dict[str, int]) -> Non
     assert Tree() == TREE
 
 
-def test_values_come_as_json_has_them() -> None:
+def test_values_come_as_json_has_them_and_entries_and_groups_may_be_named() -> None:
     """A whole number for a float becomes one, so that the manifest says 2.0 whoever writes it."""
     text = '{"branch.height": 2, "branch.leaf.pair": [0, 1], "branch.leaf.whole": [9]}'
     after = apply_overrides(TREE, json.loads(text))
@@ -129,9 +129,6 @@ def test_values_come_as_json_has_them() -> None:
     assert repr(after.branch.leaf.pair) == "(0.0, 1.0)"
     assert after.branch.leaf.whole == (9,)
     assert apply_overrides(TREE, {"branch.leaf.maybe": 7}).branch.leaf.maybe == 7
-
-
-def test_one_entry_of_a_list_and_whole_groups_may_be_named() -> None:
     raised = apply_overrides(TREE, {"branches.1.height": 3})
     assert [branch.height for branch in raised.branches] == [2.0, 3.0]
     paired = apply_overrides(TREE, {"branches.0.leaves.1.pair": [0, 2]})
@@ -236,20 +233,18 @@ def test_a_group_with_presets_may_be_named_and_then_changed(backwards: bool) -> 
     assert apply_overrides(Car(), {"engine": "small"}) == Car(engine=Engine(power=2))
 
 
-@for_each(
-    ("changes", "message"),
-    [
+def test_a_wrong_preset_or_name_is_asked_back() -> None:
+    wrong: list[tuple[dict[str, Any], str]] = [
         (
             {"engine": "lrage"},
             r"is 'lrage'; did you mean large\? Expected one of small, .*e\.power",
         ),
         ({"engine": ["large"]}, r"'engine' is \['large'\]; .*xpected one of small, large"),
         ({"engine.powr": 3}, r"'engine\.powr' does not exist.* did you mean power\? Expected one"),
-    ],
-)
-def test_a_wrong_preset_or_name_is_asked_back(changes: dict[str, Any], message: str) -> None:
-    with pytest.raises(TrilightError, match=message):
-        apply_overrides(Car(), changes)
+    ]
+    for changes, message in wrong:
+        with case(changes), pytest.raises(TrilightError, match=message):
+            apply_overrides(Car(), changes)
 
 
 Count = Annotated[int, Within(1, 9)]
