@@ -239,7 +239,7 @@ def run_plan(
     finished = list[FinishedShot]()
     notes = dict[str, None]()
     before: Frame | None = None
-    own: Sequence[Camera] = ()
+    cameras: Sequence[Camera] = ()
     with ExitStack() as stack:
         for renderer in plan.renderers:
             stack.enter_context(closing(renderer))
@@ -248,13 +248,13 @@ def run_plan(
             loaded = reader.load(source)
             scene = _SceneAtHand(plan, source, loaded.scene, on_samples)
             if plan.orbit is None:
-                own = ()
+                cameras = ()
             for _, camera in pairs:
                 if isinstance(camera, int):
-                    if not own:
+                    if not cameras:
                         start = Camera.of_scene(loaded.scene, plan.view, "--view")
-                        own = orbit(loaded.scene, start, *plan.orbit) if plan.orbit else [start]
-                    camera = own[camera]
+                        cameras = orbit(loaded.scene, start, *plan.orbit) if plan.orbit else [start]
+                    camera = cameras[camera]
                 stem = plan.output.stem_of(len(finished))
                 done, before = scene.finish(stem, camera, before)
                 finished.append(done)

@@ -17,8 +17,7 @@ import igl
 import numpy as np
 from numpy.typing import NDArray
 from scipy.ndimage import label, maximum_filter
-from scipy.sparse import coo_array
-from scipy.sparse.csgraph import connected_components
+from trimesh.graph import connected_component_labels
 
 from pipeline.assets.cleaning.clean import clean
 from pipeline.assets.decimation.decimate import collapse_by_qslim
@@ -91,8 +90,8 @@ def _fill_holes(mesh: TriangleMesh) -> TriangleMesh:
     """Return a clean mesh with each connected border closed by a fan around its middle."""
     count = len(mesh.positions)
     border = open_half_edges(mesh)
-    links = coo_array((np.ones(len(border)), tuple(border.T)), shape=(count, count))
-    _, holes = np.unique(connected_components(links)[1][border[:, 0]], return_inverse=True)
+    component = connected_component_labels(border, count)
+    _, holes = np.unique(component[border[:, 0]], return_inverse=True)
     sums = [np.bincount(holes, weights=axis) for axis in mesh.positions[border[:, 0]].T]
     middles = np.stack(sums, axis=-1) / np.bincount(holes)[:, None]
     fans = np.column_stack([border[:, 1], border[:, 0], count + holes])

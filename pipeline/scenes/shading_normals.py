@@ -11,8 +11,6 @@ from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.sparse import coo_matrix
-from scipy.sparse.csgraph import connected_components
 
 LEAST_FACING = 0.1
 """Least cosine between the normals of a corner and of its face. Below it the corner gets the normal
@@ -104,18 +102,12 @@ def shading_groups(
 
     An edge of more than two faces, or of two faces with opposite orientation, is always sharp.
     """
-    directed = np.stack([faces, np.roll(faces, -1, axis=1)], axis=-1).reshape(-1, 2)
-    ends = np.sort(directed.astype(np.int64), axis=1)
-    _, edge, count = np.unique(
-        ends[:, 0] * (int(faces.max()) + 1) + ends[:, 1], return_inverse=True, return_counts=True
-    )
-    order = np.argsort(edge, kind="stable")
-    pairs = (order[count[edge[order]] == 2] // 3).reshape(-1, 2)
+    from trimesh.graph import connected_component_labels, face_adjacency  # late: slow to load
+
+    pairs = face_adjacency(faces)
     cosine = np.sum(normals[pairs[:, 0]] * normals[pairs[:, 1]], axis=1)
     smooth_pairs = pairs[cosine >= math.cos(math.radians(angle_deg))]
-    graph = coo_matrix((np.ones(len(smooth_pairs)), smooth_pairs.T), shape=(len(faces), len(faces)))
-    _, groups = connected_components(graph, directed=False)
-    return groups.astype(np.int64)
+    return np.asarray(connected_component_labels(smooth_pairs, len(faces)), np.int64)
 
 
 def _corner_angles(

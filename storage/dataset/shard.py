@@ -42,26 +42,30 @@ def write_shard(path: Path, samples: Iterable[tuple[str, Mapping[str, bytes]]]) 
 
 
 def write_tar(stream: BinaryIO, samples: Iterable[tuple[str, Mapping[str, bytes]]]) -> None:
-    """Write samples to an open file as webdataset's TarWriter does, but with fixed metadata."""
+    """Write samples to an open file by webdataset's writer, with fixed metadata."""
+    from webdataset.writer import TarWriter  # late: it loads torch where that is installed
+
     written = set[str]()
-    with tarfile.open(fileobj=stream, mode="w|") as archive:
+    with TarWriter(stream, _OWNER, _OWNER, _MODE, encoder=False, mtime=0) as writer:
         for key, members in samples:
-            for name in sorted(name for name in members if MAP_NAME.fullmatch(name)):
-                if name not in written:
-                    _add(archive, name, members[name])
-                    written.add(name)
-            for suffix in sorted(set(members) - written):
-                _add(archive, f"{key}.{suffix}", members[suffix])
+            for name in sorted(set(filter(MAP_NAME.fullmatch, members)) - written):
+                header = _map_header(name, len(members[name]))
+                writer.tarstream.addfile(header, io.BytesIO(members[name]))
+                written.add(name)
+            writer.write({"__key__": key, **members})  # without maps, since they begin with _
 
 
-def _add(archive: tarfile.TarFile, name: str, data: bytes) -> None:
-    """Add a member under its whole name, with the metadata that all members have."""
+_OWNER = "trilight"
+_MODE = 0o444
+
+
+def _map_header(name: str, num_bytes: int) -> tarfile.TarInfo:
+    """Return the header of a map, with the metadata that all members have."""
     info = tarfile.TarInfo(name)
-    info.size = len(data)
-    info.mode = 0o444
-    info.uname = "trilight"
-    info.gname = "trilight"
-    archive.addfile(info, io.BytesIO(data))
+    info.size = num_bytes
+    info.mode = _MODE
+    info.uname = info.gname = _OWNER
+    return info
 
 
 MAX_MEMBER_BYTES = 1 << 30

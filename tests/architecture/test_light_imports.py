@@ -12,7 +12,6 @@ STEPS = (
     ("import trilight", {"numpy", "storage", "pipeline"}),
     ("import storage", HEAVY | CHECKERS),
     ("from storage.dataset import dataset, verify, staging, shard", HEAVY),
-    ("import io; shard.write_tar(io.BytesIO(), [])", HEAVY),
     ("import scene_templates.templates, scene_templates.settings", HEAVY),
     (
         "import trilight.compose, trilight.extend, trilight.learning, "

@@ -130,6 +130,13 @@ def test_no_string_names_a_module_of_ours(facts: dict[str, Facts]) -> None:
             assert each.asks_for_names or each.module_names == [], path
 
 
+def test_each_library_that_makes_the_project_has_a_job_in_it(facts: dict[str, Facts]) -> None:
+    """A manifest states their versions: one that nothing calls would be stated in vain."""
+    imported = {name for each in facts.values() for name in each.imported}
+    libraries = "mitsuba trimesh pymeshlab roma torch webdataset prefect OpenEXR pxr"
+    assert set(libraries.split()) - imported == set()
+
+
 def test_only_what_runs_in_blender_imports_it(facts: dict[str, Facts]) -> None:
     scripts = {
         "infra/bench/workloads/blender_process.py",

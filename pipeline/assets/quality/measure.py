@@ -11,6 +11,7 @@ from dataclasses import dataclass
 import igl
 import numpy as np
 from numpy.typing import NDArray
+from trimesh.geometry import faces_to_edges
 
 from pipeline.assets.cleaning.clean import clean
 from pipeline.assets.cleaning.orient import first_faces, outside_rays
@@ -70,18 +71,13 @@ def smallest_angles_deg(mesh: TriangleMesh) -> NDArray[np.float64]:
 
 def faces_of_edges(mesh: TriangleMesh) -> NDArray[np.int64]:
     """Return the number [E] of faces that share each edge: 1 at the border of an open surface."""
-    ends = np.sort(half_edges(mesh), axis=1)
+    ends = np.sort(faces_to_edges(mesh.faces), axis=1)
     return np.unique(ends[:, 0] * len(mesh.positions) + ends[:, 1], return_counts=True)[1]
-
-
-def half_edges(mesh: TriangleMesh) -> NDArray[np.int64]:
-    """Return the edges of each face in its direction: [3F, 2] rows of `positions`."""
-    return mesh.faces[:, [0, 1, 1, 2, 2, 0]].reshape(-1, 2)
 
 
 def open_half_edges(mesh: TriangleMesh) -> NDArray[np.int64]:
     """Return the edges [E, 2] that no face has in the opposite direction."""
-    edges = half_edges(mesh)
+    edges = faces_to_edges(mesh.faces)
     count = len(mesh.positions)
     opposite = edges[:, 1] * count + edges[:, 0]
     return edges[~np.isin(edges[:, 0] * count + edges[:, 1], opposite)]
@@ -301,7 +297,7 @@ def _check_vertices(result: TriangleMesh, source: TriangleMesh, max_outside: flo
 
 def require_watertight(mesh: TriangleMesh) -> None:
     """Raise Rejected `not_watertight` where a clean mesh is not closed, oriented and manifold."""
-    edges = half_edges(mesh)
+    edges = faces_to_edges(mesh.faces)
     num_open = len(open_half_edges(mesh))
     num_shared = len(edges) - len(np.unique(edges, axis=0))
     num_joints = int((~igl.is_vertex_manifold(mesh.faces)).sum()) if len(edges) else 0

@@ -14,10 +14,10 @@ from dataclasses import dataclass
 import igl
 import numpy as np
 from numpy.typing import NDArray
+from trimesh.graph import face_adjacency
 
 from pipeline.assets.quality.measure import (
     Surface,
-    half_edges,
     level_mesh,
     round_digits,
     sample_surface,
@@ -502,14 +502,10 @@ def _parts(
 
 def _torn_seams(level: TriangleMesh, source: SourceSurface, reach: float, texel: float) -> float:
     """Return the fraction of inner edge length whose two sides show distant source points."""
-    ends = np.sort(half_edges(level), axis=1)
-    edges, edge, count = np.unique(ends, axis=0, return_inverse=True, return_counts=True)
-    edge = edge.ravel()
-    order = np.argsort(edge, kind="stable")
-    sides = order[count[edge[order]] == 2].reshape(-1, 2) // 3
+    sides, ends = face_adjacency(level.faces, return_edges=True)
     if not len(sides):
         return 0.0
-    inner = level.positions[edges[count == 2]]
+    inner = level.positions[ends]
     normal = unit_normals(level)
     along = np.array(_ALONG)[:, None, None]
     points = ((1 - along) * inner[:, 0] + along * inner[:, 1]).reshape(-1, 3)
