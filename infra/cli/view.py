@@ -48,7 +48,7 @@ def view(options: ViewOptions) -> None:
     server = PageServer(deferred_routes(page_of(options.source), opened), port=options.port)
     stops: list[int] = []
     signal.signal(signal.SIGTERM, signal.getsignal(signal.SIGINT))
-    threading.Thread(target=server.serve_forever, daemon=True).start()
+    threading.Thread(target=server.run, daemon=True).start()
     suggest_look(f"Look at {server.address}")
     console.print("Only this machine reaches it, with this address. Ctrl-C ends it.", style="dim")
     screens = ("DISPLAY", "WAYLAND_DISPLAY")  # without one a browser takes over the terminal
@@ -61,6 +61,5 @@ def view(options: ViewOptions) -> None:
     while not stops:  # no lock: a signal just before a wait without end would be seen after it
         time.sleep(_STOP_S)
     room.close()
-    server.shutdown()
-    server.server_close()
+    server.close()
     console.print("Ended.", style="dim")

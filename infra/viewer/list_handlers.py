@@ -20,20 +20,13 @@ from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
+from starlette.responses import JSONResponse, Response
 
 from infra.render.path_tracer import PathTracer, RenderChild
 from infra.viewer.open_source import scene_list
 from infra.viewer.page_renderers import page_renderers
 from infra.viewer.scene_handlers import SceneHandlers
-from infra.viewer.server import (
-    NotFound,
-    Request,
-    Response,
-    Routes,
-    dispatch,
-    json_response,
-    static_routes,
-)
+from infra.viewer.server import NotFound, Request, Routes, dispatch, static_routes
 from pipeline.documents.png import encode_png
 from pipeline.documents.scene_page import preview
 from pipeline.exchange.formats import LoadedScene
@@ -303,7 +296,7 @@ class DatasetHandlers(SceneListHandlers):
     def _facts(self, _: Request) -> Response:
         manifest = self._dataset.manifest
         rows = self.index.rows
-        return json_response(
+        return JSONResponse(
             {
                 "name": safe_url(self._source),
                 "build": name_for_people(manifest.build, PRESET_ALIASES),
@@ -323,7 +316,7 @@ class DatasetHandlers(SceneListHandlers):
         matching, words = selected_rows(every, query)
         first = int(query["from"]) if query.get("from", "").isdecimal() else 0
         page = matching[first : first + MOST_ROWS]
-        return json_response(
+        return JSONResponse(
             {
                 "of": len(every),
                 "total": len(matching),
@@ -348,7 +341,7 @@ class DatasetHandlers(SceneListHandlers):
             raise NotFound("the scene has no such view.")
         if not width.isdecimal() or not 16 <= int(width) <= _WIDEST:
             raise TrilightError(f"px is {width:.10}; expected 16 to {_WIDEST}.")
-        return Response(body=self._png(key, int(view), int(width)), kind="image/png")
+        return Response(self._png(key, int(view), int(width)), media_type="image/png")
 
     def _small_png(self, key: str, view: int, width: int) -> bytes:
         shard = self.index.row(key).facts.shard
@@ -406,7 +399,7 @@ class FolderHandlers(SceneListHandlers):
 
     def _facts(self, _: Request) -> Response:
         suffixes = sorted({Path(name).suffix.lower() for name in self._names})
-        return json_response(
+        return JSONResponse(
             {
                 "name": self._root.resolve().name,
                 "files": list(self._names),
@@ -418,7 +411,7 @@ class FolderHandlers(SceneListHandlers):
     def _about(self, request: Request) -> Response:
         loaded = self._load(self._row(request.path.removeprefix("api/about/")))
         scene = loaded.scene
-        return json_response(
+        return JSONResponse(
             {
                 "triangles": scene.num_triangles,
                 "lights": num_lights(scene),
@@ -430,7 +423,7 @@ class FolderHandlers(SceneListHandlers):
 
     def _thumbnail(self, request: Request) -> Response:
         row = self._row(request.path.removeprefix("api/thumbnail/"))
-        return Response(body=self._png(row), kind="image/png")
+        return Response(self._png(row), media_type="image/png")
 
     def _small_png(self, number: int) -> bytes:
         loaded = self._load(number)

@@ -6,8 +6,10 @@ from concurrent.futures import Future
 from pathlib import Path
 from typing import Protocol
 
+from starlette.responses import Response
+
 from infra.run_record import is_run, tensorboard_command
-from infra.viewer.server import Request, Response, Routes, dispatch, static_routes
+from infra.viewer.server import Request, Routes, dispatch, static_routes
 from storage.dataset.layout import DatasetFolder
 from storage.errors import TrilightError
 

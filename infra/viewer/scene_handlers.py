@@ -17,21 +17,13 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 from PIL import Image as Picture
+from starlette.responses import JSONResponse, Response
 
 from infra.render.path_tracer import RenderChild
 from infra.render.tone_mapping import ToneMap, tone_mapped
 from infra.viewer.page_renderers import PageRenderer, PassImage, RenderJob, RenderQueue, job_record
-from infra.viewer.picture_options import (
-    parse_picture_options,
-    short_digest,
-)
-from infra.viewer.server import (
-    NotFound,
-    Request,
-    Response,
-    Routes,
-    json_response,
-)
+from infra.viewer.picture_options import parse_picture_options, short_digest
+from infra.viewer.server import NotFound, Request, Routes
 from pipeline.documents.png import encode_png
 from pipeline.exchange.convert import write_scene
 from pipeline.exchange.formats import FORMATS, LoadedScene
@@ -84,7 +76,7 @@ class SceneHandlers:
         """Return the routes of the page's requests."""
         return {
             "GET api/scene": self._facts,
-            "GET api/scene.bin": lambda _: Response(body=scene_bytes(self.scene), kind=_OCTETS),
+            "GET api/scene.bin": lambda _: Response(scene_bytes(self.scene), media_type=_OCTETS),
             "GET api/texture/": self._texture,
             "GET api/sky.bin": self._sky,
             "GET api/picture/": self._progress,
@@ -108,7 +100,7 @@ class SceneHandlers:
             {"name": name, "title": each.title, "means": each.means}
             for name, each in self.renderers.items()
         ]
-        return json_response(
+        return JSONResponse(
             {
                 "name": self.name,
                 "triangles": scene.num_triangles,
@@ -135,26 +127,26 @@ class SceneHandlers:
         name = request.path.removeprefix("api/texture/")
         if not (name.isascii() and name.isdecimal()) or int(name) >= len(self.scene.textures):
             raise NotFound("the scene has no such texture.")
-        return Response(body=texture_png(self.scene.textures[int(name)]), kind="image/png")
+        return Response(texture_png(self.scene.textures[int(name)]), media_type="image/png")
 
     def _sky(self, _: Request) -> Response:
         if self.scene.environment is None:
             raise NotFound("the scene has no environment.")
-        return Response(body=sky_bytes(self.scene), kind=_OCTETS)
+        return Response(sky_bytes(self.scene), media_type=_OCTETS)
 
     def _submit(self, request: Request) -> Response:
         options = parse_picture_options(request.body, self.renderers, self.scene.num_views)
-        return json_response({"id": self.queue.submit(options).id})
+        return JSONResponse({"id": self.queue.submit(options).id})
 
     def _cancel_all(self, _: Request) -> Response:
         self.queue.cancel_all()
-        return json_response({})
+        return JSONResponse({})
 
     def _progress(self, request: Request) -> Response:
         after = request.query.get("after", "0")
         number = request.path.removeprefix("api/picture/")
         job = self.queue.wait_for_update(number, int(after) if after.isdecimal() else 0)
-        return json_response({**job_record(job, self.queue), **self._reproduction(job)})
+        return JSONResponse({**job_record(job, self.queue), **self._reproduction(job)})
 
     def _reproduction(self, job: RenderJob) -> Mapping[str, Any]:
         """Return the command that renders a picture, and its camera as a file for that command."""
@@ -183,7 +175,7 @@ class SceneHandlers:
             pixels = job.image.pixels
         else:
             pixels = _tone_map(job.image.radiance_rgb, request.query)
-        return Response(body=encode_png(pixels), kind="image/png")
+        return Response(encode_png(pixels), media_type="image/png")
 
     def _export(self, request: Request) -> Response:
         body = request.body if isinstance(request.body, dict) else {}
@@ -197,7 +189,7 @@ class SceneHandlers:
             lost = write_scene(path, self.queue.scene(key, edits))
             data = path.read_bytes()
         said = "; ".join(lost).encode("ascii", "replace").decode()[:800]
-        return Response(body=data, kind=_OCTETS, headers={"X-Lost": said} if said else {})
+        return Response(data, media_type=_OCTETS, headers={"X-Lost": said} if said else {})
 
 
 def _tone_map(radiance_rgb: NDArray[np.float32], query: Mapping[str, str]) -> NDArray[np.uint8]:

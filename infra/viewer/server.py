@@ -6,35 +6,33 @@ that DNS rebinding and a guessed port fail. Static files are listed when the ser
 a request's path only selects from a list.
 """
 
-import contextlib
+import asyncio
 import hmac
 import json
 import math
 import secrets
 import socket
-import threading
-import time
 from collections.abc import Callable, Iterable, Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from http import HTTPStatus
-from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
 from pathlib import Path
 from typing import Any
-from urllib.parse import parse_qsl, unquote
+from urllib.parse import parse_qsl
 
+import uvicorn
+from starlette.concurrency import run_in_threadpool
+from starlette.requests import Request as HttpRequest
+from starlette.responses import (
+    FileResponse,
+    HTMLResponse,
+    JSONResponse,
+    PlainTextResponse,
+    Response,
+)
+from starlette.types import Receive, Scope, Send
+
+from pipeline.flows import guarded_server
 from storage.errors import TrilightError
-
-MOST_CONNECTIONS = 32
-"""Maximum number of concurrent responses; a browser opens six connections, and others wait."""
-
-_REQUEST_S = 15.0
-"""Seconds within which a whole request must arrive before its connection is closed."""
-
-_MOST_AWAITED = 64
-"""Maximum number of connections without a whole request; one more closes the oldest."""
-
-_STALLED_S = 30.0
-"""Seconds without progress after which a connection is dropped."""
 
 HOST = "127.0.0.1"
 """Address of the server, which only this machine reaches."""
@@ -64,29 +62,6 @@ Refusal = tuple[HTTPStatus, str]
 """Status of a refused request, and the reason as a sentence that the page shows."""
 
 STATIC = Path(__file__).with_name("static")
-_KINDS = {
-    ".html": "text/html; charset=utf-8",
-    ".js": "text/javascript; charset=utf-8",
-    ".css": "text/css; charset=utf-8",
-    ".svg": "image/svg+xml",
-    "": "text/plain; charset=utf-8",
-}
-
-
-@dataclass(frozen=True, kw_only=True)
-class Response:
-    """Response to a request."""
-
-    body: bytes
-    kind: str = "application/json"
-    """Media type of the body."""
-    headers: Mapping[str, str] = field(default_factory=dict)
-    """Headers in addition to SAFE_HEADERS."""
-
-
-def json_response(value: Any) -> Response:
-    """Return a response with a value as JSON."""
-    return Response(body=json.dumps(value, allow_nan=False).encode())
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -123,11 +98,8 @@ def dispatch(routes: Routes, request: Request) -> Response:
     raise NotFound(f"{request.path or 'the page'}: nothing is there.")
 
 
-class PageServer(ThreadingHTTPServer):
+class PageServer:
     """Server on loopback; `address` is the URL to open."""
-
-    daemon_threads = True
-    request_queue_size = 64
 
     def __init__(self, routes: Routes, *, port: int = 0) -> None:
         """Listen on a port; 0 stands for any free one.
@@ -137,126 +109,78 @@ class PageServer(ThreadingHTTPServer):
         """
         self.routes = routes
         self.token = secrets.token_urlsafe(24)
-        self.slots = threading.BoundedSemaphore(MOST_CONNECTIONS)
-        self._awaited: dict[socket.socket, float] = {}
-        self._changing = threading.Lock()
         try:
-            super().__init__((HOST, port), _Handler)
+            self._socket = socket.create_server((HOST, port))
         except OSError as error:
             raise TrilightError(
                 f"--port is {port}, which cannot be listened at ({error.strerror}); expected a "
                 "free port, or none, and one is found."
             ) from error
+        self.port = int(self._socket.getsockname()[1])
+        config = uvicorn.Config(
+            self._respond,
+            interface="asgi3",
+            http=guarded_server.request_timeout_protocol(),
+            lifespan="off",
+            ws="none",
+            log_level="critical",  # a line would hold the secret token
+            server_header=False,
+            timeout_graceful_shutdown=1,
+        )
+        self._server = uvicorn.Server(config)
 
     @property
     def address(self) -> str:
         """URL of the page, with the secret token."""
-        return f"http://{HOST}:{self.server_port}/{self.token}/"
+        return f"http://{HOST}:{self.port}/{self.token}/"
 
-    def await_request(self, connection: socket.socket) -> None:
-        """Record that a connection has no request yet; of too many, close the oldest."""
-        with self._changing:
-            self._awaited[connection] = time.monotonic()
-            if len(self._awaited) > _MOST_AWAITED:
-                self._end(next(iter(self._awaited)))
+    def run(self) -> None:
+        """Answer requests until `close` is called."""
+        with self._socket:
+            self._server.run(sockets=[self._socket])
 
-    def note_arrival(self, connection: socket.socket) -> None:
-        """Record that a connection has a whole request, or has ended."""
-        with self._changing:
-            self._awaited.pop(connection, None)
+    def close(self) -> None:
+        """Let `run` return, after a second also where responses are not complete."""
+        self._server.should_exit = True
 
-    def service_actions(self) -> None:
-        """Close connections whose request takes too long; the server calls this twice a second."""
-        with self._changing:
-            before = time.monotonic() - _REQUEST_S
-            for connection in [key for key, began in self._awaited.items() if began < before]:
-                self._end(connection)
-
-    def _end(self, connection: socket.socket) -> None:
-        """Shut a connection down, which wakes its reading thread; that thread closes it."""
-        del self._awaited[connection]
-        with contextlib.suppress(OSError):
-            connection.shutdown(socket.SHUT_RDWR)
-
-    def process_request(self, request: Any, client_address: Any) -> None:
-        """Start a thread for a connection, and await its first request."""
-        self.await_request(request)
-        super().process_request(request, client_address)
-
-    def shutdown_request(self, request: Any) -> None:
-        """Close a connection."""
-        self.note_arrival(request)
-        super().shutdown_request(request)
-
-    def handle_error(self, request: Any, client_address: Any) -> None:
-        """Print nothing: a browser may leave in the middle of a response."""
-
-
-class _Handler(BaseHTTPRequestHandler):
-    """Handler of one connection."""
-
-    server: PageServer
-    protocol_version = "HTTP/1.1"
-    timeout = _STALLED_S
-    server_version = "trilight"
-    sys_version = ""
-
-    def do_GET(self) -> None:
-        self._respond("GET")
-
-    def do_POST(self) -> None:
-        self._respond("POST")
-
-    def log_message(self, format: str, *args: Any) -> None:
-        """Print nothing: the path holds the secret token."""
-
-    def _respond(self, method: str) -> None:
-        port = self.server.server_port
-        token = self.server.token
-        refused = refusal(method, self.path, self.headers.items(), port=port, token=token)
+    async def _respond(self, scope: Scope, receive: Receive, send: Send) -> None:
+        """Send the response to a request; uvicorn calls it."""
+        sent = HttpRequest(scope, receive)
+        path = b"?".join(filter(None, (scope["raw_path"], scope["query_string"]))).decode("latin-1")
+        pairs = sent.headers.items()
+        refused = refusal(sent.method, path, pairs, port=self.port, token=self.token)
+        response = await self._answer(sent) if refused is None else _sentence(sent, *refused)
+        response.headers.update(SAFE_HEADERS)
         if refused is not None:
-            self.close_connection = True
-            self._send_sentence(*refused)
-            return
-        data = self.rfile.read(int(self.headers["Content-Length"])) if method == "POST" else b""
-        self.server.note_arrival(self.connection)
-        with self.server.slots:
-            answer = self._dispatch(method, data)
-        if isinstance(answer, Response):
-            self._send(HTTPStatus.OK, answer)
-        else:
-            self._send_sentence(*answer)
-        self.server.await_request(self.connection)
+            response.headers["Connection"] = "close"
+        await response(scope, receive, send)
 
-    def _dispatch(self, method: str, data: bytes) -> Response | Refusal:
-        path, _, query = self.path.partition("?")
-        below = unquote(path.removeprefix(f"/{self.server.token}")).removeprefix("/")
+    async def _answer(self, sent: HttpRequest) -> Response:
+        """Return the response to a request that passed the guard."""
         try:
-            body = _parse_body(data) if method == "POST" else None
-            request = Request(method=method, path=below, query=dict(parse_qsl(query)), body=body)
-            return dispatch(self.server.routes, request)
+            is_post = sent.method == "POST"
+            data = await asyncio.wait_for(sent.body(), guarded_server.REQUEST_S) if is_post else b""
+            request = Request(
+                method=sent.method,
+                path=sent.url.path.removeprefix(f"/{self.token}").removeprefix("/"),
+                query=dict(parse_qsl(sent.url.query)),
+                body=_parse_body(data) if is_post else None,
+            )
+            return await run_in_threadpool(dispatch, self.routes, request)
         except NotFound as error:
-            return HTTPStatus.NOT_FOUND, str(error)
+            return _sentence(sent, HTTPStatus.NOT_FOUND, str(error))
         except TrilightError as error:
-            return HTTPStatus.UNPROCESSABLE_ENTITY, str(error)
+            return _sentence(sent, HTTPStatus.UNPROCESSABLE_ENTITY, str(error))
         except Exception as error:
             sentence = f"The viewer cannot answer this ({type(error).__name__})."
-            return HTTPStatus.INTERNAL_SERVER_ERROR, sentence
+            return _sentence(sent, HTTPStatus.INTERNAL_SERVER_ERROR, sentence)
 
-    def _send_sentence(self, status: HTTPStatus, sentence: str) -> None:
-        """Send a sentence: as text where HTML is accepted, else as JSON."""
-        if "text/html" in self.headers.get("Accept", ""):
-            self._send(status, Response(body=sentence.encode(), kind="text/plain; charset=utf-8"))
-        else:
-            self._send(status, json_response({"error": sentence}))
 
-    def _send(self, status: HTTPStatus, response: Response) -> None:
-        self.send_response(status)
-        headers = {"Content-Type": response.kind, "Content-Length": str(len(response.body))}
-        for name, value in {**SAFE_HEADERS, **headers, **response.headers}.items():
-            self.send_header(name, value)
-        self.end_headers()
-        self.wfile.write(response.body)
+def _sentence(sent: HttpRequest, status: HTTPStatus, sentence: str) -> Response:
+    """Return a sentence as a response: as text where HTML is accepted, else as JSON."""
+    if "text/html" in sent.headers.get("accept", ""):
+        return PlainTextResponse(sentence, status)
+    return JSONResponse({"error": sentence}, status)
 
 
 def _parse_body(data: bytes) -> Any:
@@ -289,6 +213,8 @@ def refusal(
     server_address = f"{HOST}:{port}"
     pairs = [(name.lower(), value) for name, value in pairs]
     headers = dict(pairs)
+    if method not in ("GET", "POST"):
+        return HTTPStatus.NOT_IMPLEMENTED, "Only GET and POST are answered."
     if len(path) > MAX_PATH:
         return HTTPStatus.REQUEST_URI_TOO_LONG, "The address is too long."
     if any([name for name, _ in pairs].count(name) > 1 for name in _ONCE):
@@ -309,7 +235,8 @@ def refusal(
     if not hmac.compare_digest(sent_token.encode(), token.encode()):
         return HTTPStatus.FORBIDDEN, "Open the whole address that `trilight view` printed."
     length = headers.get("content-length", "")
-    if method == "POST" and not (length.isascii() and length.isdecimal()):
+    is_stated = length.isascii() and length.isdecimal() and "transfer-encoding" not in headers
+    if method == "POST" and not is_stated:
         return HTTPStatus.LENGTH_REQUIRED, "The request has no length."
     if method == "POST" and (len(length) > 9 or int(length) > MAX_BODY_BYTES):
         return HTTPStatus.REQUEST_ENTITY_TOO_LARGE, "The request is too large."
@@ -326,11 +253,11 @@ def static_routes(page: str) -> dict[str, Route]:
         name = request.path.removeprefix("static/")
         if name not in files:
             raise NotFound("there is no such file.")
-        return Response(body=files[name].read_bytes(), kind=_KINDS[files[name].suffix])
+        return FileResponse(files[name])
 
     def index(request: Request) -> Response:
         head = files["page.html"].read_bytes().replace(b"PAGE", Path(page).stem.encode())
         body = head.replace(b"BODY", files[page].read_bytes())
-        return Response(body=body, kind=_KINDS[".html"])
+        return HTMLResponse(body)
 
     return {"GET ": index, "GET static/": file}

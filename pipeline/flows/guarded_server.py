@@ -93,9 +93,9 @@ def request_timeout_protocol() -> type[asyncio.Protocol]:
 
     A connection is closed after REQUEST_S without a complete head of a request.
     """
-    from uvicorn.protocols.http.auto import AutoHTTPProtocol
+    from uvicorn.protocols.http.h11_impl import H11Protocol  # limits the size of a head
 
-    class ImpatientProtocol(AutoHTTPProtocol):  # type: ignore[misc, valid-type]
+    class ImpatientProtocol(H11Protocol):
         def connection_made(self, transport: Any) -> None:
             super().connection_made(transport)
             self._look(idle_since=object())

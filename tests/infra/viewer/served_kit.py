@@ -16,12 +16,12 @@ class Asker:
     """Sends requests as a browser would, or as a stranger."""
 
     def __init__(self, server: PageServer) -> None:
-        self.port, self.word = server.server_port, server.token
+        self.port, self.word = server.port, server.token
         self.here = f"127.0.0.1:{self.port}"
 
     def ask(
         self, path: str, body: Any = None, *, word: str | None = None, **headers: str
-    ) -> tuple[int, Any, dict[str, str]]:
+    ) -> tuple[int, Any, http.client.HTTPMessage]:
         """Return status, answer (JSON where it is some) and headers."""
         line = http.client.HTTPConnection("127.0.0.1", self.port, timeout=30)
         sent = {"Host": self.here, "Origin": f"http://{self.here}"} if body is not None else {}
@@ -30,12 +30,12 @@ class Asker:
         whole = f"/{self.word if word is None else word}/{path}"
         line.request("GET" if body is None else "POST", whole, data, sent)
         answer = line.getresponse()
-        bytes_, found = answer.read(), dict(answer.headers.items())
+        bytes_ = answer.read()
         line.close()
         try:
-            return answer.status, json.loads(bytes_), found
+            return answer.status, json.loads(bytes_), answer.headers
         except ValueError:
-            return answer.status, bytes_, found
+            return answer.status, bytes_, answer.headers
 
 
 @contextlib.contextmanager
@@ -44,12 +44,11 @@ def served(room: PageHandlers, page: str = "scene.html") -> Iterator[Asker]:
     opened = Future[PageHandlers]()
     opened.set_result(room)
     server = PageServer(deferred_routes(page, opened))
-    thread = threading.Thread(target=server.serve_forever, args=(0.01,), daemon=True)
+    thread = threading.Thread(target=server.run, daemon=True)
     thread.start()
     try:
         yield Asker(server)
     finally:
         room.close()
-        server.shutdown()
-        server.server_close()
+        server.close()
         thread.join()
