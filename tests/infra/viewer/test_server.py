@@ -103,6 +103,12 @@ QUESTIONS: list[tuple[bool, str, str, dict[str, str]]] = [
         False,
         "POST",
         f"/{WORD}/x",
+        {"Origin": f"http://{HERE}", "Content-Length": "2", "Transfer-Encoding": "chunked"},
+    ),
+    (
+        False,
+        "POST",
+        f"/{WORD}/x",
         {"Origin": "http://evil.example", "Content-Length": "2", "Sec-Fetch-Dest": "document"},
     ),
 ]
