@@ -22,15 +22,7 @@ _ROOM = [bytearray(16 << 20)]  # freed where memory lacks, so that a message can
 
 def main() -> None:
     """Run the command line; a mistake of the user is one line on stderr and exit status 1."""
-    # torch's threads would spin while they wait, which made training beside other work twelve
-    # times slower; torch reads the variable at its import, and a value that the user set wins
-    os.environ.setdefault("OMP_WAIT_POLICY", "PASSIVE")
-    logging.getLogger("matplotlib").setLevel(logging.ERROR)  # it reports its caches
-    os.environ["MPLBACKEND"] = "agg"  # a notebook's or a missing backend fails at the import
-    if not os.environ.get("COLUMNS", "80").strip("0"):  # rich prints nothing in no columns
-        del os.environ["COLUMNS"]
-    if not os.environ.get("SOURCE_DATE_EPOCH", "0").isdecimal():  # numpy's import would fail
-        del os.environ["SOURCE_DATE_EPOCH"]
+    _correct_environment()
     signal.signal(signal.SIGINT, _on_interrupt)
     open_missing_streams()
     if logging.lastResort is not None:
@@ -43,6 +35,8 @@ def main() -> None:
             confinement_mode()
         app(load_extensions(sys.argv[1:]))
         sys.stdout.flush()
+        if "RANK" in os.environ:  # under torchrun: threads of torch sometimes abort a usual end
+            os._exit(0)
     except CycloptsError as mistake:
         leave(f"trilight: {complaint(mistake)}", 2)
     except TrilightError as mistake:
@@ -62,6 +56,19 @@ def main() -> None:
             said = f"too little memory ({type(error).__name__}); what was finished is safe."
             leave(f"trilight: {said}{_describe_limit()}", EnvironmentFailure.exit_status)
         raise
+
+
+def _correct_environment() -> None:
+    """Set variables by which libraries work badly, or not at all."""
+    # torch's threads would spin while they wait, which made training beside other work twelve
+    # times slower; torch reads the variable at its import, and a value that the user set wins
+    os.environ.setdefault("OMP_WAIT_POLICY", "PASSIVE")
+    logging.getLogger("matplotlib").setLevel(logging.ERROR)  # it reports its caches
+    os.environ["MPLBACKEND"] = "agg"  # a notebook's or a missing backend fails at the import
+    if not os.environ.get("COLUMNS", "80").strip("0"):  # rich prints nothing in no columns
+        del os.environ["COLUMNS"]
+    if not os.environ.get("SOURCE_DATE_EPOCH", "0").isdecimal():  # numpy's import would fail
+        del os.environ["SOURCE_DATE_EPOCH"]
 
 
 def _describe_limit() -> str:

@@ -92,8 +92,9 @@ async function watch() {
     fill("split", facts.splits);
     fill("template", facts.templates);
     const going = facts.shards_read < facts.shards;
-    byId("facts").textContent = `${facts.build}; ${facts.scenes.toLocaleString("en")} scenes in ${
-      facts.shards} shards${going ? `; reading the index: ${facts.indexed.toLocaleString("en")}` : ""}`;
+    const reading = going ? `; reading the index: ${facts.indexed.toLocaleString("en")}` : "";
+    byId("facts").textContent =
+      `${facts.build}; ${some(facts.scenes, "scene")} in ${some(facts.shards, "shard")}${reading}`;
     if (facts.problems.length) say(facts.problems.join(" "));
     if (facts.indexed !== before && (before <= 0 || !going)) await show(0);
     before = facts.indexed;

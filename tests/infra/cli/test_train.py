@@ -196,6 +196,15 @@ def test_several_processes_are_launched_by_torchrun(monkeypatch: pytest.MonkeyPa
     assert replaced.call_count == 2
 
 
+def test_under_torchrun_no_thread_of_a_library_turns_an_end_into_a_failure(tmp_path: Path) -> None:
+    """torchrun ends the other processes, and says that the training failed, where one aborts."""
+    (tmp_path / "aborts.py").write_text("import atexit, os\natexit.register(os.abort)\n")
+    extension = str(tmp_path / "aborts.py")
+    words = [sys.executable, "-m", "trilight", "--extend", extension, "presets"]
+    run_program(words, status=-signal.SIGABRT)
+    assert "tiny" in run_program(words, RANK="1").stdout
+
+
 FAR = "out-of-range"
 
 
