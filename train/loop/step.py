@@ -6,6 +6,7 @@ keeps the GPU's queue full. Torch fuses the modules of a step into fewer kernels
 """
 
 import contextlib
+import warnings
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
@@ -76,9 +77,11 @@ class Stepper:
             # Every weight is used. With find_unused_parameters=False torch would regroup the
             # gradients after the first step and sum them in another order from then on: a resumed
             # run would differ in the last bits.
-            self._net = DistributedDataParallel(
-                state.model, broadcast_buffers=False, find_unused_parameters=True
-            )
+            with warnings.catch_warnings():  # torch 2.13 has another name, which 2.11 lacks
+                warnings.filterwarnings("ignore", "`broadcast_buffers` is", FutureWarning)
+                self._net = DistributedDataParallel(
+                    state.model, broadcast_buffers=False, find_unused_parameters=True
+                )
 
     def step(self, batches: Sequence[TrainingBatch], learning_rate: float) -> StepReport:
         """Launch a step, wait for it, and return its report; see `launch`."""
