@@ -13,6 +13,7 @@ Time is up when somebody makes the file `time-is-up` in the folder $FAKE_SLURM, 
 cancelled when somebody makes `cancel`. What was asked for is in its file `calls`, a line a call.
 """
 
+import contextlib
 import json
 import os
 import re
@@ -67,12 +68,20 @@ def sbatch(words: list[str]) -> int:
                 if _taken("time-is-up"):
                     shell.send_signal(signal.Signals[f"SIG{name}"])
                 if (PLACE / "steps").exists() and _taken("cancel"):
-                    for pid in (PLACE / "steps").read_text().split():
-                        os.kill(int(pid), signal.SIGTERM)
+                    _cancel([int(pid) for pid in (PLACE / "steps").read_text().split()])
         starts += 1
         if not ("requeue" in options and _taken("requeue")):
             return shell.returncode
     sys.exit(f"sbatch: job {JOB} was queued again {MOST_STARTS} times")
+
+
+def _cancel(tasks: list[int]) -> None:
+    """End tasks as Slurm does; a shell that becomes another program may miss the first signal."""
+    for number in (signal.SIGTERM, signal.SIGKILL):
+        for pid in tasks:
+            with contextlib.suppress(ProcessLookupError):
+                os.kill(pid, number)
+        time.sleep(KILL_WAIT_S)
 
 
 def _variables(options: Mapping[str, str], starts: int) -> dict[str, str]:
